@@ -76,7 +76,7 @@ class Training:
 
 
 class Report(Protocol):
-    """The report of a job's result."""
+    """The report of a job's result: an HTML page with the task's text, and text for the terminal."""
 
     def page(
         self,
@@ -84,65 +84,27 @@ class Report(Protocol):
         parts: Sequence[Part],
         pictures: Sequence[tuple[Picture, bytes]],
         task_text: str,
-    ) -> str:
-        """The report as an HTML page."""
-        ...
-
-    def table(self, result: Result) -> str:
-        """The report as text for the terminal."""
-        ...
+    ) -> str: ...
+    def table(self, result: Result) -> str: ...
 
 
 class Job(Protocol[T, S, O]):
     """A kind of learning job, with its task, setup and outcome; implemented by modules."""
 
     @property
-    def DOUBLE(self) -> bool:
-        """True if figures are computed in double precision."""
-        ...
-
+    def DOUBLE(self) -> bool: ...  # True if figures are computed in double precision
     @property
     def report(self) -> Report: ...
-
-    def read_task(self, path: Path) -> T:
-        """The checked task file."""
-        ...
-
-    def prepare(self, task: T, seed: int) -> S:
-        """The objects that a task file describes."""
-        ...
-
-    def describe(self, setup: S) -> str:
-        """Sizes of a setup, in one line."""
-        ...
-
-    def learn(self, setup: S, training: Training) -> O:
-        """Learns with several seeds, keeps one, and evaluates it."""
-        ...
-
-    def postfix(self, figures: Mapping[str, np.ndarray]) -> dict[str, str]:
-        """The newest metrics for the progress bar."""
-        ...
-
-    def summary(self, outcome: O) -> Result:
-        """The contents of ``result.json``."""
-        ...
-
-    def save(self, out: Path, outcome: O) -> None:
-        """Writes the policy into a directory."""
-        ...
-
-    def task_pictures(self, setup: S) -> list[Picture]:
-        """The pictures that need no outcome."""
-        ...
-
-    def pictures(self, outcome: O) -> list[Picture]:
-        """The pictures of an outcome."""
-        ...
-
-    def live(self, outcome: O) -> Sequence[Explorer | TooLarge | Curves]:
-        """The interactive parts of the report."""
-        ...
+    def read_task(self, path: Path) -> T: ...  # the checked task file
+    def prepare(self, task: T, seed: int) -> S: ...  # the objects that a task file describes
+    def describe(self, setup: S) -> str: ...  # sizes of a setup, in one line
+    def learn(self, setup: S, training: Training) -> O: ...  # with several seeds, keeping one
+    def postfix(self, figures: Mapping[str, np.ndarray]) -> dict[str, str]: ...  # newest metrics
+    def summary(self, outcome: O) -> Result: ...  # the contents of ``result.json``
+    def save(self, out: Path, outcome: O) -> None: ...  # writes the policy into a directory
+    def task_pictures(self, setup: S) -> list[Picture]: ...  # those that need no outcome
+    def pictures(self, outcome: O) -> list[Picture]: ...
+    def live(self, outcome: O) -> Sequence[Explorer | TooLarge | Curves]: ...  # of the report
 
 
 SomeJob: TypeAlias = Job[Any, Any, Any]  # of a kind that a task file decides

@@ -87,6 +87,10 @@ class Synthesis:
     def starts(self) -> np.ndarray:
         return np.flatnonzero(np.asarray(self.world.game.initial) > 0)
 
+    @property
+    def lost_starts(self) -> np.ndarray:
+        return self.starts[~self.wins[self.starts]]
+
 
 def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synthesis:
     """Solves the game of a file, checks the solution, and extracts a permissive strategy."""

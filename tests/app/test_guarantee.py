@@ -11,7 +11,7 @@ import jaxltl as jl
 from benchmarks.mistakes import losses
 from jaxltl.app import learn as job
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports.learn import _nearly_best, remarks, table
+from jaxltl.app.reports.learn import remarks, table
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401
@@ -275,7 +275,17 @@ def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
     ],
 )
 def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
-    found, text = _nearly_best(lower, {"value": 0.5, "upper": upper})
+    mean = {"value": 0.5, "lower": lower, "upper": upper}
+    solved = {"mean": mean, "minimum": {"lower": 0.4}, "status": "CONVERGED", "num_starts": 1}
+    result = {
+        "satisfaction": solved,
+        "best_achievable": solved,
+        "guarantee": {"asked": "best"},
+        "training": {"converged": True},
+        "expected_steps": None,
+        "impossible_starts": [],
+    }
+    ((found, text),) = remarks(result)
     assert found == kind and words in text
 
 

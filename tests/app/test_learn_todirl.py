@@ -379,13 +379,13 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
 @pytest.mark.slow
 def test_what_must_be_known_before_trusting_the_figures(learned):
     result = json.loads(json.dumps(learned[2]))
-    assert report_todirl.warnings(result) == []
+    assert all(kind != "warning" for kind, _ in report_todirl.remarks(result))
     test, learning = result["test"], result["learning"]
     test["infeasible"], test["left_out"] = ["seed 0", "seed 1"], ["seed 1"]
     test["worlds"][0]["infeasible_starts"] = 3
     test["expert"]["uncertain"] = ["seed 1"]
     learning.update(stopped_early=False, best_step=learning["steps"] - 1, solver="MAX_STEPS")
-    told = " ".join(report_todirl.warnings(result))
+    told = " ".join(text for kind, text in report_todirl.remarks(result) if kind == "warning")
     starts = test["worlds"][0]["num_starts"]
     for words in (
         f"from 3 of {starts} initial states of the test world seed 0; it counts in the mean "

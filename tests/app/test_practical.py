@@ -11,7 +11,7 @@ from jaxltl.app import learn as job
 from jaxltl.app.practical import neg_log_likelihood, step_bound
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps as report
-from jaxltl.app.reports.learn import table, warnings
+from jaxltl.app.reports.learn import remarks, table
 from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
@@ -184,7 +184,7 @@ def test_the_report_has_both_numbers_and_what_relaxing_gives(harbour):
     for value in (time["learned"], time["quickest"], time["front"][1]["steps"]["value"]):
         assert f"{value:.4g}" in text
     assert "a share of" in text and "steps_factor in [task] sets the multiple" in text
-    assert not any("suffice" in x for x in warnings(result))
+    assert not any("suffice" in text for _, text in remarks(result))
     (picture,) = report.pictures(time)
     assert picture.name == "steps.svg" and len(picture.drawing.arguments[0][""]) == 2
 

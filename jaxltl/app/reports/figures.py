@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import statistics
+from collections.abc import Iterable, Sequence
 
 import click
 from jaxltl.app.wording import Result
@@ -19,14 +20,19 @@ def remark_lines(remarks: Iterable[Remark]) -> list[str]:
     ]
 
 
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table of texts."""
+    width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, width)).rstrip() for row in rows]
+
+
 def mean_deviation(values: Iterable[float | None]) -> str:
     """Mean and standard deviation of the finite values."""
     known = [v for v in values if v is not None]
     if not known:
         return "unknown"
-    mean = sum(known) / len(known)
-    deviation = (sum((v - mean) ** 2 for v in known) / max(1, len(known) - 1)) ** 0.5
-    return f"{number(mean)} ± {deviation:.2g}"
+    deviation = statistics.stdev(known) if len(known) > 1 else 0.0
+    return f"{number(statistics.fmean(known))} ± {deviation:.2g}"
 
 
 def probability(value: float | None) -> str:

@@ -70,16 +70,34 @@ def render_page(
     return _environment().get_template(template).render(values | context)
 
 
+def render_text(template: str, **values: object) -> list[str]:
+    """The lines of a text."""
+    text = _environment().get_template(template).render(values)
+    return [line.rstrip() for line in text.splitlines()]
+
+
+def render_table(template: str, remarks: Iterable[figures.Remark], **values: object) -> str:
+    """A report for the terminal, with its remarks at the end."""
+    return "\n".join([*render_text(template, **values), *figures.remark_lines(remarks)])
+
+
+def render_remarks(template: str, **values: object) -> list[figures.Remark]:
+    """Remarks of a template whose lines are ``kind: text``."""
+    lines = (line.partition(": ") for line in render_text(template, **values) if line)
+    return [(kind, text) for kind, _, text in lines]
+
+
 @functools.cache
 def _environment() -> jinja2.Environment:
     found = jinja2.Environment(
         loader=jinja2.PackageLoader("jaxltl.app.reports"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(),  # of HTML
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    functions = (figures.number, figures.probability, figures.certified, figures.mean_deviation)
+    names = ("number", "probability", "certified", "mean_deviation", "rounded_down")
+    functions = [getattr(figures, name) for name in names]
     found.filters |= {function.__name__: function for function in (*functions, place, many)}
     return found
 

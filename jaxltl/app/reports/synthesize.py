@@ -10,9 +10,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.game import World, task_text
+from jaxltl.app.files.game import task_text
 from jaxltl.app.job import plain, took
-from jaxltl.app.reports.figures import number
+from jaxltl.app.reports.figures import aligned, number
+from jaxltl.app.reports.page import render_text
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.games.permissive import Permissive
@@ -45,12 +46,23 @@ def summary(found: Synthesis, seconds: float) -> Record:
             "states": int(wins.sum()),
             "initial_states": won,
             "num_initial_states": int(starts.size),
-            "lost_initial_states": [world.where(s) for s in starts[~wins[starts]][:100]],
+            "lost_initial_states": [world.where(s) for s in found.lost_starts[:100]],
         },
         "verdict": found.verdict._asdict(),
         "strategy": _about_strategy(found),
         "expected_moves": found.moves and dict(zip(("drawn", "any"), found.moves, strict=True)),
-        "play": _about_play(found),
+        "play": found.play
+        and {
+            **vars(found.play),
+            "steps": [
+                {
+                    "mover": step.mover,
+                    "move": step.action,
+                    **world.where(int(found.nodes.world_state[step.node])),
+                }
+                for step in found.play.steps
+            ],
+        },
         **took(seconds),
     }
     return dict(plain(result))
@@ -75,86 +87,36 @@ def _about_strategy(found: Synthesis) -> Record | None:
     }
 
 
-def _about_play(found: Synthesis) -> Record | None:
-    if found.play is None:
-        return None
-    return {
-        "steps": [
-            {
-                "mover": step.mover,
-                "move": step.action,
-                **found.world.where(int(found.nodes.world_state[step.node])),
-            }
-            for step in found.play.steps
-        ],
-        "repeats_from": found.play.repeats_from,
-        "failed": found.play.failed,
-        "by_chance": found.play.by_chance,
-    }
-
-
 def is_confirmed(result: Result) -> bool:
     """True if the independent check confirms a :func:`summary`."""
-    strategy = result["strategy"]
-    claims = result["verdict"]
+    claims, strategy = result["verdict"], result["strategy"]
     sound = strategy is None or strategy["confirmed"]
     return bool(claims["system"] and claims["environment"] and sound)
 
 
 def table(result: Result, found: Synthesis) -> str:
     """A :func:`summary` as text."""
-    region, strategy = result["region"], result["strategy"]
-    sure = result["deterministic"] or result["chance"] == "adversarial"
-    surely = "surely" if sure else "almost surely"
-    lines = [
-        f"{result['game']}: {result['num_states']} states"
-        + (f" x {result['num_memory']} automaton states" if found.nodes.automaton else ""),
-        f"  {result['task']}",
-        "",
-        f"{result['outcome']}: the system wins {surely} from {region['initial_states']} of "
-        f"{region['num_initial_states']} initial states",
-        f"  (and from {region['states']} of all {result['num_states']} states)",
-    ]
-    lost = region["num_initial_states"] - region["initial_states"]
-    if lost:
-        kind = "" if sure else " with positive probability"
-        lines.append(
-            f"the environment wins{kind} from {lost}, for example: "
-            + found.world.describe(int(found.starts[~found.wins[found.starts]][0]))
-        )
-    if strategy:
-        lines += [
-            "",
-            *textwrap.wrap(
-                f"permissive strategy, {strategy['reason']}", 96, subsequent_indent="  "
-            ),
-            f"  restricted game   {strategy['num_states']} states "
-            f"({strategy['num_system_states']} of the system), {strategy['num_moves']} moves "
-            f"({strategy['num_system_moves']} of the system)",
-        ]
-        if strategy["num_memory"] > 1:
-            lines.append(f"  memory            {strategy['num_memory']} states")
-    if moves := result["expected_moves"]:
-        drawn, worst = ("unbounded" if x is None else number(x) for x in moves.values())
-        lines += [
-            f"  expected moves    until acceptance at most {drawn} if drawn uniformly, {worst} for any "
-            "choice, certified"
-        ]
-    lines += ["", verdict(result)]
-    if found.play is not None:
-        note = "" if found.world.places is None else " (cells as row, column)"
-        lines += ["", f"a play that the environment wins{note}", *describe_play(found)]
+    reason = f"permissive strategy, {(result['strategy'] or {}).get('reason')}"
+    moves = (result["expected_moves"] or {}).values()
+    lines = render_text(
+        "synthesis.txt",
+        result=result,
+        found=found,
+        reason=textwrap.fill(reason, 96, subsequent_indent="  "),
+        moves=["unbounded" if x is None else number(x) for x in moves],
+        verdict=verdict(result),
+        play=describe_play(found),
+    )
     return "\n".join(lines)
 
 
 def verdict(result: Result) -> str:
     """Verdict of the independent check, as text."""
+    strategy = result["strategy"]
     if is_confirmed(result):
-        what = "both players' strategies" + (
-            " and the permissive strategy" if result["strategy"] else ""
-        )
-        return f"independent check: confirmed, {what}"
-    reasons = [result["verdict"]["reason"], (result["strategy"] or {}).get("refuted_by", "")]
+        more = " and the permissive strategy" if strategy else ""
+        return f"independent check: confirmed, both players' strategies{more}"
+    reasons = [result["verdict"]["reason"], (strategy or {}).get("refuted_by", "")]
     return f"independent check: REFUTED: {' '.join(r for r in reasons if r)}"
 
 
@@ -163,30 +125,18 @@ def verdict(result: Result) -> str:
 
 def describe_play(found: Synthesis) -> list[str]:
     """A play that the environment wins, as lines of a table."""
-    play, nodes, world = found.play, found.nodes, found.world
+    play, world = found.play, found.world
     if play is None:
         return []
-    rows = [["step", "mover", "move", *_columns(world)]]
+    columns = ["state"] if world.places is None else ["system", "environment"]
+    rows = [["step", "mover", "move", *columns]]
     for i, step in enumerate(play.steps):
-        state = int(nodes.world_state[step.node])
-        rows.append([str(i), step.mover, step.action, *_cells(world, state)])
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = [
-        "  " + "  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
-    return [*lines, "  " + _ending(play, found)]
-
-
-def _columns(world: World) -> list[str]:
-    return ["state"] if world.places is None else ["system", "environment"]
-
-
-def _cells(world: World, state: int) -> list[str]:
-    where = world.where(state)
-    if world.places is None:
-        return [str(where["state"])]
-    return [f"{where[k]['row']}, {where[k]['column']}" for k in _columns(world)]
+        where = world.where(int(found.nodes.world_state[step.node]))
+        cells = [
+            x if world.places is None else f"{x['row']}, {x['column']}" for x in where.values()
+        ]
+        rows.append([str(i), step.mover, step.action, *map(str, cells)])
+    return [f"  {line}" for line in (*aligned(rows), _ending(play, found))]
 
 
 def _ending(play: Play, found: Synthesis) -> str:
