@@ -1,4 +1,4 @@
-"""(l) First calls, each in a fresh process after the import: seconds and compiled programs."""
+"""(l) First calls, each in a fresh process after its imports: seconds and compiled programs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ calls = {
 }
 short = name.split(",")[0]  # names are imported when they are first looked up
 getattr(jl.graphs if short == "end_components" else jl, short), jl.games.buchi, jl.verify
-import scipy.sparse, scipy.linalg  # by the first solve on the host
+import scipy.sparse.linalg, scipy.sparse.csgraph  # by the first solve on the host
 count[0], begin = 0, time.perf_counter()
 try:
     jax.block_until_ready(jax.tree.leaves(calls[name]()))

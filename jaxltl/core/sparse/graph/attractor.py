@@ -93,14 +93,18 @@ class _Search(NamedTuple):
             row = row[self.lacking[row] <= 0]
             if empty is not None and empty.size:
                 row = np.concatenate([row, empty])
-        row = row[self.waiting[row]]
-        if not row.size:
-            return row
-        row = sorted_unique(row, self.graph.num_rows)
+        if row.size < self.graph.num_rows // 16:
+            row = sorted_unique(row[self.waiting[row]], self.graph.num_rows)
+        else:
+            mark = np.zeros(self.graph.num_rows, bool)
+            mark[row] = True
+            row = np.flatnonzero(mark & self.waiting)
         self.waiting[row] = False
+        row = row[self.open[self.graph.state[row]]]
         state = self.graph.state[row]
-        decrement(self.left, state)
-        joins = (self.rule[state] | (self.left[state] == 0)) & self.open[state]
+        all_rows = ~self.rule[state]
+        decrement(self.left, state[all_rows])
+        joins = ~all_rows | (self.left[state] == 0)
         state, row = state[joins], row[joins]
         first = group_starts(state)  # rows are in order, so those of one state are contiguous
         state, row = state[first], row[first]
