@@ -16,8 +16,7 @@ from jaxltl.core import validation
 from jaxltl.core.pretty_print import rounded_outward
 from jaxltl.core.statistics.graph_assumption import Graph, LeastProbability
 from jaxltl.core.validation import Range
-from jaxltl.core.models.construct.counts import TransitionCounts, model_from_counts, align_counts
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models import SparseMDP, TransitionCounts, align_counts, model_from_counts
 from jaxltl.core.statistics.confidence_sets import check_confidence
 from jaxltl.core.types import Status
 from jaxltl.core.values.evaluation.data_guarantee import (

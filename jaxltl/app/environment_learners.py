@@ -17,9 +17,7 @@ from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentTask
 from jaxltl.app.job import settings
-from jaxltl.core.environments.environment import Box, Environment, Finite, Timestep
-from jaxltl.core.environments.episodes import Agent
-from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.environments import Agent, Box, Environment, Finite, Timestep, Verdict
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 from jaxltl.app.protocols import Algorithm

@@ -13,8 +13,7 @@ from jaxltl.app.practical import neg_log_likelihood
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models.construct.lifting import memory_along
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.models import Product, Trajectories
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted.mixture import (
     at_starts,

@@ -41,19 +41,13 @@ from jaxltl.app.job import (
     settings,
     took,
 )
-from jaxltl.core.models.construct.lifting import lift_policy, project_policy
+from jaxltl.core.models import Product, Trajectories, lift_policy, product, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import softmax_policy
 from jaxltl.core.values.undiscounted.mixture import at_starts, certified, from_starts
-from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
+from jaxltl.core.values import optimal_actions, optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
-from jaxltl.core.values.undiscounted.satisfaction import (
-    optimal_satisfaction,
-    satisfaction_probability,
-)
 from jaxltl.app.wording import Record, many
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.policies.policy_file import save_policy

@@ -33,12 +33,9 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.core.types import Status
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.continuous.certificate import ProofOptions, certify_policy
-from jaxltl.core.continuous.counterexample import counterexample
-from jaxltl.core.continuous.dynamics import Dynamics
-from jaxltl.core.continuous.learned_policy import state_policy
+from jaxltl.core.automata import Automaton, to_automaton
+from jaxltl.core.continuous.certificate import ProofOptions
+from jaxltl.core.continuous import Dynamics, certify_policy, counterexample, state_policy
 from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
 from jaxltl.core.environments.monitor import Verdict, verdicts

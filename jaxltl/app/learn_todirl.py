@@ -54,8 +54,7 @@ from jaxltl.app.job import (
     run_seeds,
     settings,
 )
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.synchronize import synchronize
+from jaxltl.core.automata import Automaton, synchronize
 from jaxltl.core.models.construct.batch import (
     lift_memory_policy,
     restrict_stacked_actions,

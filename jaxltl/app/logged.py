@@ -19,8 +19,7 @@ from jaxltl.app.certify import (
 )
 from jaxltl.app.files.models import padded
 from jaxltl.app.files.task_mlirl import WorldTable
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, product
+from jaxltl.core.models import MDP, Product, product
 from jaxltl.core.types import Status
 from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.mixture import from_starts

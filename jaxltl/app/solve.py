@@ -18,12 +18,9 @@ import numpy as np
 
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.logic.comparisons import Definitions, program_definitions
-from jaxltl.core.logic.properties import Property, parse_properties
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
+from jaxltl.core.models import Game, IntervalMDP, SparseMDP
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values.multi_objective.multi_objective import (

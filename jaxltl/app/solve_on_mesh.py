@@ -17,14 +17,9 @@ from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import ProcessGroup, is_loss
 from jaxltl.app.run_job import make_directory
 from jaxltl.app.solve import INVALID, NOT_CONVERGED, Query, Result, load
-from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.logic.properties import Property
+from jaxltl.core.logic import Formula, Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mesh.lanes import on_host
-from jaxltl.core.models.mesh.shard import shard, to_mesh
-from jaxltl.core.models.mesh.sharded import ShardedMDP
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models import IntervalMDP, ShardedMDP, SparseMDP, on_host, shard, to_mesh
 from jaxltl.core.types import NotConverged
 from jaxltl.core.values.properties.solve_on_mesh import (
     Bounds,

@@ -17,8 +17,7 @@ from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_
 from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at, winning_region
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.construct.restrict import Restriction, restrict
-from jaxltl.core.models.game import Game
+from jaxltl.core.models import Game, Restriction, restrict
 from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
 
 Progress = Callable[[str], None]

@@ -8,8 +8,7 @@ from typing import SupportsIndex
 import numpy as np
 
 from jaxltl.core import validation
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.models import MDP, DenseMDP, Trajectories, make_trajectories
 
 TERMINATED = "terminated"
 _NAMES = (("obs", "acts"), ("observations", "actions"))

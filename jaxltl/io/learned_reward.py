@@ -32,8 +32,7 @@ from jaxltl.algos import todirl
 from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, product
+from jaxltl.core.models import MDP, Product, product
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, worst
 from jaxltl.core.values.undiscounted.mixture import practical_policy, reaching, require_attainable

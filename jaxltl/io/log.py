@@ -11,19 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core import validation
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.counts import (
-    Places,
-    TransitionCounts,
-    in_order,
-    listed,
-    make_counts,
-    merged,
-    place_of,
-    places,
-)
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.construct.counts import Places, in_order, listed, merged, place_of, places
+from jaxltl.core.models import MDP, DenseMDP, SparseMDP, TransitionCounts, make_counts, to_sparse
 from jaxltl.io.csv_columns import Lines, read_columns
 
 _COUNT = re.compile(r"[0-9]{1,16}")

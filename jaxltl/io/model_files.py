@@ -7,11 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.files import pieces, raw_bytes, suffix_of, write_bytes
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game

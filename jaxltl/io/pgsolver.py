@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.games.objective import Parity
-from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text, write_bytes
 

@@ -19,11 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.product import Product, read_probability
+from jaxltl.core.models.product import read_probability
+from jaxltl.core.models import Game, Product, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
 from jaxltl.io.hoa.table import alphabet_of

@@ -11,11 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.umb.umb import read_umb, write_umb
 
 StormModel: TypeAlias = Any  # a sparse model of the optional package stormpy

@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Floats
-from jaxltl.core.continuous.certificate import Certificate
-from jaxltl.core.continuous.dynamics import Dynamics
-from jaxltl.core.continuous.regions import Region
+from jaxltl.core.continuous import Certificate, Dynamics, Region
 from jaxltl.plot.style import (
     ACCENT,
     INK,

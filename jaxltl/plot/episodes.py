@@ -37,8 +37,7 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from jaxltl.core.environments.environment import Environment
-from jaxltl.core.environments.episodes import Episode
+from jaxltl.core.environments import Environment, Episode
 from jaxltl.envs.flat_world import Discs, FlatState
 from jaxltl.envs.letter_world import LetterState
 from jaxltl.envs.zone_world import ZoneState

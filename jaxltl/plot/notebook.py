@@ -12,12 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.games.permissive import Permissive
-from jaxltl.core.games.winning import Winning
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.games import Permissive, Winning
+from jaxltl.core.models import MDP, DenseMDP, Game, Product, SparseMDP
 from jaxltl.core.pretty_print import picture, readable
 from jaxltl.core.types import Solution
 from jaxltl.plot.automata import automaton

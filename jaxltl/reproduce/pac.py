@@ -17,8 +17,7 @@ from jaxltl.algos.common import loops, pac
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.ops.operators import expectation
+from jaxltl.core.models import expectation, restrict
 from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.envs.gridworld import ACTIONS

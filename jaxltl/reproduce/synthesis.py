@@ -11,14 +11,11 @@ import numpy as np
 
 from jaxltl.algos import maximin_q
 from jaxltl.app.job import plain
-from jaxltl.core.games.objective import GR1, Parity, buchi, gr1, safety
-from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
+from jaxltl.core.games import GR1, Parity, apply_strategy, buchi, gr1, permissive_strategy, safety
 from jaxltl.core.games.winning import solve, task_game
-from jaxltl.core.models.construct.restrict import Restriction
-from jaxltl.core.models.game import Game
+from jaxltl.core.models import Game, Restriction
 from jaxltl.core.types import NotConverged, check
-from jaxltl.core.values.discounted.discounted import optimal_value
-from jaxltl.core.values.discounted.minimax import minimax_value
+from jaxltl.core.values import minimax_value, optimal_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
 from jaxltl.reproduce.experiment import Figures, run_seconds, svg_files
 

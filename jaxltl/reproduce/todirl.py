@@ -14,9 +14,7 @@ import numpy as np
 
 from jaxltl.algos import behavioral_cloning as cloning, todirl
 from jaxltl.app.job import plain
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.automata import Automaton, synchronize, to_automaton
 from jaxltl.core.models.construct.batch import lift_memory_policy, stack_products
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories

@@ -17,9 +17,7 @@ from jaxltl.app.files.task_mlirl import MlirlTask
 from jaxltl.app.files.worlds import World
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.construct.counts import listed
-from jaxltl.core.models.construct.lifting import project_trajectories
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.models import Product, Trajectories, make_trajectories, project_trajectories
 from jaxltl.core.types import Solution
 
 _STEP_BYTES = 128  # of a simulated step, measured while demonstrations are made and checked

@@ -33,8 +33,7 @@ from jaxltl.app.files.worlds import initial_where
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
 from jaxltl.core.games.winning import task_game
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.product import Product
+from jaxltl.core.models import Game, Product, make_game
 from jaxltl.envs.robots import ACTIONS, grid_game, places
 from jaxltl.envs.text_map import parse_map
 from jaxltl.app.wording import Record

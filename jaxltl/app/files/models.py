@@ -12,10 +12,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_bytes
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.construct.padded import row_actions, to_padded
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models import MDP, Game, IntervalMDP, SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
 from jaxltl.io.pgsolver import objective_of

@@ -15,12 +15,10 @@ from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_todirl import TodirlTask, WorldTable, map_file
 from jaxltl.app.files.worlds import World, grid_options
 from jaxltl.app.wording import where
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import parse_ltl
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.models import MDP, Trajectories
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS, gridworld

@@ -31,8 +31,7 @@ from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values.undiscounted.mixture import at_starts
-from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
-from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+from jaxltl.core.values import optimal_actions, satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 

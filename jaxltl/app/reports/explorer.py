@@ -15,8 +15,7 @@ import numpy as np
 from jaxltl.app.reports.drawing import Drawing, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.models import Product, Trajectories
 from jaxltl.envs.text_map import plain_kind
 
 MOST_CELLS = 20_000  # of all maps of a world together; a page of more takes seconds to load

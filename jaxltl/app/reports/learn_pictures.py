@@ -23,8 +23,7 @@ from jaxltl.app.reports.explorer import (
 from jaxltl.app.guarantee import left_out
 from jaxltl.app.job import automaton_picture, over_seeds, plain, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.product import Product
+from jaxltl.core.models import Product, restrict
 from jaxltl.core.values.undiscounted.mixture import from_starts
 
 _CURVES = "Loss, satisfaction probability and gradient before each step"

@@ -15,10 +15,8 @@ from jaxltl.app.job import plain, took
 from jaxltl.app.reports.figures import aligned, number
 from jaxltl.app.reports.page import render_text
 from jaxltl.app.synthesize import Play, Synthesis
-from jaxltl.core.games.objective import GR1
-from jaxltl.core.games.permissive import Permissive
+from jaxltl.core.games import GR1, Permissive, Winning
 from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
-from jaxltl.core.games.winning import Winning
 from jaxltl.core.models.game import Game, is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.policies.policy_file import save_policy, write_policy_file

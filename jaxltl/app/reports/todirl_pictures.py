@@ -28,8 +28,7 @@ from jaxltl.app.reports.explorer import (
 )
 from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.construct.batch import lift_memory_policy
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
 
 _PICTURES = 3  # worlds that are drawn, of each kind

@@ -14,10 +14,8 @@ from jaxltl.app.files.scenes import Scene
 from jaxltl.app.practical import StepBound
 from jaxltl.app.files.task_todirl import TodirlTask
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
-from jaxltl.core.values.undiscounted.performance import Performance
+from jaxltl.core.models import Product, Trajectories
+from jaxltl.core.values import OptimalActions, Performance
 from jaxltl.core.models.protocols import PyTree
 
 TreeT = TypeVar("TreeT")

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.models.interval import IntervalMDP, interval_rows
-from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP, interval_rows, make_sparse
 from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,

@@ -19,8 +19,7 @@ from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformulas
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
 from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priority

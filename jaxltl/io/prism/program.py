@@ -8,9 +8,7 @@ from collections.abc import Mapping
 from jaxltl.core.language.parser import parse_program
 from jaxltl.core.language.resolve import resolve
 from jaxltl.core.language.syntax import Program, Syntax
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models import Game, IntervalMDP, SparseMDP
 from jaxltl.core.programs.build import MAX_STATES, build_model as build_model
 from jaxltl.core.programs.partial import solve_program as solve_program
 from jaxltl.core.programs.simulation import (

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP
 from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
 from jaxltl.io.tokens import joined_lines
 
