@@ -81,19 +81,6 @@ class Learned:
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
 
 
-def _features(setup: Setup) -> mlirl.Features:
-    """The features of the reward, in the world or in the product (chapter 2)."""
-    table, model, shown = setup.task.learner, setup.model, setup.used
-    avoid = table.avoid or ()
-    if table.in_world:
-        return mlirl.world_features(
-            model.mdp, shown, goal=table.goal or (), progress=table.progress_labels, avoid=avoid
-        )
-    # Without a guarantee, those of the dissertation's Table 1 alone.
-    best = None if setup.guarantee.asked == "none" else setup.guarantee.best
-    return mlirl.task_features(model, shown, avoid=avoid, progress=table.progress_states, best=best)
-
-
 def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
     """The learning problem of inverse RL, with some of the actions or all."""
     table, model, features = setup.task.learner, setup.model, setup.features
@@ -123,14 +110,9 @@ def _train(
     """Reward weights and policies of N seeds."""
     table, model = setup.task.learner, setup.model
     wait = _compile_policy(problem, hparams)
-    found, history = run_seeds(
-        mlirl,
-        problem,
-        hparams,
-        training,
-        num_steps=num_steps or table.steps,
-        options=Options(until=Partial(_ends, table.tolerance), keep="before"),
-    )
+    options = Options(until=Partial(_ends, table.tolerance), keep="before")
+    steps = num_steps or table.steps
+    found, history = run_seeds(mlirl, problem, hparams, training, num_steps=steps, options=options)
     wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
     weights = states.parameters
@@ -139,18 +121,18 @@ def _train(
     policy, nll, codes = (np.stack(column) for column in zip(*each, strict=True))
     if table.in_world:
         policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
-    gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
+    gradient_norm = history["gradient_norm"][-1]
     return Learned(
         policy=np.asarray(policy),
         weights=weights,
         names=setup.features.names,
         loss=history["loss"][-1],
-        neg_log_likelihood=np.asarray(nll),
+        neg_log_likelihood=nll,
         gradient_norm=gradient_norm,
-        status=status,
+        status=codes,
         num_steps=np.asarray(states.step),
         # Values of softmax policies have no certificate without contraction.
-        converged=(gradient_norm <= table.tolerance) & (status <= Status.UNCERTIFIED),
+        converged=(gradient_norm <= table.tolerance) & (codes <= Status.UNCERTIFIED),
         history=history,
     )
 
@@ -234,30 +216,24 @@ def _constrained(
     top = max(required, max((point.probability for point in points), default=0))
 
     def mixed_loss(point: Point) -> float:
-        return point.loss + lost * np.log(max(top + _GAP - point.probability, _GAP))
+        left = max(top + _GAP - point.probability, _GAP)
+        return point.loss if enough else point.loss + lost * np.log(left)
 
-    chosen = [min(points, key=mixed_loss)] if points else []
-    if enough:
-        chosen = [min(enough, key=lambda point: point.loss)]
-    return [(_learned(point, free, problem, hparams), point.multiplier) for point in chosen]
-
-
-def _learned(
-    point: Point, free: Learned, problem: mlirl.Problem, hparams: mlirl.Hparams
-) -> Learned:
-    """The result at a point of the constrained problem."""
+    if not points:
+        return []
+    point = min(enough or points, key=mixed_loss)
     parameters = jnp.asarray(point.parameters, point.value.dtype)
     policy = np.asarray(_softmax_policy(parameters, point.value, problem, hparams))
-    return dataclasses.replace(
+    ends = point.stationarity <= _STATIONARY * (1 + np.linalg.norm(point.gradient))
+    learned = dataclasses.replace(
         free,
         policy=policy[None],
         weights=point.parameters[None],
         loss=np.array([point.loss]),
         gradient_norm=np.array([point.stationarity]),
-        converged=np.array(
-            [point.stationarity <= _STATIONARY * (1 + np.linalg.norm(point.gradient))]
-        ),
+        converged=np.array([ends]),
     )
+    return [(learned, point.multiplier)]
 
 
 @jax.jit
@@ -350,8 +326,18 @@ class Setup:
 
     @functools.cached_property
     def features(self) -> mlirl.Features:
-        """The features of the reward."""
-        return _features(self)
+        """The features of the reward, in the world or in the product (chapter 2)."""
+        table, model, shown = self.task.learner, self.model, self.used
+        avoid = table.avoid or ()
+        if table.in_world:
+            return mlirl.world_features(
+                model.mdp, shown, goal=table.goal or (), progress=table.progress_labels, avoid=avoid
+            )
+        # Without a guarantee, those of the dissertation's Table 1 alone.
+        best = None if self.guarantee.asked == "none" else self.guarantee.best
+        return mlirl.task_features(
+            model, shown, avoid=avoid, progress=table.progress_states, best=best
+        )
 
     @functools.cached_property
     def problem(self) -> mlirl.Problem:
@@ -459,20 +445,17 @@ def summary(outcome: Outcome) -> Record:
     """The results for ``result.json``."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
-    starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
-    best = setup.guarantee.best
+    initial, lengths = np.asarray(model.mdp.initial), np.asarray(setup.demonstrations.length)
+    starts, best = np.flatnonzero(initial > 0), setup.guarantee.best
     impossible = starts[from_starts(model, best.upper)[starts] <= 0].tolist()
-    mean = outcome.satisfaction @ np.asarray(model.mdp.initial)
-    least = outcome.satisfaction[:, starts].min(axis=1)
-    pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
     result = {
         **about(task),
         "in": task.learner.in_,
         "num_states": world.mdp.num_states,
         "num_memory": model.num_memory,
         "demonstrations": {
-            "number": len(np.asarray(setup.demonstrations.length)),
-            "pairs": pairs,
+            "number": len(lengths),
+            "pairs": int(lengths.sum()),
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
@@ -500,8 +483,8 @@ def summary(outcome: Outcome) -> Record:
             "number": len(learned.loss),
             "kept": i,
             "converged": int(learned.converged.sum()),
-            "mean": mean,
-            "minimum": least,
+            "mean": outcome.satisfaction @ initial,
+            "minimum": outcome.satisfaction[:, starts].min(axis=1),
             "loss": learned.loss,
             "neg_log_likelihood": learned.neg_log_likelihood,
         },
