@@ -23,8 +23,6 @@ Example:
 
 from __future__ import annotations
 
-import html
-import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -41,6 +39,7 @@ from jaxltl.core.environments import Environment, Episode
 from jaxltl.envs.flat_world import Discs, FlatState
 from jaxltl.envs.letter_world import LetterState
 from jaxltl.envs.zone_world import ZoneState
+from jaxltl.io.templates import render
 from jaxltl.plot.board import ROBOT, rule_cells
 from jaxltl.plot.style import ACCENT, FAINT, INK, KINDS, MUTED, PAPER, head, note, write
 
@@ -265,56 +264,6 @@ def _draw_ground(axes: Axes, scene: Scene) -> None:
 
 # --- a page that plays it -------------------------------------------------------------------------
 
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1f2a37; --muted: #5a6673; --line: #d5dae0;
-  --page: #f6f7f8; --card: #ffffff; --accent: #1a647e; --on-accent: #ffffff; --soft: #eef2f5; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6eaee; --muted: #a3afbb; --line: #3a444f;
-  --page: #13171c; --card: #1b2128; --accent: #74c0da; --on-accent: #0d1a20; --soft: #2a333c; } }
-body { margin: 0; padding: 1rem; background: var(--page); color: var(--ink);
-  font: 1rem/1.5 system-ui, sans-serif; }
-main { max-width: 34rem; margin: 0 auto; } h1 { font-size: 1.2rem; margin: 0 0 .6rem;
-  overflow-wrap: anywhere; }
-svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--line);
-  border-radius: 10px; } svg text { text-anchor: middle; dominant-baseline: central; }
-.letter rect { fill: var(--soft); } .letter text { fill: var(--muted); font-weight: 700; }
-.rule { stroke: var(--line); fill: none; } .disc text { fill: #1f2a37; }
-.track { fill: none; stroke: var(--accent); stroke-width: 3; stroke-linejoin: round; }
-.controls { display: flex; gap: .8rem; align-items: center; margin: .7rem 0; }
-button { min-width: 5rem; min-height: 2.75rem; border: 0; border-radius: 8px; font: inherit;
-  background: var(--accent); color: var(--on-accent); cursor: pointer; }
-input { flex: 1; min-width: 0; min-height: 2.75rem; accent-color: var(--accent); }
-:focus-visible { outline: 3px solid var(--accent); outline-offset: 2px; }
-output { font-variant-numeric: tabular-nums; } .muted { color: var(--muted); }
-"""
-_SCRIPT = """
-const frames = JSON.parse(document.getElementById("frames").textContent);
-const token = document.getElementById("token"), bar = document.getElementById("at");
-const lines = [...document.querySelectorAll(".track")], told = document.getElementById("told");
-const button = document.getElementById("play");
-let timer = null;
-function show(t) {
-  bar.value = t;
-  const [x, y] = frames.place[t];
-  const turn = frames.turn ? ` rotate(${frames.turn[t]})` : "";
-  token.setAttribute("transform", `translate(${x} ${y})${turn}`);
-  for (const line of lines) line.style.display = Number(line.dataset.step) <= t ? "" : "none";
-  const last = frames.place.length - 1;
-  told.textContent = `step ${t} of ${last}: ${frames.shown[t] || "nothing holds"}`;
-}
-function stop() { clearInterval(timer); timer = null; button.textContent = "Play"; }
-button.onclick = () => {
-  if (timer) return stop();
-  if (Number(bar.value) === frames.place.length - 1) show(0);
-  button.textContent = "Pause";
-  timer = setInterval(() => {
-    const t = Number(bar.value) + 1;
-    if (t < frames.place.length) show(t); else stop();
-  }, frames.wait);
-};
-bar.oninput = () => { stop(); show(Number(bar.value)); };
-show(0);
-"""
-
 
 def play_episode(environment: Environment, episode: Episode, *, title: str | None = None) -> str:
     """A self-contained HTML page that plays an episode, with a pause button and a slider.
@@ -327,7 +276,6 @@ def play_episode(environment: Environment, episode: Episode, *, title: str | Non
     """
     scene = scene_of(environment, episode)
     zoom = _PIXELS / scene.size
-    name = html.escape(_met(scene) if title is None else title)
     frames: dict[str, Any] = {
         "place": (scene.track * zoom).round(1).tolist(),
         "shown": scene.shown,
@@ -335,51 +283,18 @@ def play_episode(environment: Environment, episode: Episode, *, title: str | Non
     }
     if scene.heading is not None:
         frames["turn"] = (-np.degrees(scene.heading)).round(1).tolist()
-    data = json.dumps(frames).replace("<", "\\u003c")
-    last = len(scene.track) - 1
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<style>{_STYLE}</style><main><h1>{name}</h1>{_ground_svg(scene, zoom)}"
-        '<div class="controls"><button id="play">Play</button>'
-        f'<input id="at" type="range" min="0" max="{last}" value="0" aria-label="step"></div>'
-        '<p><output id="told" for="at"></output></p></main>'
-        f'<script type="application/json" id="frames">{data}</script>'
-        f"<script>{_SCRIPT}</script></html>"
-    )
-
-
-def _ground_svg(scene: Scene, zoom: float) -> str:
-    """SVG of the map, the track by steps, and the agent."""
-    side, parts = scene.size * zoom, []
-    for column, row, name in scene.letters:
-        x, y = column * zoom, row * zoom
-        parts.append(
-            f'<g class="letter"><rect x="{x:.1f}" y="{y:.1f}" width="{zoom:.1f}" '
-            f'height="{zoom:.1f}"/><text x="{x + zoom / 2:.1f}" y="{y + zoom / 2:.1f}" '
-            f'font-size="{zoom * 0.4:.1f}">{html.escape(name)}</text></g>'
-        )
-    for i in range(1, scene.cells):
-        parts.append(
-            f'<path class="rule" d="M{i * zoom:.1f} 0V{side:.1f}M0 {i * zoom:.1f}H{side:.1f}"/>'
-        )
-    for i, (x, y, radius, name) in enumerate(scene.discs):
-        x, y = x * zoom, y * zoom
-        parts.append(
-            f'<g class="disc"><circle cx="{x:.1f}" cy="{y:.1f}" r="{radius * zoom:.1f}" '
-            f'fill="{tint(name, i)}"/><text x="{x:.1f}" y="{y:.1f}" font-size="13">'
-            f"{html.escape(name)}</text></g>"
-        )
-    for t in range(len(scene.track) - 1):
-        piece = scene._replace(track=scene.track[t : t + 2], shown=[])
-        for line in _segments(piece._replace(cells=0)):
-            points = " ".join(f"{x:.1f},{y:.1f}" for x, y in line * zoom)
-            parts.append(f'<polyline class="track" data-step="{t + 1}" points="{points}"/>')
-    radius = zoom * 0.3 if scene.cells else 9
-    nose = "" if scene.heading is None else f'<path d="M{radius} -4L{radius + 8} 0L{radius} 4Z"/>'
-    parts.append(f'<g id="token" fill="{ROBOT}"><circle r="{radius:.1f}"/>{nose}</g>')
-    told = "A map of cells" if scene.cells else "A map"
-    return (
-        f'<svg viewBox="0 0 {side:.1f} {side:.1f}" role="img" aria-label="{told} with the '
-        f'agent on it">{"".join(parts)}</svg>'
+    pieces = [
+        scene._replace(track=scene.track[t : t + 2], cells=0) for t in range(len(scene.track) - 1)
+    ]
+    return render(
+        "jaxltl.plot",
+        "episode.html",
+        title=_met(scene) if title is None else title,
+        scene=scene,
+        zoom=zoom,
+        side=_PIXELS,
+        lines=[(t + 1, line) for t, piece in enumerate(pieces) for line in _segments(piece)],
+        frames=frames,
+        tint=tint,
+        robot=ROBOT,
     )

@@ -21,7 +21,7 @@ from jaxltl.core.environments.environment import Environment, Timestep
 from jaxltl.envs import lqr, navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import apply, make_network
-from jaxltl.reproduce.experiment import Figures, svg_files
+from jaxltl.reproduce.experiment import Figures, render_table, svg_files
 from jaxltl.core.models.protocols import PyTree
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
@@ -462,55 +462,7 @@ def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures,
 
 def table(result: Figures) -> str:
     """The report of section 4.5."""
-    lines = [
-        f"Section 4.5.1: a regulator with bounded controls, optimal cost "
-        f"{result['lqr_optimum']:.10f}",
-        "",
-        f"{'network':12}{'parameters':>12}{'feasible':>12}{'median gap':>12}{'largest gap':>13}",
-        *(
-            f"{x['network']:12}{x['parameters']:>12}{x['feasible']:>8} / {x['seeds']:<3}"
-            f"{_number(x['gap_median'], '10.4g'):>10}{_number(x['gap_max'], '11.4g'):>13}"
-            for x in result["lqr"]
-        ),
-        "",
-        "Section 4.5.2: a robot; objectives J are to be large, costs H at most the limit",
-    ]
-    for title, rows in (
-        ("", result["navigation"]),
-        ("from feasible policies", result["navigation_feasible_start"]),
-    ):
-        lines += [
-            "",
-            *([title] if title else []),
-            f"{'':28}{'feasible':>10}{'':>4}{'returned policies':>20}{'':>4}thousand trajectories",
-            f"{'task':6}{'limit':>6}  {'method':16}{'seeds':>8}{'sure':>6}{'J':>8}{'H':>8}"
-            f"    until first feasible, of the total",
-        ]
-        for x in rows:
-            first = ", ".join(
-                "-" if t is None else f"{t / 1000:.1f}" for t in x["trajectories_to_feasible"]
-            )
-            lines.append(
-                f"{x['task']:<6}{x['limit']:>6}  {x['method']:16}"
-                f"{x['seeds_feasible']:>4} / {x['seeds']:<2}{x['seeds_confident']:>5}"
-                f"{x['objective_mean']:>8.1f}{x['cost_mean']:>8.2f}    {first} of "
-                f"{x['trajectories'] / 1000:g}"
-            )
-    return "\n".join([*lines, "", *_DIFFERENCES, "", f"{result['seconds']:.1f} s in all"])
-
-
-def _number(x: float | None, form: str) -> str:
-    return "-" if x is None else format(x, form)
-
-
-_DIFFERENCES = (
-    "Published: pictures without digits. Gaps are of the returned policies that are feasible.",
-    "J and H of the robot are means over the seeds on 1,000 fresh trajectories of each returned",
-    "policy: of CCE the mean of the last distribution or the best sample, whichever is feasible",
-    "and better; of the others the last policy, with its noise. Sure: the 95% interval of H is",
-    "below the limit too. First feasible: the sampled policies, on average. The map is ours, read",
-    "off a picture. The rewards of TRPO and CPO are the increments of J and Z in each step.",
-)
+    return render_table("cce.txt", **result)
 
 
 # --- pictures -----------------------------------------------------------------------------------

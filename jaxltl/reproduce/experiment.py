@@ -8,6 +8,8 @@ from typing import Any, Protocol, TypeVar
 
 import jax
 
+from jaxltl.io.templates import render
+
 ResultT = TypeVar("ResultT")
 Figures = dict[str, Any]  # numbers, texts, and lists and dicts of them, as in JSON
 
@@ -33,6 +35,12 @@ def run_seconds(job: Callable[[], ResultT]) -> tuple[ResultT, float]:
     jax.block_until_ready(job())
     begin = time.perf_counter()
     return jax.block_until_ready(job()), round(time.perf_counter() - begin, 4)
+
+
+def render_table(template: str, **values: object) -> str:
+    """A report by a template, without blanks at the ends of lines."""
+    lines = render("jaxltl.reproduce", template, **values).splitlines()
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def svg_files(drawn: Mapping[str, Any]) -> list[tuple[str, bytes]]:

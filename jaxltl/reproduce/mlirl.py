@@ -24,7 +24,7 @@ from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
-from jaxltl.reproduce.experiment import Figures
+from jaxltl.reproduce.experiment import Figures, render_table
 
 MAP = """
 w  w  w  w  w  w  r  w  w  w
@@ -184,60 +184,7 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
 
 def table(result: Figures) -> str:
     """The report of section 2.5."""
-    lines = [
-        "Section 2.5: inverse reinforcement learning with a temporal-logic task",
-        "satisfaction probability over 88 initial states (discount 0.5, mu 0.01)",
-        "",
-        f"{'':34}{'published':>22}{'measured':>24}",
-        f"{'':34}{'mean':>11}{'minimum':>11}{'mean':>13}{'minimum':>11}",
-    ]
     titles = ("case 1: in the world", "case 2: in the product", "case 3: with satisfaction")
-    for i, title in enumerate(titles, start=1):
-        ours, theirs = result[f"case{i}"], PUBLISHED[f"case{i}"]
-        lines.append(
-            f"{title:34}{theirs['mean']:>11.3f}{theirs['min']:>11.3g}"
-            f"{ours['mean']:>13.4f}{ours['min']:>11.4g}"
-        )
-    missing = result["missing_safety"]
-    row, column = divmod(missing["worst"], 10)
-    lines += [
-        f"{'task without its safety part':34}{'(picture)':>22}{missing['mean']:>13.4f}"
-        f"{missing['min']:>11.4g}   at row {row + 1}, column {column + 1};",
-        f"{'':69} row 7, column 5: {missing['row_7_column_5']:.4f}",
-        "",
-        "weights   demonstrated, goal, progress, avoid, time; negative log-likelihood",
-    ]
-    for i in (1, 2, 3):
-        ours, theirs = result[f"case{i}"], PUBLISHED[f"case{i}"]
-        lines += [
-            f"  case {i}  published " + " ".join(f"{x:8.3f}" for x in theirs["theta"]),
-            "          measured  "
-            + " ".join(f"{x:8.3f}" for x in ours["theta"])
-            + f"   {ours['neg_log_likelihood']:.3f}",
-        ]
-    lines += ["", f"{'mu':>10}{'mean':>10}{'minimum':>10}{'neg. log-likelihood':>22}"]
-    lines += [
-        f"{x['mu']:>10g}{x['mean']:>10.4f}{x['min']:>10.4f}{x['neg_log_likelihood']:>22.3f}"
-        for x in result["mu_sweep"]
-    ]
-    bound = max(result[f"case{i}"]["bound"] for i in (1, 2, 3))
-    return "\n".join(
-        [
-            *lines,
-            "",
-            *_DIFFERENCES,
-            "",
-            f"every probability is certified within {bound:.0e}; {result['seconds']:.1f} s",
-        ]
-    )
-
-
-_DIFFERENCES = (
-    "Differences: the published map is a picture whose cells the text does not give, so ours",
-    "is a surrogate with the same landmarks and other demonstrations, and the discount is not",
-    "printed. What carries over is the order and what drives it: without the task (case 1) the",
-    "policy fails where demonstrations are lacking; in the product (case 2) it mostly succeeds,",
-    "but its weight on avoiding red stays near zero; the satisfaction term (case 3) makes that",
-    "weight large and lifts the worst start, at no cost in likelihood. Without the safety part",
-    "(learned as in case 2) the text singles out row 7, column 5, closed in by red on three sides.",
-)
+    names = ("case1", "case2", "case3")
+    cases = [(t, result[n], PUBLISHED[n]) for t, n in zip(titles, names, strict=True)]
+    return render_table("mlirl.txt", cases=cases, **result)

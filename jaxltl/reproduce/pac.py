@@ -22,7 +22,7 @@ from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
-from jaxltl.reproduce.experiment import Figures, run_seconds, svg_files
+from jaxltl.reproduce.experiment import Figures, render_table, run_seconds, svg_files
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
 RESTART = 1 / 50  # probability of a restart before a move
@@ -207,80 +207,13 @@ def _evaluated(
 
 def table(result: Figures) -> str:
     """The report of section 6.7."""
-    first, graph = result["initial_strategy"], result["winning_strategy"]
-    rows = [
-        ("states", "states"),
-        ("of the system", "system_states"),
-        ("actions of the system", "system_transitions"),
-        ("almost surely winning", "almost_sure_states"),
-    ]
-    seen = {**PUBLISHED, "almost_sure_states": PUBLISHED["states"]}
-    lines = [
-        "Section 6.7: two post offices and a signal light (discount 0.6, epsilon 1e-4)",
-        "",
-        f"{'':32}{'published':>12}{'measured':>12}",
-        *(f"{title:32}{seen[key]:>12}{result[key]:>12}" for title, key in rows),
-        f"{'seconds of one run':32}{seen['seconds']:>12}{result['seconds']:>12.4f}",
-        f"{'seconds to its last update':32}{seen['last_update_seconds']:>12}"
-        f"{result['last_update_seconds']:>12.4f}",
-        "",
-        "optimal values of the system's states, and their number of states: "
-        + ", ".join(f"{v}: {n}" for v, n in result["values"].items()),
-        "",
-        f"{'worst-case value (published as a picture)':48}{'min':>10}{'max':>10}{'mean':>10}",
-        *(
-            f"  {title:46}{x['min']:>10.6f}{x['max']:>10.6f}{x['mean']:>10.6f}"
-            for title, x in (
-                ("initial strategy: uniform over allowed actions", first),
-                ("pure winning strategy, by the graph only", graph),
-            )
-        ),
-        "",
-        "in the true model, the largest loss of the strategies of algorithm 4, which explore with a",
-        f"small probability: {result['hat_strategy_gap']:.3e} for the winning strategy of the hat "
-        f"game, {result['uniform_hat_strategy_gap']:.3e} for the",
-        "uniform one of Remark 4 (the bound is epsilon / 6)",
-        "",
-        f"learned: epsilon-optimal of the {result['reachable_system_states']} reachable states of "
-        "the system, in the worst case and against the environment played",
-        "",
-        f"{'':6}{f'restarts, one in {round(1 / RESTART)} moves':>38}{'no restarts':>38}",
-        f"{'seed':>6}" + f"{'last update':>14}{'updates':>10}{'worst':>7}{'played':>7}" * 2,
-    ]
-    for pair in zip(result["learned"], result["learned_without_restarts"], strict=True):
-        lines.append(
-            f"{pair[0]['seed']:>6}"
-            + "".join(
-                f"{x['last_update_step']:>14}{x['updates']:>10}{x['eps_optimal_states']:>7}"
-                f"{x['eps_optimal_states_played']:>7}"
-                for x in pair
-            )
-        )
-    runs = [*result["learned"], *result["learned_without_restarts"]]
-    sure = sum(x["always_almost_sure"] for x in runs)
-    return "\n".join(
-        [
-            *lines,
-            "",
-            *_DIFFERENCES,
-            "",
-            f"{sure} of {len(runs)} runs won almost surely at every moment, by the graph; "
-            f"{len(result['learned'])} runs in one call take {result['seconds_together']:.3f} s; "
-            f"{result['total_seconds']:.1f} s in all",
-        ]
+    return render_table(
+        "pac.txt",
+        result=result,
+        published=PUBLISHED,
+        restart=round(1 / RESTART),
+        pairs=list(zip(result["learned"], result["learned_without_restarts"], strict=True)),
     )
-
-
-_DIFFERENCES = (
-    "A run ends after 20,000 moves without an update (published: 10,000 steps); times are medians",
-    "of single runs without compilation. The published 192 counts the system's actions; with those",
-    "of the light there are 336. In the published picture the learned values lie above the initial",
-    "ones and, by the text, far from the optimal ones. Epsilon-optimality excludes that: ours",
-    "coincide with the optimal ones in every state counted above. Runs without restarts converge",
-    "to a round trip, and actions of the light that do not occur stay unknown; all reachable",
-    "states, as published, are learned with restarts only. In unreachable states the learned",
-    "values are meaningless.",
-)
 
 
 # --- pictures -----------------------------------------------------------------------------------

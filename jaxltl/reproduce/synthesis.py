@@ -17,7 +17,7 @@ from jaxltl.core.models import Game, Restriction
 from jaxltl.core.types import NotConverged, check
 from jaxltl.core.values import minimax_value, optimal_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
-from jaxltl.reproduce.experiment import Figures, run_seconds, svg_files
+from jaxltl.reproduce.experiment import Figures, render_table, run_seconds, svg_files
 
 SIZES = (3, 4, 5, 6, 8, 10)
 BOUNDS = (4, 6, 8, 10, 14, 20)
@@ -197,77 +197,11 @@ def _figure_12() -> Figures:
 
 def table(result: Figures) -> str:
     """The report of section 5.5."""
-    lines = [
-        "Section 5.5, example 1: two robots, avoid collision (discount 0.9 for each system move)",
-        "",
-        f"{'':4}{'states':>8}{'system':>8}{'synthesis [s]':>22}{'learning [s]':>22}"
-        f"{'moves':>24}{'error':>10}",
-        f"{'N':>4}{'':16}{'published':>12}{'measured':>10}{'published':>12}{'measured':>10}"
-        f"{'published':>13}{'measured':>11}",
-    ]
-    for row in result["table5"]:
-        extraction, learning, moves, states, system = TABLE5[row["n"]]
-        same = "" if (states, system) == (row["states"], row["system_states"]) else "   differs"
-        lines.append(
-            f"{row['n']:>4}{row['states']:>8}{row['system_states']:>8}"
-            f"{extraction:>12.2f}{row['synthesis_seconds']:>10.4f}"
-            f"{learning:>12.2f}{row['learning_seconds']:>10.4f}"
-            f"{moves:>13.3g}{row['learning_moves']:>11.3g}{row['max_error']:>10.1e}{same}"
-        )
-    lines += ["", "values at the system's states, and at how many of them"]
-    lines += [
-        f"{row['n']:>4}  "
-        + ", ".join(f"{value}: {count}" for value, count in reversed(row["values"].items()))
-        for row in result["table5"]
-    ]
-    lines += [
-        "",
-        "Example 3 at N = 3: the best value under each strategy",
-        "",
-        f"{'counter':>12}{'states':>8}{'published':>12}{'measured':>12}",
-    ]
-    lines.append(
-        f"{'memoryless':>12}{'':8}{MEMORYLESS:>12.4f}{result['memoryless_permissive_max']:>12.6f}"
-    )
-    lines += [
-        f"{row['bound']:>12}{row['states']:>8}{TABLE6[row['bound']]:>12.4f}"
-        f"{row['max_value']:>12.6f}"
-        for row in result["table6"]
-    ]
-    second, twelve = result["example2"], result["figure12"]
-    lines += [
-        "",
-        "Example 2 at N = 4, assumptions and guarantees, by rank (published as a picture):",
-        f"  over initial states: maximum {second['max']:.6f}, minimum {second['min']:.6f}, "
-        f"mean {second['mean']:.6f}",
-        "",
-        f"Figure 12: the supremum is {twelve['supremum']:g}, "
-        + (
-            "attained"
-            if twelve["attained"]
-            else "and no strategy that satisfies the task attains it"
-        )
-        + "; satisfying the task within m visits:",
-        "  " + ", ".join(f"{x['bound']}: {x['value']:.3f}" for x in twelve["delays"]),
-        "",
-        *_DIFFERENCES,
-        "",
-        f"no move left its mask ({sum(x['violations'] for x in result['table5'])} of "
-        f"{sum(x['learning_moves'] for x in result['table5']):.3g} moves); "
-        f"{result['seconds']:.1f} s",
-    ]
-    return "\n".join(lines)
-
-
-_DIFFERENCES = (
-    "Times are of the second call: the first one compiles. Learning stops when the largest error",
-    "on the recurrent states is below 0.001; 1,024 parallel games share one table, so moves are",
-    "faster, and more of them are needed than in a sequence. In example 2 no strategy is the most",
-    "permissive one, and values depend on the choice: ours uses the iterations of the triple",
-    "fixpoint. The memory update that section 5.4.1 prints for the",
-    "second strategy of figure 12's game never changes the memory, so that strategy does not win;",
-    "the one of section 5.3 does.",
-)
+    rows = {
+        "table5": [(row, TABLE5[row["n"]]) for row in result["table5"]],
+        "table6": [(row, TABLE6[row["bound"]]) for row in result["table6"]],
+    }
+    return render_table("synthesis.txt", memoryless=MEMORYLESS, **{**result, **rows})
 
 
 def pictures(result: Figures) -> list[tuple[str, bytes]]:

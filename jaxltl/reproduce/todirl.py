@@ -21,7 +21,7 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.undiscounted.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
 from jaxltl.io.colored_world import read_world, write_world
-from jaxltl.reproduce.experiment import Figures, svg_files
+from jaxltl.reproduce.experiment import Figures, render_table, svg_files
 from jaxltl.core.models.protocols import PyTree
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
@@ -318,37 +318,7 @@ def _references(setting: Setting) -> list[Figures]:
 
 def table(result: Figures) -> str:
     """The report of section 3.5."""
-    count = result["seeds"]
-    lines = [
-        "Section 3.5: satisfaction probability (L_phi) with rewards learned in one world,",
-        f"mean over {count} seeds (standard deviation over seeds)",
-        "",
-        f"{'demonstrations':>14}  {'method':12}{'training world':>20}{'test worlds':>20}"
-        f"{'worst':>8}{'steps':>8}",
-        *(
-            f"{x['demonstrations']:>14}  {x['method']:12}"
-            f"{_mean_and_deviation(x, 'train'):>20}{_mean_and_deviation(x, 'test'):>20}"
-            f"{x['test_worst']:>8.3f}{x['steps']:>8.0f}"
-            for x in result["by_demonstrations"]
-        ),
-        "",
-        *(
-            f"{'':>14}  {x['policy']:12}{x['train_mean']:>12.4f}{'':8}{x['test_mean']:>12.4f}"
-            f"{'':8}{x['test_worst']:>8.3f}"
-            for x in result["reference"]
-        ),
-        "",
-        *_orders(result["by_demonstrations"]),
-        "",
-        *_DIFFERENCES,
-        "",
-        f"{result['seconds']:.1f} s in all",
-    ]
-    return "\n".join(lines)
-
-
-def _mean_and_deviation(row: Figures, part: str) -> str:
-    return f"{row[part + '_mean']:.4f} ({row[part + '_std']:.4f})"
+    return render_table("todirl.txt", orders=_orders(result["by_demonstrations"]), **result)
 
 
 def _orders(rows: list[Figures]) -> list[str]:
@@ -367,16 +337,6 @@ def _orders(rows: list[Figures]) -> list[str]:
             f"{verdict}"
         )
     return lines
-
-
-_DIFFERENCES = (
-    "Published: pictures without digits. All seeds share 20 test worlds and differ in the colours",
-    "of the training world, in their demonstrations and starts. Learning is stopped by the",
-    "likelihood of a fifth of the demonstrations, which are held out; test worlds are not used.",
-    "incomplete: obstacles are not in the automaton; patch5: the reward sees 5 x 5 cells;",
-    "memoryless: no automaton; cloning: a convolutional policy. Worst: minimum over seeds and test",
-    "worlds. Ahead or behind: by more than two standard errors of the difference paired by seed.",
-)
 
 
 def pictures(result: Figures) -> list[tuple[str, bytes]]:

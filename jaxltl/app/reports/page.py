@@ -18,6 +18,7 @@ from jaxltl.app.reports.explorer import START, Curves, Explorer, Layer, TooLarge
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.io import templates
 from jaxltl.app.wording import Record, Result, many, place, where
 
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
@@ -89,13 +90,7 @@ def render_remarks(template: str, **values: object) -> list[figures.Remark]:
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    found = jinja2.Environment(
-        loader=jinja2.PackageLoader("jaxltl.app.reports"),
-        autoescape=jinja2.select_autoescape(),  # of HTML
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    found = templates.environment("jaxltl.app.reports")
     names = ("number", "probability", "certified", "mean_deviation", "rounded_down")
     functions = [getattr(figures, name) for name in names]
     found.filters |= {function.__name__: function for function in (*functions, place, many)}
