@@ -29,8 +29,10 @@ CASES = (
     ("csma.4-6", "csma/csma.4-6", None, "some_before"),
     ("crowds, 6 runs of 20", "crowds/crowds", "TotalRuns=6,CrowdSize=20", "positive"),
     ("egl, N=10, L=2", "egl/egl", "N=10,L=2", "unfairA"),
+    ("nand, N=60, K=3", "nand/nand", "N=60,K=3", "reliable"),
     ("nand, N=60, K=4", "nand/nand", "N=60,K=4", "reliable"),
     ("consensus.8, K=2", "consensus/consensus.8", "K=2", "c2"),
+    ("consensus.10, K=2", "consensus/consensus.10", "K=2", "c2"),
     (
         "firewire, delay 36, deadline 400",
         "firewire/firewire.true",

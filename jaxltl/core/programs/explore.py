@@ -15,6 +15,7 @@ from jaxltl.core.programs.hash_table import HashTable
 from jaxltl.core.programs.layout import Layout, Words
 from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
 from jaxltl.core.programs.narrow import search_narrow
+from jaxltl.core.programs.symmetry import Orbit
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges
 
@@ -108,6 +109,7 @@ class Search:
         self.actions = ("", *names)
         self.columns = _columns(self.codes, self.actions)
         self.known = HashTable(layout.num_words)
+        self.orbits: tuple[Orbit, ...] = ()  # successors are found up to these symmetries
         self.output = _Output()
         self.num_transitions = 0
 
@@ -299,6 +301,8 @@ class Search:
             else:
                 weight[part] = self.weights.product(weight[part], more)
         assert weight is not None
+        for orbit in self.orbits:
+            orbit.sort(self.layout, tuple(target))
         self.output.successor.append(self.known.insert(tuple(target)))
         self.output.weight.append(weight)
         self._check_size()

@@ -25,6 +25,7 @@ from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_l
 from jaxltl.core.programs.explore import Explored, Search
 from jaxltl.core.programs.initial import initial_states
 from jaxltl.core.programs.layout import Reader, make_layout
+from jaxltl.core.programs.symmetry import find_orbits
 from jaxltl.core.programs.weights import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.types import Solution, Status
@@ -36,9 +37,13 @@ from jaxltl.core.values.properties.solve_property import TOLERANCE, as_answer, s
 Method = Literal["build", "partial"]
 Report = Callable[[int, int, Answer], None]  # of the numbers of states found and expanded
 
-_FIRST = 1000  # states before the first solve; each further one has twice as many
+_FIRST = 1000  # states before the first solve
+_GROWTH = {"dtmc": 2.0, "mdp": 1.3}  # of their number between two solves
 _NEAR = 0.1  # states with this share of the largest weight are expanded together
-_SHARE = 50  # the share of known states that is expanded at least is 1 / _SHARE, so that batches are large
+_SHARE = 50  # of an mdp at least 1 / _SHARE of the known states are, so that batches are large
+# A chain's states are expanded from a reach probability on, which falls by a factor when less than
+# this share of states is new.
+_FALL, _MORE = 3.0, 1.5
 _WORK = 30  # entries visited for the weights, as a multiple of the transitions
 _STEP = 100  # entries that take as long as the rest of a step
 _FINE = 0.1  # share of the tolerance for the errors of the solver
@@ -63,8 +68,8 @@ def solve_program(
     learning algorithms"; Ashok et al. 2019). States that are not expanded count as 0 for the
     lower bound and as 1 for the upper bound, and both models are solved exactly as others are, with
     their end components, so that the bounds are certified. The states that a policy which is
-    optimal for the bound on the optimistic side reaches most likely are expanded next, until the
-    explored part has twice the states.
+    optimal for the bound on the optimistic side reaches most likely are expanded next. States that
+    differ by exchanges of equal modules or variables count as one state.
 
     Args:
       program: of ``jl.io.read_program``. Of an mdp or a dtmc without intervals for ``"partial"``.
@@ -138,7 +143,7 @@ def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | No
             report(part.num_states, part.num_expanded, answer)
         if answer.status == Status.CONVERGED or not part.frontier.any() or part.room <= 0:
             return answer
-        size = 2 * part.num_expanded
+        size = max(_FIRST, int(_GROWTH[part.program.kind] * part.num_expanded) + 1)
 
 
 def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
@@ -220,6 +225,8 @@ class _Conditions:
             )
         require_known(labels, (*program.labels, "init"), prop.text)
         self.labels = {n: compile_expressions([program.labels[n]]) for n in labels}
+        self.expressions = [program.labels[n] for n in labels]
+        self.expressions += [c.expression for c in self.comparisons.values()]
 
     def holds(self, read: Reader, size: int, initial: bool) -> list[Booleans]:
         """The truth ``bool[N]`` of each formula in N states."""
@@ -244,28 +251,39 @@ class _Part:
         self.conditions = _Conditions(program, (event.stay, event.goal), prop)
         self.layout = make_layout(program.variables)
         self.search = Search(program, self.layout, Numbers(), 2**31 - 2)
+        if "init" not in self.conditions.names:
+            self.search.orbits = find_orbits(program, self.conditions.expressions)
         initial = initial_states(program, self.layout, max_states)
         self.num_initial = initial[0].size
         self.search.known.fill(initial)
         self.order: list[Integers] = []  # expanded states
-        self.stay, self.goal, self.expanded = (np.zeros(0, bool) for _ in range(3))
-        self.weight = np.zeros(0)  # estimates of reach probabilities, of the frontier
+        self.num_expanded = self.size = 0
+        self.truths = np.zeros((3, 0), bool)  # stay, goal and expanded, with room for more states
+        self.weights = np.zeros(0)
+        self.least = 1.0  # reach probability of a chain's states that are expanded
+        self.before = 0  # states that were expanded before the last search
         self.widest = 1.0  # new states of an expanded one
-        self._add(np.ones(self.num_initial))
+        self._add(1.0)
         self._expand(np.arange(self.num_initial))
+
+    @property
+    def weight(self) -> Floats:
+        """Estimates of reach probabilities, of the frontier."""
+        return self.weights[: self.size]
 
     @property
     def num_states(self) -> int:
         return len(self.search.known)
 
     @property
-    def num_expanded(self) -> int:
-        return sum(x.size for x in self.order)
-
-    @property
     def frontier(self) -> Booleans:
         """States that are not expanded and do not decide the event."""
-        found: Booleans = self.stay & ~self.goal & ~self.expanded
+        return self.frontier_of(slice(self.size))
+
+    def frontier_of(self, states: Integers | slice) -> Booleans:
+        """The marks of some states in :attr:`frontier`."""
+        stay, goal, expanded = self.truths[:, states]
+        found: Booleans = stay & ~goal & ~expanded
         return found
 
     @property
@@ -275,26 +293,45 @@ class _Part:
 
     def expand_to(self, size: int) -> None:
         """Expands the frontier states with the largest weights until `size` states are expanded."""
-        expanded = self.num_expanded
-        while expanded < size and self.room > 0 and (states := np.flatnonzero(self.frontier)).size:
-            weight = self.weight[states]
-            near = int(np.count_nonzero(weight >= _NEAR * weight.max()))
-            count = min(max(near, expanded // _SHARE), self.room, size - expanded, states.size)
+        states = np.flatnonzero(self.frontier)
+        if self.program.kind == "dtmc":
+            # From a fixed weight on, so that the probability of all paths to a state is known
+            # before it is expanded where these have the same length.
+            top = float(self.weight[states].max(initial=0.0))
+            if self.num_expanded < _MORE * self.before:
+                self.least = min(top, self.least) / _FALL
+            states = states[self.weight[states] >= self.least]
+        self.before = self.num_expanded
+        while states.size and self.num_expanded < size and self.room > 0:
+            count = min(states.size, self.room, size - self.num_expanded)
+            if self.program.kind == "mdp":
+                weight = self.weight[states]
+                near = int(np.count_nonzero(weight >= _NEAR * weight.max()))
+                count = min(max(near, self.num_expanded // _SHARE), count)
             if count < states.size:
-                states = np.sort(states[np.argpartition(-weight, count - 1)[:count]])
-            self._expand(states)
-            expanded += states.size
+                order = np.argpartition(-self.weight[states], count - 1)
+                states = np.sort(states[order[:count]])
+            reached = self._expand(states)
+            if self.program.kind == "mdp":
+                states = np.flatnonzero(self.frontier)
+            else:
+                inner = self.frontier_of(reached) & (self.weight[reached] >= self.least)
+                states = np.unique(reached[inner])
 
-    def _add(self, weight: Floats) -> None:
+    def _add(self, weight: float) -> None:
         """Truths of the state formulas in the states that were found last."""
-        before = self.stay.size
-        words = self.search.known.words(before, self.num_states)
-        found = self.conditions.holds(Reader(self.layout, words), words[0].size, before == 0)
-        self.stay, self.goal = np.append(self.stay, found[0]), np.append(self.goal, found[1])
-        self.expanded = np.append(self.expanded, np.zeros(weight.size, bool))
-        self.weight = np.append(self.weight, weight)
+        before, size = self.size, self.num_states
+        if size > self.truths.shape[1]:
+            self.truths = np.pad(self.truths, ((0, 0), (0, 2 * size - self.truths.shape[1])))
+            self.weights = np.pad(self.weights, (0, 2 * size - self.weights.size))
+        words = self.search.known.words(before, size)
+        found = self.conditions.holds(Reader(self.layout, words), size - before, before == 0)
+        self.truths[:2, before:size] = found
+        self.weights[before:size] = weight
+        self.size = size
 
-    def _expand(self, states: Integers) -> None:
+    def _expand(self, states: Integers) -> Integers:
+        """Adds the successors of some states, and returns them."""
         before, out = self.num_states, self.search.output
         parts: tuple[list[NDArray[Any]], ...] = (
             *(out.row_count, out.entry_count, out.successor, out.weight),
@@ -306,13 +343,15 @@ class _Part:
             for part, i in zip(parts, begin, strict=True)
         )
         self.order.append(states)
-        self.expanded[states] = True
+        self.num_expanded += states.size
+        self.truths[2, states] = True
         self.widest = max(self.widest, (self.num_states - before) / states.size)
-        self._add(np.zeros(self.num_states - before))
+        self._add(0.0)
         # Reach probabilities of a chain; of an mdp those of the most likely paths.
         mass = self.weight[states].repeat(rows).repeat(entries) * probability
         merge = np.add if self.program.kind == "dtmc" else np.maximum
         merge.at(self.weight, successor, mass)
+        return successor
 
     def guide(self, row: Integers, gap: Floats) -> None:
         """Sets the weights of the frontier to its reach probabilities under a policy.
@@ -321,7 +360,8 @@ class _Part:
         """
         host, frontier = self.model.host, self.frontier[self.states]
         first, last = host.entry_start[row], host.entry_start[row + 1]
-        passed = (self.stay & ~self.goal & self.expanded)[self.states] & (gap > _REST)
+        stay, goal, expanded = self.truths[:, self.states]
+        passed = stay & ~goal & expanded & (gap > _REST)
         state = np.arange(self.num_initial)
         mass, reached = np.full(state.size, 1 / state.size), np.zeros(host.num_states)
         work, steps = _WORK * host.num_transitions, self.event.steps
@@ -342,7 +382,7 @@ class _Part:
         """Makes the model of the explored part: `model`, whose states are those of `states`."""
         out, size = self.search.output, self.num_states
         done = np.concatenate(self.order)
-        self.states = np.concatenate([done, np.flatnonzero(~self.expanded)])
+        self.states = np.concatenate([done, np.flatnonzero(~self.truths[2, :size])])
         place = np.empty(size, np.int32)
         place[self.states] = np.arange(size, dtype=np.int32)
         empty = np.zeros(0, np.int32)
@@ -363,7 +403,7 @@ class _Part:
             found, _ = as_chain(found, Numbers(), {})
         initial = np.zeros(size)
         initial[: self.num_initial] = 1 / self.num_initial
-        truths = (self.stay, self.goal, self.frontier)
+        truths = (*self.truths[:2, :size], self.frontier)
         self.model = make_sparse(
             offsets_from_counts(found.row_count),
             offsets_from_counts(found.entry_count),

@@ -98,7 +98,7 @@ def test_few_states_of_a_large_program_suffice():
     program = read_program(WALK, {"N": 2**31 - 2})
     found = solve_program(program, "P=? [ F x=20 ]", method="partial")
     assert found.lower[0] <= 2 / (3**20 - 1) <= found.upper[0] <= found.lower[0] + 1e-6
-    assert found.method.startswith("partial exploration of 2")
+    assert int(found.method.split()[3]) < 30
     assert solve_program(program, "P<0.01 [ F x=20 ]", method="partial").holds == [True]
     assert solve_program(program, "P>=0.99 [ F<=1000 x=0 ]", method="partial").holds == [True]
     assert solve_program(program, "P=? [ G x<20 ]", method="partial").lower[0] > 0.99999
