@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Generic, cast
 
 import chex
 import jax
@@ -19,7 +19,15 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
+from jaxltl.core.models.protocols import (
+    Arena,
+    Array,
+    LabelledModel,
+    Model,
+    PyTree,
+    SuccessorModel,
+    base_model,
+)
 from jaxltl.core.models.sparse import SparseMDP
 
 
@@ -34,7 +42,7 @@ def _facts(value: Game) -> Iterator[str]:
 
 @brief(facts=_facts, drawn=True)
 @struct.dataclass
-class Game:
+class Game(Generic[Arena]):
     """Turn-based stochastic game of the system against the environment; see :func:`make_game`.
 
     Attributes:
@@ -48,7 +56,7 @@ class Game:
       (2, [True, False], [[True], [True]])
     """
 
-    mdp: Any
+    mdp: Arena
     system: jax.Array
 
     @property
@@ -59,12 +67,12 @@ class Game:
     @property
     def num_actions(self) -> int:
         """A; ValueError for a sparse model."""
-        return self.mdp.num_actions
+        return cast(SuccessorModel, self.mdp).num_actions
 
     @property
     def num_successors(self) -> int:
         """K."""
-        return self.mdp.num_successors
+        return cast(SuccessorModel, self.mdp).num_successors
 
     @property
     def state_shape(self) -> tuple[int, ...]:
@@ -74,12 +82,12 @@ class Game:
     @property
     def successor_probability(self) -> jax.Array:
         """``float[S, A, K]``."""
-        return self.mdp.successor_probability
+        return cast(SuccessorModel, self.mdp).successor_probability
 
     @property
     def available(self) -> jax.Array:
         """``bool[S, A]``."""
-        return self.mdp.available
+        return cast(SuccessorModel, self.mdp).available
 
     @property
     def initial(self) -> jax.Array:
@@ -89,12 +97,12 @@ class Game:
     @property
     def label(self) -> jax.Array:
         """``bool[S, P]``, the propositions that hold in each state."""
-        return self.mdp.label
+        return cast(LabelledModel, self.mdp).label
 
     @property
     def propositions(self) -> tuple[str, ...]:
         """The P names."""
-        return self.mdp.propositions
+        return cast(LabelledModel, self.mdp).propositions
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -102,7 +110,7 @@ class Game:
         return self.mdp.dtype
 
 
-def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
+def make_game(model: Arena, system: Sequence[bool] | chex.Array) -> Game[Arena]:
     """Validated :class:`Game` on a model.
 
     Args:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from functools import singledispatch
-from typing import Any, overload, TypeAlias
+from typing import Generic, cast, overload, TypeAlias
 
 import chex
 import jax
@@ -26,7 +26,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.models.protocols import Array, LabelledModel
+from jaxltl.core.models.protocols import Array, LabelledModel, SuccessorModel, World
 
 
 register_annotated_pytree(
@@ -50,7 +50,7 @@ def _facts(model: Product) -> Iterator[str]:
 
 @brief(facts=_facts, drawn=True)
 @struct.dataclass
-class Product:
+class Product(Generic[World]):
     """Product of a model and an automaton that tracks the progress of a task.
 
     With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in ``delta(q_I, L(s0))``: the
@@ -72,7 +72,7 @@ class Product:
       ((3, 2), [[0, 1], [1, 1], [0, 1]], [False, True])
     """
 
-    mdp: Any
+    mdp: World
     automaton: Automaton
     letter: jax.Array | np.ndarray
     label_on: str = struct.field(pytree_node=False, default="entry")
@@ -91,7 +91,7 @@ class Product:
     @property
     def num_actions(self) -> int:
         """A."""
-        return self.mdp.num_actions
+        return cast(SuccessorModel, self.mdp).num_actions
 
     @property
     def state_shape(self) -> tuple[int, ...]:
@@ -101,12 +101,12 @@ class Product:
     @property
     def num_successors(self) -> int:
         """K."""
-        return self.mdp.num_successors
+        return cast(SuccessorModel, self.mdp).num_successors
 
     @property
     def successor_probability(self) -> jax.Array:
         """``float[S, 1, A, K]``: the same in every memory state."""
-        return self.mdp.successor_probability[:, None]
+        return cast(SuccessorModel, self.mdp).successor_probability[:, None]
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -116,7 +116,7 @@ class Product:
     @property
     def available(self) -> jax.Array:
         """``bool[S, Q, A]``."""
-        xp, available, allowed = namespace(self.mdp.available, self.allowed)
+        xp, available, allowed = namespace(cast(SuccessorModel, self.mdp).available, self.allowed)
         shape = (*self.state_shape, self.num_actions)
         available = xp.broadcast_to(available[:, None, :], shape)
         return to_jax(available if allowed is None else available & allowed)
@@ -177,13 +177,15 @@ def occurring_letters(
 
 
 @overload
-def product(world: Game, task: Automaton | Formula | str, *, label_on: str = ...) -> Game: ...
+def product(
+    world: Game, task: Automaton | Formula | str, *, label_on: str = ...
+) -> Game[Product]: ...
 
 
 @overload
 def product(
-    world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = ...
-) -> Product: ...
+    world: World, task: Automaton | Formula | str, *, label_on: str = ...
+) -> Product[World]: ...
 
 
 def product(

@@ -15,7 +15,7 @@ A game satisfies what its model does. Quantities on states have the shape ``stat
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -108,6 +108,15 @@ class RowModel(LabelledModel, Protocol):
 
 
 ModelT = TypeVar("ModelT", bound=Model)
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar as DefaultTypeVar
+
+    # The model of a product or of a game; of a plain Product or Game any model.
+    World = DefaultTypeVar("World", bound=LabelledModel, default=Any)
+    Arena = DefaultTypeVar("Arena", bound=Model, default=Any)
+else:  # Python 3.13 has defaults
+    World, Arena = TypeVar("World"), TypeVar("Arena")
 
 
 def base_model(model: Model) -> Model:
