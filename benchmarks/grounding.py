@@ -30,7 +30,7 @@ from flax import linen as nn
 
 import jaxltl as jl
 from jaxltl.algos import grounding, mlirl
-from jaxltl.core.automata.synchronize import synchronize
+from jaxltl.core.automata.language import synchronize
 from jaxltl.core.models.construct.batch import lift_memory_policy
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.envs import gridworld

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.memory import large_product
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

@@ -32,7 +32,8 @@ from .core.games.verify import verify as verify
 from .core.games.winning import winning_region as winning_region
 from .core.logic.ltl import parse_ltl as parse_ltl
 from .core.models.construct.batch import stack_products as stack_products
-from .core.models.construct.convert import to_padded as to_padded, to_sparse as to_sparse
+from .core.models.construct.convert import to_sparse as to_sparse
+from .core.models.construct.padded import to_padded as to_padded
 from .core.models.construct.counts import make_counts as make_counts
 from .core.models.construct.lifting import (
     lift_policy as lift_policy,

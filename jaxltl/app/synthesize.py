@@ -18,7 +18,7 @@ from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at, winning_region
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models import Game, Restriction, restrict
-from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
+from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
 Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")

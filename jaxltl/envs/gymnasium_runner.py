@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata.automaton import letter_index
-from jaxltl.core.automata.verdicts import Verdict, lasso_verdicts, verdicts
+from jaxltl.core.automata.runs import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.policies.evaluation import EpisodeTotals, Evaluation, evaluation_of
 from jaxltl.core.policies.finite_memory import Controller, FiniteMemoryPolicy, Policy
 

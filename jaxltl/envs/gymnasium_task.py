@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import Task, to_automaton
-from jaxltl.core.automata.verdicts import Verdict
+from jaxltl.core.automata.runs import Verdict
 from jaxltl.core.environments.task_environment import TaskOptions, TaskTables, make_task_tables
 
 Labels = Callable[[PyTree, PyTree], Collection[str]]

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.sparse import choice_reward
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.undiscounted.reachability import reachability_probability

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.automata.verdicts import Verdict, verdict
+from jaxltl.core.automata.runs import Verdict, verdict
 from jaxltl.envs.gymnasium_runner import run_policy
 from jaxltl.envs.gymnasium_task import gymnasium_task
 

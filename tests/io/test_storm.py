@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
 from jaxltl.core.values.undiscounted.reachability import reachability_probability

@@ -61,7 +61,7 @@ from jaxltl.algos.interval_learning._intervals import (
 from jaxltl.algos.interval_learning._sampling import sampled_counts
 from jaxltl.algos.interval_learning.problem import Problem
 from jaxltl.algos.interval_learning.state import Hparams, Metrics, State
-from jaxltl.core.graphs.acceptance import accepting_bottom_components
+from jaxltl.core.graphs.end_components import accepting_bottom_components
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.operators import forall_successor

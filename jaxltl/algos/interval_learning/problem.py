@@ -9,10 +9,11 @@ from jaxltl.core import struct
 
 from jaxltl.algos.common.play import cumulative
 from jaxltl.core.automata.translate import Task
-from jaxltl.core.graphs.acceptance import Accepting, accepting_end_components
+from jaxltl.core.graphs.end_components import Accepting, accepting_end_components
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.graphs.end_components import end_components
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.array_namespace import to_jax

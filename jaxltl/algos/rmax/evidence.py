@@ -26,7 +26,7 @@ from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.core.values.interval.robust import robust_discounted_value
-from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
+from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
 
 @brief

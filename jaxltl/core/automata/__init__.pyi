@@ -10,5 +10,5 @@ from .language import (
     is_included as is_included,
 )
 from .sequences import Sequences as Sequences, reach_avoid_sequences as reach_avoid_sequences
-from .synchronize import synchronize as synchronize
+from .language import synchronize as synchronize
 from .translate import to_automaton as to_automaton

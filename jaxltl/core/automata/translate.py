@@ -4,7 +4,7 @@ A syntactically co-safe or safety formula becomes the automaton of its progressi
 a combination of Sigma-2 and Pi-2 formulas and limits (`normal_form`), each followed by one
 tracker. Two automata are made of the trackers, and the smaller is kept and reduced (`parity`):
 their synchronous product has an Emerson-Lei condition, which becomes parity (`emerson_lei`), or
-they follow their formulas only where the condition needs it (`on_demand`).
+they follow their formulas only where the condition needs it (`trackers`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jaxltl.core.automata.minimal import equivalence_classes, quotient
 from jaxltl.core.automata.merging import Table
 from jaxltl.core.automata.parity import is_weak, reachable, reduce_table
 from jaxltl.core.automata.runs import EVEN, ODD, find_lasso, live_states, universal_states
-from jaxltl.core.automata.on_demand import track_on_demand
+from jaxltl.core.automata.trackers import track_on_demand
 from jaxltl.core.automata.trackers import Alphabet, Trackers, too_many_states, track_together
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import (

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.operators import sample_successor

@@ -16,7 +16,7 @@ import numpy as np
 from jaxltl.core import struct
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.verdicts import (
+from jaxltl.core.automata.runs import (
     Verdict as Verdict,
     lasso_verdicts as lasso_verdicts,
     verdict as verdict,

@@ -39,7 +39,7 @@ from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.environments.task_reward import RewardOptions, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
+from jaxltl.core.struct import register_annotated_pytree
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 

@@ -17,7 +17,7 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import Winning
-from jaxltl.core.models.compiled.compiled import compiled_form
+from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP

@@ -23,7 +23,7 @@ from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.compiled.compiled import compiled_form
+from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax

@@ -1,4 +1,4 @@
-"""Attractors and almost-sure sets: exact analyses of the graph of a model.
+"""Attractors, almost-sure sets, prob0 and prob1 states: exact analyses of the graph of a model.
 
 Only the supports of the probabilities matter. Inside ``jit`` and ``vmap`` regions grow by sweeps,
 which are fast where few are needed; on concrete arrays they are computed on the host, in time linear
@@ -7,7 +7,7 @@ in the transitions. Of a sparse model allowed actions are ``bool[R]``, and an ac
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Any
 
 import jax
 import numpy as np
@@ -191,3 +191,36 @@ def surely(
     found = attract(graph, goal, allowed) if reaching is None else reaching
     # A state that cannot reach the goal at all is what removes others.
     return graph.repeat(body, (found, ~graph.xp.all(found.region)))[0]
+
+
+class Sets(NamedTuple):
+    """Prob1 states, prob0 states, and a policy that attains these probabilities."""
+
+    one: Any  # arrays of the graph's namespace
+    zero: Any
+    action: Any
+
+
+def policy_sets(graph: Graph, target: Array, policy: Array) -> Sets:
+    """Prob0 and prob1 states of a policy, from its support."""
+    allowed = graph.available & (policy > 0)
+    zero = ~attract(graph, target, allowed).region
+    doomed = attract(graph, zero, allowed, among=~target).region
+    return Sets(~doomed, zero, graph.xp.zeros(target.shape, np.int32))
+
+
+def max_sets(graph: Graph, target: Array) -> Sets:
+    """Prob0 and prob1 states of the maximal probability, with a policy that attains it."""
+    some = attract(graph, target)
+    sure = surely(graph, target, reaching=some)
+    action = graph.xp.where(sure.region, sure.action, some.action)
+    return Sets(sure.region, ~some.region, action)
+
+
+def min_sets(graph: Graph, target: Array) -> Sets:
+    """Prob0 and prob1 states of the minimal probability, with a policy that attains it."""
+    zero = avoid(graph, target)
+    doomed = attract(graph, zero, among=~target).region
+    stays, action = graph.first(graph.available & graph.forall(zero))
+    first = graph.first(graph.available)[1]
+    return Sets(~doomed, zero, graph.xp.where(stays, action, first))

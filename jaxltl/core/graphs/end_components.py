@@ -1,4 +1,4 @@
-"""Maximal end components, and bottom strongly connected components."""
+"""Maximal and accepting end components, and bottom strongly connected components."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxltl.core.array_types import Array
-from jaxltl.core.graphs.attractor import avoid
+from jaxltl.core.graphs.attractor import avoid, attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Model, Array
 from jaxltl.core.pretty_print import brief
 
 
@@ -84,3 +84,67 @@ def closed_components(graph: Graph, allowed: Array) -> EndComponents:
     """:func:`bottom_components` of a graph."""
     everywhere = graph.xp.ones(graph.state_shape, bool)
     return EndComponents(*graph.components(everywhere, allowed & graph.available, closed=True))
+
+
+class Accepting(NamedTuple):
+    """A region where acceptance is almost sure, with a policy that stays in it."""
+
+    region: jax.Array  # bool[S, Q]
+    action: jax.Array  # int32[S, Q], in the region a policy that is accepted almost surely
+    inside: jax.Array  # bool[S, Q, A], the actions of the state's end component; False elsewhere
+    least: jax.Array  # int32[S, Q], the least priority of the component, even; -1 elsewhere
+
+
+def accepting_end_components(model: Product) -> Accepting:
+    """The union of accepting end components of a product, with a policy that is accepted there."""
+    # For each even p: the maximal end components of the actions that read no priority below p, with
+    # an action that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs), which the
+    # policy takes infinitely often. Almost every trajectory ends in one end component and takes all
+    # of its transitions infinitely often (de Alfaro 1997). The first p of a state counts.
+    graph = graph_of(model)
+    xp, available = graph.xp, graph.available
+    priority = take(graph, model.automaton.priority)
+    everywhere = xp.ones(graph.state_shape, bool)
+
+    def body(half: Array, found: Accepting) -> Accepting:
+        least = 2 * half
+        allowed = available & ~graph.reads(priority < least)
+        components = components_within(graph, everywhere, allowed)
+        hits = components.inside & graph.reads(priority == least)
+        hit, action = graph.first(hits)
+        wins = graph.anywhere(hit, components.component) & graph.first(components.inside)[0]
+        towards = attract(graph, hit, components.inside).action
+        action = xp.where(hit, action, towards)
+        new = wins & ~found.region
+        return Accepting(
+            found.region | new,
+            xp.where(new, action, found.action),
+            found.inside | (components.inside & new[..., None]),
+            xp.where(new, least, found.least).astype(np.int32),
+        )
+
+    nothing = xp.zeros(graph.state_shape, np.int32)
+    start = Accepting(
+        ~everywhere, graph.first(available)[1], xp.zeros(available.shape, bool), nothing - 1
+    )
+    return to_jax(graph.times(priority.max() // 2 + 1, body, start))
+
+
+def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
+    """States ``bool[S, Q]`` of accepting bottom strongly connected components of a policy."""
+    graph = graph_of(model, policy)
+    xp = graph.xp
+    priority, policy = take(graph, (model.automaton.priority, policy))
+    bottom = closed_components(graph, policy > 0)
+    inside = bottom.inside.any(-1)
+
+    def body(i: Array, least: Array) -> Array:
+        # In descending order, so that the least is written last.
+        p = priority.max() - i
+        met = (bottom.inside & graph.reads(priority == p)).any(-1)
+        return xp.where(graph.anywhere(met, bottom.component) & inside, p, least)
+
+    # A component that reads no priority is not accepting.
+    start = xp.full(graph.state_shape, 1, priority.dtype)
+    least = graph.times(priority.max() + 1, body, start)
+    return to_jax(inside & (least % 2 == 0))

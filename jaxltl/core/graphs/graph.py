@@ -18,7 +18,7 @@ from jax import lax
 
 from jaxltl.core import struct
 from jaxltl.core.graphs.colouring import components_by_sweeps
-from jaxltl.core.models.compiled.compiled import compiled_form
+from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
@@ -26,7 +26,7 @@ from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.host_callback import host_callback
-from jaxltl.core.models.ops.latest import keep_latest
+from jaxltl.core.models.construct.convert import keep_latest
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP

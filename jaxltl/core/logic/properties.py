@@ -15,7 +15,7 @@ from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
-from jaxltl.core.logic.property_expressions import ExpressionStream
+from jaxltl.core.logic.property_tokens import ExpressionStream
 from jaxltl.core.logic.property_tokens import Token
 from jaxltl.core.pretty_print import brief
 

@@ -2,7 +2,8 @@ from .construct.batch import (
     lift_memory_policy as lift_memory_policy,
     stack_products as stack_products,
 )
-from .construct.convert import to_padded as to_padded, to_sparse as to_sparse
+from .construct.convert import to_sparse as to_sparse
+from .construct.padded import to_padded as to_padded
 from .construct.counts import (
     TransitionCounts as TransitionCounts,
     model_from_counts as model_from_counts,

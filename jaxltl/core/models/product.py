@@ -24,7 +24,7 @@ from jaxltl.core.pretty_print import batch_text, brief, count, describe, nested_
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
+from jaxltl.core.struct import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.protocols import Array, LabelledModel, SuccessorModel, World
 

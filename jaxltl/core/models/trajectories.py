@@ -14,7 +14,7 @@ from jaxltl.core import struct, validation
 
 from jaxltl.core.pretty_print import batch_text, brief, count, value_range
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
+from jaxltl.core.struct import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array
-from jaxltl.core.automata.verdicts import Verdict
+from jaxltl.core.automata.runs import Verdict
 from jaxltl.core.pretty_print import brief, count, number
 from jaxltl.core.statistics.binomial import anytime, clopper_pearson
 from jaxltl.core.statistics.empirical_bernstein import bounded_mean

@@ -1,5 +1,5 @@
 from .average.average_reward import average_reward as average_reward
-from .average.mean_payoff import mean_payoff as mean_payoff
+from .average.average_reward import mean_payoff as mean_payoff
 from .discounted.boltzmann import (
     boltzmann_fixed_points as boltzmann_fixed_points,
     boltzmann_value as boltzmann_value,

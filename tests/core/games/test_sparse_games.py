@@ -9,7 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.games.winning import solve
-from jaxltl.core.models.compiled.compiled import compiled_form
+from jaxltl.core.models.compiled import compiled_form
 from tests.sparse_models import random_sparse
 
 COUNT, GAMES = 7, 40

@@ -10,7 +10,7 @@ import pytest
 
 from jaxltl.core.automata.automaton import make_automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
+from jaxltl.core.graphs.end_components import accepting_bottom_components, accepting_end_components
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import (

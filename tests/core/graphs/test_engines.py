@@ -11,8 +11,11 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.automata.automaton import make_automaton
 from jaxltl.core.games.objective import GR1, Parity
-from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
-from jaxltl.core.graphs.end_components import bottom_components
+from jaxltl.core.graphs.end_components import (
+    accepting_bottom_components,
+    accepting_end_components,
+    bottom_components,
+)
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, from_dense, make_mdp, to_dense
 from jaxltl.core.models.product import product

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.mdp import MDP, make_mdp, support, to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse

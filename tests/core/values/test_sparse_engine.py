@@ -5,7 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.construct.restrict import restrict, with_allowed
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
+from functools import wraps
+from typing import TypeVar
 
+import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
-from jaxltl.core.models.construct.padded import to_padded as to_padded
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 
 
 def to_sparse(model: Model) -> SparseMDP:
@@ -100,3 +104,32 @@ def _product(model: Product) -> SparseMDP:
         action=None if world.action is None else np.asarray(world.action)[row],
         action_names=world.action_names,
     )
+
+
+M = TypeVar("M")
+R = TypeVar("R")
+
+
+def keep_latest(convert: Callable[[M], R]) -> Callable[[M], R]:
+    """Keeps the result for the latest model while that is alive and none of its arrays can change."""
+    kept: dict[str, tuple[weakref.ref[M], R]] = {}
+
+    @wraps(convert)
+    def wrapper(model: M) -> R:
+        latest = kept.get("latest")
+        if latest is not None and latest[0]() is model:
+            return latest[1]
+        found = convert(model)
+        if all(isinstance(x, jax.Array) for x in jax.tree.leaves(model)):
+            kept["latest"] = weakref.ref(model, forget), found
+        return found
+
+    def forget(reference: weakref.ref[M]) -> None:
+        latest = kept.get("latest")
+        if latest is not None and latest[0] is reference:
+            del kept["latest"]
+
+    return wrapper
+
+
+_LARGEST = 8 * 2**30  # bytes of the largest model that is padded

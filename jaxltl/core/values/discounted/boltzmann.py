@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core import validation
-from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
+from jaxltl.core.models.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.protocols import Array, Model

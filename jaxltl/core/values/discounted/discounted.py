@@ -22,7 +22,7 @@ from jax import lax
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_discounted_value
 from jaxltl.core import validation
-from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
+from jaxltl.core.models.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices

@@ -21,7 +21,7 @@ from jaxltl.core import validation
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
+from jaxltl.core.models.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices

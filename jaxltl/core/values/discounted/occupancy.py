@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy
+from jaxltl.core.models.compiled import compiled_form, flatten_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy

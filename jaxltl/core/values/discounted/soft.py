@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core import validation
-from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
+from jaxltl.core.models.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator

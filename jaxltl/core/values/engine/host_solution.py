@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.compiled.compiled import flatten_policy, is_sparse as is_sparse
+from jaxltl.core.models.compiled import flatten_policy, is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.protocols import ActionModel, Array, Model

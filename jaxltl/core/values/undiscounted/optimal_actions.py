@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from jaxltl.core.graphs.end_components import components_within
 from jaxltl.core.graphs.graph import graph_of
-from jaxltl.core.graphs.reaching import max_sets, min_sets
+from jaxltl.core.graphs.attractor import max_sets, min_sets
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product

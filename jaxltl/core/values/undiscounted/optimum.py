@@ -19,7 +19,7 @@ from jax import lax
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
-from jaxltl.core.graphs.reaching import Sets, max_sets, min_sets, policy_sets
+from jaxltl.core.graphs.attractor import Sets, max_sets, min_sets, policy_sets
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.double_word import double_word, normalised_rows

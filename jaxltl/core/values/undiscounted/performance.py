@@ -20,7 +20,7 @@ from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
-from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
+from jaxltl.core.graphs.attractor import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.double_word import normalised_rows

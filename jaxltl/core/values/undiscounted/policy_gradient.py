@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
-from jaxltl.core.graphs.acceptance import accepting_bottom_components
+from jaxltl.core.graphs.end_components import accepting_bottom_components
 from jaxltl.core.graphs.graph import graph_of
-from jaxltl.core.graphs.reaching import policy_sets
+from jaxltl.core.graphs.attractor import policy_sets
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.sparse.mdp import HostMDP

@@ -17,7 +17,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.latest import keep_latest
+from jaxltl.core.models.construct.convert import keep_latest
 from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model

@@ -15,7 +15,7 @@ from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core import validation
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.graphs.acceptance import (
+from jaxltl.core.graphs.end_components import (
     Accepting,
     accepting_bottom_components,
     accepting_end_components,

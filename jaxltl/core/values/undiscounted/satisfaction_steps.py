@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.graphs.graph import graph_of
-from jaxltl.core.graphs.reaching import max_sets
+from jaxltl.core.graphs.attractor import max_sets
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array

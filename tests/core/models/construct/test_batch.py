@@ -9,7 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.automata.automaton import accepts_lasso, run
-from jaxltl.core.automata.synchronize import synchronize
+from jaxltl.core.automata.language import synchronize
 from jaxltl.core.models.construct.batch import (
     as_stacked,
     demonstration_counts,

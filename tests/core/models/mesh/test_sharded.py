@@ -9,14 +9,15 @@ import pytest
 
 from jaxltl.core.games.objective import safety
 from jaxltl.core.games.permissive import permissive_strategy
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.core.values.average.mean_payoff import mean_payoff
+from jaxltl.core.values.average.average_reward import mean_payoff
 from jaxltl.core.values.prepared.prepared import prepare
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from tests.sparse_models import random_sparse

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from tests.sparse_models import random_sparse
 from tests.support import assert_gradients

@@ -7,7 +7,8 @@ import pytest
 
 from jaxltl.core.games.winning import almost_sure_buchi
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.construct.restrict import restrict, with_allowed
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import from_dense, make_mdp, to_dense

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxltl.core.graphs.attractor import avoid
+from jaxltl.core.graphs.attractor import avoid, max_sets, min_sets
 from jaxltl.core.graphs.graph import host_graph
-from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.mdp import support
 from jaxltl.core.sparse.graph import bitsets as bits
 from tests.support import random_product

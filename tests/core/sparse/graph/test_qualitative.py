@@ -18,7 +18,8 @@ from jaxltl.core.graphs.end_components import (
     end_components,
 )
 from jaxltl.core.graphs.graph import host_graph
-from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.sparse import rows
 from jaxltl.core.sparse.graph import attractor as host_attract
 from jaxltl.core.sparse.graph import components

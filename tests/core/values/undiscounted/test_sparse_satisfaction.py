@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

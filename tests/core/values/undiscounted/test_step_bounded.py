@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.convert import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.sparse.solvers import reward_bounded
 from jaxltl.core.sparse.solvers import step_bounded as bounded

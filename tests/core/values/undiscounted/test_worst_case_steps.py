@@ -7,7 +7,7 @@ import pytest
 
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
+from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 from tests import reference_games
 from tests.support import as_mdp, assert_encloses
 

@@ -1,1 +1,0 @@
-"""Access of compiled programs to sparse models."""
