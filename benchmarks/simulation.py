@@ -5,40 +5,53 @@ does the peer, which makes one step a call. Rates are steps a second of wall tim
 processor time, which other programs on the same cores do not change. The folder has a folder for
 each family of the Quantitative Verification Benchmark Set, with its programs.
 
-    python -m benchmarks.simulation FOLDER [--lanes 4096] [--steps 1000] [--ppo]
+With `--seeds`, the frequencies of 10^6 steps are tested against the probabilities of the built model.
+
+    python -m benchmarks.simulation FOLDER [--lanes 4096] [--steps 1000] [--ppo] [--seeds 10]
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import random
 import time
+import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse, stats
 
 import jaxltl as jl
 from jaxltl.algos import ppo
+from jaxltl.core.language.syntax import Program
 
 CASES = {
     "brp": ("brp/brp.prism", "N=64,MAX=5"),
     "consensus.4": ("consensus/consensus.4.prism", "K=4"),
     "zeroconf": ("zeroconf/zeroconf.prism", "N=1000,K=8,reset=false"),
 }
+TESTED = {
+    "brp": ("brp/brp.prism", "N=64,MAX=5"),
+    "consensus.4": ("consensus/consensus.4.prism", "K=4"),
+    "zeroconf": ("zeroconf/zeroconf.prism", "N=1000,K=2,reset=false"),
+}
+LEVEL = 0.01  # of all tests of one program together
+_LEAST = 5.0  # expected number of steps to a cell of the test
 _PEER_SECONDS = 5.0
 _UPDATES = 50
 
 
-def batch_of_steps(path: Path, constants: str, lanes: int, steps: int) -> Any:
-    """A compiled function of a key: some steps in each lane; the last worlds."""
-    program = jl.io.read_program(path, constants)
+def batch_of_steps(
+    program: Program, lanes: int, steps: int, trace: Callable[[Any], Any] | None = None
+) -> Any:
+    """A compiled function of a key: some steps in each lane; the last worlds and the traces."""
     environment = jl.io.program_environment(program, labels=[])
 
     def step(world: Any, key: jax.Array) -> Any:
@@ -47,23 +60,24 @@ def batch_of_steps(path: Path, constants: str, lanes: int, steps: int) -> Any:
         if program.kind == "mdp":
             mask = environment.allowed(world)
             action = jnp.argmax(jnp.where(mask, jax.random.uniform(first, mask.shape), -1.0))
-        return environment.step(world, action, second).world
+        after = environment.step(world, action, second).world
+        return after, None if trace is None else (trace(world), trace(after))
 
     def run(key: jax.Array) -> Any:
         begin = jax.vmap(environment.reset)(jax.random.split(key, lanes))
         every = jax.vmap(step)
         return jax.lax.scan(
-            lambda world, k: (every(world, jax.random.split(k, lanes)), None),
+            lambda world, k: every(world, jax.random.split(k, lanes)),
             begin,
             jax.random.split(key, steps),
-        )[0]
+        )
 
     return jax.jit(run)
 
 
 def our_rates(path: Path, constants: str, lanes: int, steps: int) -> tuple[float, float, float]:
     """Steps a second of wall time and of processor time, and seconds of the first call."""
-    run = batch_of_steps(path, constants, lanes, steps)
+    run = batch_of_steps(jl.io.read_program(path, constants), lanes, steps)
     devices = jax.devices()[:2]
     keys = [jax.device_put(jax.random.key(i), d) for i, d in enumerate(devices)]
     pool = ThreadPoolExecutor(len(devices))  # calls of one thread follow each other
@@ -103,6 +117,47 @@ def peer_rates(path: Path, constants: str) -> tuple[float, float]:
             engine.step(draw.randrange(len(engine.get_choices())))
             count += 1
     return count / (time.perf_counter() - wall), count / (time.process_time() - processor)
+
+
+def p_values(program: Program, seeds: int, lanes: int = 1000, steps: int = 1000) -> list[float]:
+    """Pearson's test of simulated transitions given their states, once for each seed.
+
+    Available actions are drawn evenly. States whose cells have less than 5 expected transitions
+    are not tested; a transition that the model does not have is an error.
+    """
+    model = jl.io.build_model(program)
+    names = [v.name for v in program.variables]
+    sizes = [v.high - v.low + 1 for v in program.variables]
+    assert math.prod(sizes) < 2**63, "the states of a tested program have numbers"
+    base = np.cumprod([1, *sizes[:-1]])
+    own = np.stack([model.valuation[n].astype(np.int64) for n in names], -1) @ base
+    order, size = np.argsort(own), model.num_states
+    host, rows = model.host, np.diff(model.row_start)
+    state_of_row = np.repeat(np.arange(size), rows)
+    share = (1 / rows[state_of_row]).repeat(np.diff(host.entry_start))
+    shape, start = (host.num_rows, size), host.entry_start
+    every = sparse.csr_array((host.probability * share, host.successor, start), shape)
+    mean = sparse.csr_array((np.ones(state_of_row.size), state_of_row, np.arange(shape[0] + 1)))
+    law = (mean.T @ every).tocsr()
+    law.sort_indices()
+    of_entry = np.repeat(np.arange(size), np.diff(law.indptr))
+    entry = of_entry * size + law.indices
+    run = batch_of_steps(
+        program, lanes, steps, lambda w: jnp.stack([w[n].astype(jnp.int32) for n in names])
+    )
+    found = []
+    for seed in range(seeds):
+        worlds = [np.asarray(x).astype(np.int64) @ base for x in run(jax.random.key(seed))[1]]
+        state, target = (order[np.searchsorted(own, x, sorter=order).ravel()] for x in worlds)
+        at = np.searchsorted(entry, state * size + target)
+        assert (entry[at] == state * size + target).all()
+        count = np.bincount(at, minlength=entry.size)
+        expected = np.bincount(state, minlength=size)[of_entry] * law.data
+        kept = ~np.isin(of_entry, of_entry[expected < _LEAST])
+        free = kept.sum() - np.unique(of_entry[kept]).size
+        statistic = ((count - expected)[kept] ** 2 / expected[kept]).sum()
+        found.append(float(stats.chi2.sf(statistic, free)))
+    return found
 
 
 def learn(path: Path) -> None:
@@ -158,7 +213,19 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--ppo", action="store_true", help="learn in consensus.2 alone")
+    parser.add_argument("--seeds", type=int, help="test the frequencies of 10^6 steps of each seed")
     given = parser.parse_args()
+    os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    if given.seeds:
+        warnings.simplefilter("ignore")
+        for name, (file, constants) in TESTED.items():
+            program = jl.io.read_program(given.folder / file, constants)
+            p = sorted(p_values(program, given.seeds))
+            passed = p[0] >= LEVEL / given.seeds
+            print(
+                f"{name}: p-values {', '.join(f'{x:.3f}' for x in p)}; agree: {passed}", flush=True
+            )
+        return
     if given.ppo:
         learn(given.folder / "consensus/consensus.2.prism")
         return

@@ -9,6 +9,7 @@ import pytest
 from jax.tree_util import Partial
 from scipy import stats
 
+from benchmarks import simulation
 from jaxltl.core.environments.episodes import Agent, run_episode
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.environments.time_limit import with_time_limit
@@ -246,3 +247,17 @@ def test_what_has_no_simulation_is_refused(text, options, message):
     with pytest.raises(ValueError, match=message) as error:
         program_environment(read_program(text), **options)
     assert "\n" not in str(error.value)
+
+
+WHEEL = """mdp module m x : [0..6]; [a] true -> 0.3 : (x'=mod(x+1, 7)) + 0.7 : true;
+  [] x>2 -> x/10 : (x'=0) + 1 - x/10 : (x'=x-1); [] x=4 -> (x'=1); endmodule
+module n y : [0..3]; b : bool; [a] y<3 -> 0.1 : (y'=y+1) + 0.9 : (b'=!b); [a] b -> (y'=0); endmodule"""
+
+
+@pytest.mark.slow
+def test_frequencies_of_many_steps_pass_a_chi_square_test(monkeypatch):
+    program = read_program(WHEEL)
+    assert min(simulation.p_values(program, 2, lanes=500, steps=2000)) > 0.001
+    other = build_model(read_program(WHEEL.replace("0.3", "0.31").replace("0.7", "0.69")))
+    monkeypatch.setattr(simulation.jl.io, "build_model", lambda _: other)
+    assert simulation.p_values(program, 1)[0] < 1e-6
