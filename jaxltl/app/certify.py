@@ -25,13 +25,10 @@ from jaxltl.core.values.evaluation.data_guarantee import (
     learn_guarantee,
 )
 from jaxltl.app.wording import Record
+from jaxltl.io.templates import render
 
 SHOWN = 5  # choices for which more samples are recommended
 POINTS = 13  # of a curve
-_HINT = (
-    "each choice may lead to each of them; --least-probability P or --graph seen assume more, and "
-    "guarantee more"
-)
 PICTURES = (".svg", ".png", ".pdf")
 
 
@@ -111,7 +108,7 @@ def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
                 f"has {_some(counts)}."
             )
     known = None if labels is None else read_labels(labels, counts.states)
-    graph = "complete" if graph is None else graph
+    graph = graph or "complete"
     sparse, count = model_from_counts(
         counts,
         initial=list(initial),
@@ -164,38 +161,16 @@ def certify(evidence: Evidence, query: Query) -> DataGuarantee:
     )
 
 
-def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> str:
-    """Guarantee from a log, as text."""
-    side, other = (">=", "more") if query.objective == "max" else ("<=", "less")
-    lines = [
-        f"P {side} {rounded_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
-        f"  of {query.formula!r}, under the policy found; no policy has {other} than "
-        f"{rounded_outward(found.optimistic, side == '>=')}",
-        f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
-        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {query.method}",
-    ]
-    lines.append(f"  assuming that {found.assumption}")
-    if evidence.graph == "complete":
-        lines.append(f"  {_HINT}")
-    status = Status(int(found.satisfaction.solution.status))
-    if status != Status.CONVERGED:
-        lines.append(f"  the solver's bounds did not converge ({status.name})")
-    for row in most_helpful(found):
-        lines.append(
-            f"  more samples of {evidence.actions[row]} in {_state(evidence, row)} "
-            f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}"
-        )
-    return "\n".join([*lines, f"  {seconds:.3f} s"])
-
-
-def most_helpful(found: DataGuarantee) -> list[int]:
-    """The choices for which more samples raise the guarantee, in decreasing order."""
-    order = np.argsort(-found.gain, kind="stable")[:SHOWN]
-    return [int(r) for r in order if found.gain[r] > 1e-12]
-
-
-def _state(evidence: Evidence, row: int) -> str:
-    return evidence.states[int(evidence.model.host.state[row])]
+def text(evidence: Evidence, result: Record) -> str:
+    """The :func:`entry` of a guarantee as text."""
+    return render(
+        "jaxltl.app.reports",
+        "certify.txt",
+        result=result,
+        formula=repr(result["formula"]),
+        complete=evidence.graph == "complete",
+        rounded=rounded_outward,
+    ).rstrip("\n")
 
 
 def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> Record:
@@ -219,15 +194,16 @@ def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float
 
 
 def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
-    """Choices of which more samples improve the guarantee most."""
+    """Choices of which more samples improve the guarantee most, in decreasing order."""
     return [
         {
-            "state": _state(evidence, r),
+            "state": evidence.states[int(evidence.model.host.state[r])],
             "action": evidence.actions[r],
             "gain": float(found.gain[r]),
             "samples": int(found.sets.num_samples[r]),
         }
-        for r in most_helpful(found)
+        for r in np.argsort(-found.gain, kind="stable")[:SHOWN].tolist()
+        if found.gain[r] > 1e-12
     ]
 
 
@@ -246,12 +222,6 @@ def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
         objective=query.objective,
     )
     return sizes.tolist(), bound.tolist()
-
-
-def timed(evidence: Evidence, query: Query) -> tuple[DataGuarantee, float]:
-    """Result of :func:`certify`, and its wall time."""
-    begin = time.perf_counter()
-    return certify(evidence, query), time.perf_counter() - begin
 
 
 def certify_and_write(
@@ -277,11 +247,12 @@ def certify_and_write(
         nothing if picture is None else atomic_write(picture) as drawing,
     ):
         evidence = read_evidence(log, source)
-        found, seconds = timed(evidence, query)
-        say(text(evidence, query, found, seconds))
-        result = entry(evidence, query, found, seconds)
+        begin = time.perf_counter()
+        found = certify(evidence, query)
+        result = entry(evidence, query, found, time.perf_counter() - begin)
+        say(text(evidence, result))
         if file is not None:
-            about = {**entry(evidence, query, found, 0.0), "seconds": None}
+            about = {**result, "seconds": None}
             policy = project_policy(evidence.model, found.satisfaction, states=evidence.states)
             save_policy(file, policy, {"result": json.dumps(about, allow_nan=False)})
         if drawing is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import chex
 import jax
@@ -70,9 +71,10 @@ def _settings(task: EnvironmentTask) -> Record:
     return found
 
 
-def _size(shape: PyTree) -> int:
-    return sum(
-        math.prod(x.shape) for x in jax.tree.leaves(shape, is_leaf=lambda x: isinstance(x, Box))
+def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, bool], Agent]:
+    """The policy of a state of a learner: greedy, or with drawn actions."""
+    return lambda state, likeliest: (learner.greedy if likeliest else learner.policy)(
+        state, problem, hparams
     )
 
 
@@ -82,15 +84,11 @@ def _ppo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     network = dataclasses.replace(default_network(environment.actions), **parts)
     problem = ppo.make_problem(environment, network=network)
     hparams = settings(ppo.Hparams, spec)
-
-    def agent(state: PyTree, likeliest: bool) -> Agent:
-        return (ppo.greedy if likeliest else ppo.policy)(state, problem, hparams)
-
     return Method(
         ppo,
         problem,
         hparams,
-        agent,
+        _acts(ppo, problem, hparams),
         ("episode_return", "episode_length", "entropy", "explained_variance"),
         ("parameters", "moments"),
         hparams.num_envs * hparams.num_steps,
@@ -102,9 +100,9 @@ def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     table, actions = task.settings, environment.actions
     assert isinstance(table, CceTable)
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
-    network = make_network(
-        (_size(environment.observations), *table.hidden, outputs), hidden=table.activation
-    )
+    seen = jax.tree.leaves(environment.observations, is_leaf=lambda x: isinstance(x, Box))
+    inputs = sum(math.prod(x.shape) for x in seen)
+    network = make_network((inputs, *table.hidden, outputs), hidden=table.activation)
     make = network_agent(network, environment)
     score = episode_evaluator(
         environment,
@@ -117,16 +115,11 @@ def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     first = diagonal_gaussian(jnp.zeros(network.num_parameters, jnp.float32), table.deviation)
     problem = cce.make_problem(score, first, limit=table.limit)
     hparams = settings(cce.Hparams, _settings(task))
-
-    def agent(state: PyTree, likeliest: bool) -> Agent:
-        del likeliest
-        return make(cce.policy(state, problem, hparams))
-
     return Method(
         cce,
         problem,
         hparams,
-        agent,
+        lambda state, likeliest: make(cce.policy(state, problem, hparams)),
         ("objective", "cost", "best_objective", "num_feasible", "spread"),
         ("family",),
         hparams.population * table.episodes * num_steps,
@@ -147,15 +140,11 @@ def _cpo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
         environment = dataclasses.replace(environment, step=step, outcomes=None)
     problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
     hparams = settings(trust_region.Hparams, _settings(task))
-
-    def agent(state: PyTree, likeliest: bool) -> Agent:
-        return (trust_region.greedy if likeliest else trust_region.policy)(state, problem, hparams)
-
     return Method(
         trust_region,
         problem,
         hparams,
-        agent,
+        _acts(trust_region, problem, hparams),
         ("reward", "cost", "length", "deviation", "kl"),
         ("parameters", "moments"),
         hparams.num_trajectories * num_steps,

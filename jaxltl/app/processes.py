@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import inspect
-import io
 import json
 import os
 import socket
@@ -229,7 +228,9 @@ def process_group(
         line = f"process {launch.process} stops: another process has ended. {exit_message.AGAIN}."
         os.write(2, f"{exit_message.END}{line}\n".encode())
         raise SystemExit(LOST) from None
-    _leave()
+    import jax
+
+    jax.distributed.shutdown()  # when all are done; an early process would count as lost
 
 
 def _choose_devices(options: DeviceOptions, launch: Launch) -> None:
@@ -354,13 +355,6 @@ def _join(launch: Launch, wait: float) -> None:
     )
 
 
-def _leave() -> None:
-    """Leaves when all processes are done; an early one would count as lost."""
-    import jax
-
-    jax.distributed.shutdown()
-
-
 # --- the end ----------------------------------------------------------------------------------
 
 
@@ -381,21 +375,12 @@ def _read_apart(launch: Launch) -> None:
     os.dup2(sink, 1)
     os.dup2(sink, 2)
     os.close(sink)
-    for name, number in (("stdout", out), ("stderr", err)):
+    for name, target in (("stdout", os.devnull if launch.process else out), ("stderr", err)):
         old = getattr(sys, name)
         old.flush()
-        setattr(
-            sys,
-            name,
-            io.TextIOWrapper(
-                io.BufferedWriter(io.FileIO(number, "w")),
-                encoding=old.encoding,
-                errors=old.errors,
-                line_buffering=name == "stderr" or old.line_buffering,
-            ),
-        )
-    if launch.process:
-        sys.stdout = io.TextIOWrapper(io.BufferedWriter(io.FileIO(os.devnull, "w")))
+        by_line = 1 if name == "stderr" or old.line_buffering else -1
+        new = open(target, "w", by_line, encoding=old.encoding, errors=old.errors)  # noqa: SIM115
+        setattr(sys, name, new)
     with contextlib.suppress(ImportError, ValueError, OSError):  # no core dump
         import resource
 

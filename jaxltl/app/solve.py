@@ -164,15 +164,17 @@ def load(
 
 
 class _Progress:
-    """Prints the number of states of a long exploration every few seconds."""
+    """Prints the states of a long exploration, and the bounds so far, every few seconds."""
 
     def __init__(self) -> None:
         self.last = time.monotonic()
 
-    def __call__(self, found: int, expanded: int) -> None:
+    def __call__(self, found: int, expanded: int, answer: Answer | None = None) -> None:
         if time.monotonic() - self.last > _PROGRESS_SECONDS:
             self.last = time.monotonic()
-            print(f"{found} states found, {expanded} expanded", file=sys.stderr, flush=True)
+            ends = answer and f": {answer.lower.min():.6g} to {answer.upper.max():.6g}"
+            text = f"{found} states found, {expanded} expanded{ends or ''}"
+            print(text, file=sys.stderr, flush=True)
 
 
 def solve(
@@ -215,22 +217,13 @@ def _explored(program: Program, prop: Property, tolerance: float, max_states: in
     from jaxltl.core.programs.build import MAX_STATES
     from jaxltl.core.programs.partial import solve_program
 
-    last = time.monotonic()
-
-    def report(found: int, expanded: int, answer: Answer) -> None:
-        nonlocal last
-        if time.monotonic() - last > _PROGRESS_SECONDS:
-            last = time.monotonic()
-            bounds = f"{answer.lower.min():.6g} to {answer.upper.max():.6g}"
-            print(f"{found} states found, {expanded} expanded: {bounds}", file=sys.stderr)
-
     return solve_program(
         program,
         prop,
         method="partial",
         tolerance=tolerance,
         max_states=MAX_STATES if max_states is None else max_states,
-        report=report,
+        report=_Progress(),
     )
 
 

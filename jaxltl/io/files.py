@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import itertools
 import lzma
 import os
 import zlib
@@ -44,19 +45,28 @@ def _check_path(path: object) -> None:
 
 def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     """Contents of a file without decompression, at most `limit` bytes."""
+    parts = list(_parts(path, limit, 2**24))
+    try:
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+    except MemoryError as error:
+        raise _unreadable(str(path), error) from None
+
+
+def _parts(path: str | os.PathLike[str], limit: int, step: int) -> Iterator[bytes]:
+    """Contents of a file in parts, without decompression; ValueError beyond `limit` bytes."""
     _check_path(path)
-    name, parts, size = str(path), [], 0
+    size = 0
     try:
         with open(path, "rb") as file:
-            while size <= limit and (part := file.read(2**24)):
-                parts.append(part)
+            while part := file.read(step):
                 size += len(part)
-        data = parts[0] if len(parts) == 1 else b"".join(parts)
+                if size > limit:
+                    break
+                yield part
     except (OSError, ValueError, MemoryError) as error:
-        raise _unreadable(name, error) from None
+        raise _unreadable(str(path), error) from None
     if size > limit:
-        raise _too_large(name, limit)
-    return data
+        raise ValueError(f"{str(path)!r} has more than {limit} bytes, the most that are read.")
 
 
 class FileBytes:
@@ -106,35 +116,18 @@ def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterat
 
 def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
     """Decompressed contents of a file in pieces; only compressed input is held in memory."""
-    _check_path(path)
-    packed: list[bytes] = []
-    name, size = str(path), 0
-    try:
-        with open(path, "rb") as file:
-            while part := file.read(_STEP):
-                size += len(part)
-                if size > limit:
-                    break
-                if packed or (size == len(part) and compression_of(part)):
-                    packed.append(part)
-                else:
-                    yield part
-    except (OSError, ValueError, MemoryError) as error:
-        raise _unreadable(name, error) from None
-    if size > limit:
-        raise _too_large(name, limit)
-    if packed:
-        yield from pieces(b"".join(packed), name, limit)
+    parts = _parts(path, limit, _STEP)
+    first = next(parts, b"")
+    if compression_of(first):
+        yield from pieces(b"".join([first, *parts]), str(path), limit)
+    else:
+        yield from itertools.chain([first] if first else [], parts)
 
 
 def _unreadable(name: str, error: Exception) -> ValueError:
     # A null byte in the name makes a ValueError.
     reason = getattr(error, "strerror", None) or str(error) or "too large for the memory"
     return ValueError(f"cannot read {name!r}: {reason}.")
-
-
-def _too_large(name: str, limit: int) -> ValueError:
-    return ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:

@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 from numpy.typing import ArrayLike
 
 from jaxltl.algos import todirl
@@ -134,20 +134,6 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
 # --- files ----------------------------------------------------------------------------------
 
 
-_ABOUT = (
-    "hidden",
-    "label_on",
-    "discount",
-    "horizon",
-    "radius",
-    "formula",
-    "kinds",
-    "guarantee",
-    "over",
-    "steps_factor",
-)
-
-
 def save_reward(path: str | Path, learned: LearnedReward) -> None:
     """Writes a learned reward as ``.npz``, atomically.
 
@@ -159,9 +145,9 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
     Raises:
       ValueError: the file cannot be written.
     """
-    about = {key: getattr(learned, key) for key in _ABOUT}
-    text = json.dumps({**about, "memory": to_dict(learned.memory)})
-    arrays = {name: np.asarray(x) for name, x in _flat(learned.parameters).items()}
+    about = {**vars(learned), "memory": to_dict(learned.memory)}
+    arrays = flatten_dict(about.pop("parameters"), sep="/")
+    text = json.dumps(about)
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, about=np.array(text), **arrays)
 
@@ -185,7 +171,8 @@ def load_reward(path: str | Path) -> LearnedReward:
         memory = from_dict(about.pop("memory"))
         for key in ("hidden", "kinds"):
             about[key] = tuple(about[key])
-        learned = LearnedReward(parameters=_nested(arrays), memory=memory, **about)
+        parameters = unflatten_dict({k: jnp.asarray(x) for k, x in arrays.items()}, sep="/")
+        learned = LearnedReward(parameters=parameters, memory=memory, **about)
         learned.parameters["params"]["kernel"]  # what any reward network has
     except OSError as error:
         raise ValueError(f"the network cannot be read: {str(path)!r}: {error.strerror}.") from None
@@ -194,19 +181,3 @@ def load_reward(path: str | Path) -> LearnedReward:
             f"{str(path)!r} is no learned reward, as save_reward writes it: {error}"
         ) from None
     return learned
-
-
-def _flat(parameters: PyTree) -> dict[str, jax.Array]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(parameters)
-    return {"/".join(str(part.key) for part in path): leaf for path, leaf in leaves}
-
-
-def _nested(arrays: dict[str, np.ndarray]) -> PyTree:
-    tree: PyTree = {}
-    for name, array in arrays.items():
-        *rooms, last = name.split("/")
-        place = tree
-        for room in rooms:
-            place = place.setdefault(room, {})
-        place[last] = jnp.asarray(array)
-    return tree

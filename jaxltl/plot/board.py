@@ -10,12 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.envs.text_map import parse_map
-from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, SCALE, write
+from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, SCALE, blank, write
 
 STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 DIRECTIONS = {**STEPS, "stay": (0, 0)}
@@ -177,10 +176,8 @@ def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figur
     """A figure with `count` axes for maps, `across` per row."""
     (rows, columns), size = shape, cell_size(shape)
     down = -(-count // across)
-    figure = Figure(
-        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
-        layout=ConstrainedLayoutEngine(h_pad=0.1),
-        facecolor=PAPER,
+    figure = blank(
+        max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6, padded=True
     )
     every = figure.subplots(down, across, squeeze=False).ravel()
     for axes in every[count:]:

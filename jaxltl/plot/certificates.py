@@ -21,6 +21,7 @@ from jaxltl.plot.style import (
     PAPER,
     SCALE,
     SERIES,
+    blank,
     head,
     note,
     plain_axes,
@@ -64,7 +65,7 @@ def certificate(
       2
     """
     grid, n = certificate.grid, certificate.grid.num_axes
-    figure = Figure(figsize=(6.0, 4.6), layout="constrained", facecolor=PAPER)
+    figure = blank(6.0, 4.6)
     panel = figure.subplots()
     plain_axes(panel)
     head(panel, f"{certificate.formula}: lower bound of the probability")

@@ -19,8 +19,8 @@ from jaxltl.plot.style import (
     INK,
     KINDS,
     MUTED,
-    PAPER,
     SERIES,
+    blank,
     bottom_labels,
     legend_below,
     panel_rows,
@@ -58,7 +58,7 @@ def curves(
             f"curves: {', '.join(shown)} are single numbers; give a run's history, [T] or [N, T]."
         )
     chosen = list(series)
-    figure = Figure(figsize=(3.1 * len(chosen) + 0.2, 2.5), layout="constrained", facecolor=PAPER)
+    figure = blank(3.1 * len(chosen) + 0.2, 2.5)
     for i, (name, axes) in enumerate(
         zip(chosen, figure.subplots(1, len(chosen), squeeze=False)[0], strict=True)
     ):
@@ -251,7 +251,7 @@ def guarantees(
     """
     if not bounds:
         raise ValueError("guarantees: nothing to show; give a bound.")
-    figure = Figure(figsize=(4.6, 2.9), layout="constrained", facecolor=PAPER)
+    figure = blank(4.6, 2.9)
     axes = figure.subplots()
     plain_axes(axes)
     count = np.asarray(samples, float)
@@ -299,9 +299,7 @@ def paths(
         raise ValueError("paths: nothing to show; give at least one map.")
     columns = min(columns, len(maps))
     count = -(-len(maps) // columns)
-    figure = Figure(
-        figsize=(2.3 * columns, 2.4 * count + 0.3), layout="constrained", facecolor=PAPER
-    )
+    figure = blank(2.3 * columns, 2.4 * count + 0.3)
     every = figure.subplots(count, columns, squeeze=False).ravel()
     low, high = np.asarray(bounds, float)
     handles: list[Artist] = []

@@ -41,7 +41,7 @@ from jaxltl.envs.letter_world import LetterState
 from jaxltl.envs.zone_world import ZoneState
 from jaxltl.io.templates import render
 from jaxltl.plot.board import ROBOT, rule_cells
-from jaxltl.plot.style import ACCENT, FAINT, INK, KINDS, MUTED, PAPER, head, note, write
+from jaxltl.plot.style import ACCENT, FAINT, INK, KINDS, MUTED, PAPER, blank, head, note, write
 
 _PIXELS = 440.0
 
@@ -73,7 +73,7 @@ def draw_episode(environment: Environment, episode: Episode, *, title: str | Non
     Raises:
       ValueError: another world, or many trajectories.
     """
-    figure = Figure(figsize=(4.4, 4.9), layout="constrained", facecolor=PAPER)
+    figure = blank(4.4, 4.9)
     scene = scene_of(environment, episode)
     _draw_scene(figure.subplots(), scene, title)
     ends = f"ends after {len(scene.track) - 1} steps"
@@ -94,7 +94,7 @@ def draw_episodes(
     """
     if not episodes:
         raise ValueError("there is no episode; give at least one.")
-    figure = Figure(figsize=(3.4 * len(episodes), 3.9), layout="constrained", facecolor=PAPER)
+    figure = blank(3.4 * len(episodes), 3.9)
     every = figure.subplots(1, len(episodes), squeeze=False)[0]
     for i, (axes, episode) in enumerate(zip(every, episodes, strict=True)):
         _draw_scene(axes, scene_of(environment, episode), titles[i] if titles else None)

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
@@ -34,13 +33,14 @@ from jaxltl.plot.board import (
     shade_cells,
 )
 from jaxltl.plot.style import (
-    MapOptions,
     ACCENT,
     FAINT,
     INK,
     MUTED,
     PAPER,
     SERIES,
+    MapOptions,
+    blank,
     head,
     note,
     plain_axes,
@@ -248,11 +248,7 @@ def _small_multiples(
     size = float(np.clip(8.5 / max(across * columns, down * rows), 0.085, 0.42))
     gap = 0.18 if environment is None else 0.32
     width = across * (columns * size + 0.14) + bar + 0.2
-    figure = Figure(
-        figsize=(max(width, 3.4), down * (rows * size + gap) + 0.5),
-        layout="constrained",
-        facecolor=PAPER,
-    )
+    figure = blank(max(width, 3.4), down * (rows * size + gap) + 0.5)
     every = figure.subplots(down, across, squeeze=False).ravel()
     maps = {place: every[spot] for place, spot in zip(chosen, spots, strict=True)}
     for axes in every:
@@ -319,11 +315,7 @@ def compare(
     group = np.array([kinds.index(name) for name in names])
     order = np.lexsort((*reversed(series.values()), group))
     place = np.arange(count) + 1.5 * group[order]
-    figure = Figure(
-        figsize=(float(np.clip(0.085 * count + 1.2, 4, 10)), 3.2),
-        layout=ConstrainedLayoutEngine(h_pad=0.1),
-        facecolor=PAPER,
-    )
+    figure = blank(float(np.clip(0.085 * count + 1.2, 4, 10)), 3.2, padded=True)
     axes = figure.subplots()
     styles = [("_", 8), ("o", 4.5), ("x", 4), ("D", 3.5), ("v", 4), ("s", 3.5)]
     for i, (name, value) in reversed(list(enumerate(series.items()))):

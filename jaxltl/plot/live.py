@@ -20,7 +20,7 @@ from jaxltl.plot import layout
 from jaxltl.plot.automata import edge_texts, on_the_host
 from jaxltl.plot.board import STEPS
 from jaxltl.plot.maps import kind_colors, kind_marks
-from jaxltl.plot.style import MapOptions, SCALE
+from jaxltl.plot.style import SCALE, MapOptions
 from jaxltl.plot.worlds import TINTS
 
 if TYPE_CHECKING:

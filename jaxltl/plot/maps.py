@@ -32,11 +32,12 @@ from jaxltl.plot.board import (
     short_name,
 )
 from jaxltl.plot.style import (
-    MapOptions,
     FAINT,
     INK,
     KINDS,
     PAPER,
+    MapOptions,
+    blank,
     head,
     note,
     scale_bar,
@@ -92,13 +93,9 @@ def grid(
     down = -(-count // across)
     longest = max(rows, columns)
     size = float(np.clip(5.2 / longest, max(0.16, min(0.24, 9 / longest)), 0.52))
-    figure = Figure(
-        figsize=(
-            across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
-            down * (rows * size + 0.55),
-        ),
-        layout="constrained",
-        facecolor=PAPER,
+    figure = blank(
+        across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
+        down * (rows * size + 0.55),
     )
     all_axes = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
     limits = value_limits(np.zeros(0) if panels is None else panels, limits)

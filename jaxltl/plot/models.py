@@ -20,7 +20,7 @@ from jaxltl.plot import layout as drawing
 from jaxltl.plot.automata import canvas, draw_edge, draw_label, draw_start, draw_state
 from jaxltl.plot.board import STEPS, Board
 from jaxltl.plot.maps import grid
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes, write
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, blank, plain_axes, write
 
 if TYPE_CHECKING:
     from jaxltl.core.models.protocols import PyTree
@@ -155,7 +155,7 @@ def _strip(found: Solution) -> Figure:
     """Values of all states in ascending order, one line per lane."""
     value, low, high = (np.asarray(x, float) for x in (found.value, found.lower, found.upper))
     lanes = int(np.prod(np.shape(found.status)))
-    figure = Figure(figsize=(4.6, 1.7), layout="constrained", facecolor=PAPER)
+    figure = blank(4.6, 1.7)
     axes = figure.subplots()
     plain_axes(axes)
     for mine, least, most in zip(

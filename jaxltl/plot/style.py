@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -30,6 +31,12 @@ SCALE = LinearSegmentedColormap.from_list(
 
 
 Point: TypeAlias = Sequence[float] | NDArray[np.float64]
+
+
+def blank(width: float, height: float, *, padded: bool = False) -> Figure:
+    """An empty figure with a constrained layout, with more space between rows if padded."""
+    layout = ConstrainedLayoutEngine(h_pad=0.1) if padded else "constrained"
+    return Figure(figsize=(width, height), layout=layout, facecolor=PAPER)
 
 
 def write(axes: Axes, place: Point, text: str, size: float, color: str, **style: PyTree) -> None:
@@ -187,11 +194,7 @@ def panel_rows(
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
     if not columns:
         raise ValueError(f"{name}: nothing to show; give at least one row with a panel.")
-    figure = Figure(
-        figsize=(size[0] * len(columns), size[1] * len(rows) + 0.5),
-        layout="constrained",
-        facecolor=PAPER,
-    )
+    figure = blank(size[0] * len(columns), size[1] * len(rows) + 0.5)
     grid = figure.subplots(len(rows), len(columns), squeeze=False)
     found = {}
     for i, row in enumerate(rows):

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
@@ -26,11 +25,12 @@ from jaxltl.plot.board import (
 )
 from jaxltl.plot.maps import TINY, kind_marks
 from jaxltl.plot.style import (
-    MapOptions,
     ACCENT,
     INK,
     PAPER,
     SERIES,
+    MapOptions,
+    blank,
     head,
     note,
     scale_bar,
@@ -92,13 +92,10 @@ def temporal_gridworld(
     wide = max(shape) + 2 * world.margin
     inches = float(np.clip(5.4 / wide, 0.06, 0.42)) * wide
     down = 1 if values is None else 2
-    figure = Figure(
-        figsize=(
-            len(chosen) * (inches + 0.3) + (0.8 if down == 2 else 0.1),
-            down * (inches * (shape[0] + 2 * world.margin) / wide + 0.55) + (0.3 if lines else 0),
-        ),
-        layout=ConstrainedLayoutEngine(h_pad=0.1),
-        facecolor=PAPER,
+    figure = blank(
+        len(chosen) * (inches + 0.3) + (0.8 if down == 2 else 0.1),
+        down * (inches * (shape[0] + 2 * world.margin) / wide + 0.55) + (0.3 if lines else 0),
+        padded=True,
     )
     every = figure.subplots(down, len(chosen), squeeze=False)
     for i, (axes, name) in enumerate(zip(every[0], titles, strict=True)):

@@ -159,15 +159,14 @@ def curves(
     return Curves(name, title, caption, figures, steps, drawn)
 
 
-@dataclass(frozen=True)
 class _Dynamics:
     """Transitions of a world and of a policy's memory, as NumPy arrays."""
 
-    successor: np.ndarray
-    probability: np.ndarray
-    initial_memory: np.ndarray
-    next_memory: np.ndarray
-    on_entry: bool
+    def __init__(self, model: Product) -> None:
+        parts = (model.mdp.successor, model.mdp.probability, model.next_memory)
+        self.successor, self.probability, self.next_memory = map(np.asarray, parts)
+        self.initial_memory = np.asarray(model.initial_memory)
+        self.on_entry = model.label_on == "entry"
 
     def reached(self, state: int, action: int) -> tuple[np.ndarray, np.ndarray]:
         """The successors of an action, and their probabilities."""
@@ -180,20 +179,9 @@ class _Dynamics:
         return int(self.next_memory[there if self.on_entry else here, memory])
 
 
-def _dynamics(model: Product) -> _Dynamics:
-    mdp = model.mdp
-    return _Dynamics(
-        np.asarray(mdp.successor),
-        np.asarray(mdp.probability),
-        np.asarray(model.initial_memory),
-        np.asarray(model.next_memory),
-        model.label_on == "entry",
-    )
-
-
 def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
     """The first demonstrations with their memory states, and a deterministic last successor."""
-    world, runs = _dynamics(model), []
+    world, runs = _Dynamics(model), []
     states, actions = np.asarray(shown.state), np.asarray(shown.action)
     lengths = np.asarray(shown.length)
     for number in np.flatnonzero(lengths > 0)[:MOST_RUNS].tolist():
@@ -205,15 +193,14 @@ def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
         memory = [int(world.initial_memory[at[0]])]
         for here, there in itertools.pairwise(at):
             memory.append(world.remember(memory[-1], here, there))
-        ends: list[int | None] = [None] * (len(at) - length)
-        steps = list(zip(at, memory, [*did, *ends], strict=True))
+        steps = list(itertools.zip_longest(at, memory, did))
         runs.append(Run(f"demonstration {number + 1} of {len(lengths)}", steps))
     return runs
 
 
 def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) -> list[Run]:
     """Rollouts of a policy until the formula is decided, or :data:`LONGEST_RUN` steps."""
-    rng, world = np.random.default_rng(seed), _dynamics(model)
+    rng, world = np.random.default_rng(seed), _Dynamics(model)
     decided = verdicts(model.automaton) != Verdict.UNDECIDED
     initial = np.asarray(model.mdp.initial, float)
     longest = LONGEST_RUN if policy.ndim == 3 else min(len(policy), LONGEST_RUN)

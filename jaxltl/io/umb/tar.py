@@ -6,6 +6,7 @@ Member sizes are not trusted beyond the available bytes, and nothing is extracte
 from __future__ import annotations
 
 import re
+import tarfile
 import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -216,33 +217,9 @@ def tar_pieces(contents: Sequence[tuple[str, NDArray[np.uint8] | bytes]]) -> Ite
 
 
 def _header(name: str, size: int) -> bytes:
-    encoded = name.encode()
-    prefix = b""
-    if len(encoded) > 100:
-        cut = encoded.rindex(b"/", 0, min(len(encoded), 156))
-        prefix, encoded = encoded[:cut], encoded[cut + 1 :]
-    assert len(encoded) <= 100 and len(prefix) <= 155, name
-    length = b"%011o\0" % size if size < 8**11 else b"\x80" + size.to_bytes(11, "big")
-    header = b"".join(
-        (
-            encoded.ljust(100, b"\0"),
-            b"0000644\0",
-            b"0000000\0",
-            b"0000000\0",
-            length,
-            b"00000000000\0",
-            b" " * 8,
-            b"0",
-            bytes(100),
-            b"ustar\x0000",
-            bytes(64),
-            b"0000000\0",
-            b"0000000\0",
-            prefix.ljust(155, b"\0"),
-            bytes(12),
-        )
-    )
-    return header[:148] + b"%06o\0 " % sum(header) + header[156:]
+    info = tarfile.TarInfo(name)
+    info.size = size
+    return info.tobuf(tarfile.USTAR_FORMAT if size < 8**11 else tarfile.GNU_FORMAT)
 
 
 _GZIP_BLOCK = 2**20
