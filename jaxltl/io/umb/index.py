@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -172,41 +173,83 @@ def parse_index(content: bytes, place: str) -> Index:
         data = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{place}this is not JSON: {error}.") from None
-    data = _table(data, "the index", place)
-    if (version := _count(data, "format-version", place)) != 1:
+    index = _Table(data, "the index", place)
+    if (version := index.count("format-version")) != 1:
         raise ValueError(f"{place}format-version is {version}; version 1 is read.")
-    system = _table(_get(data, "transition-system", place), "transition-system", place)
-    counts = {
-        name: _count(system, f"#{name}", place)
-        for name in ("players", "states", "choices", "branches", "choice-actions", "observations")
-    }
-    names = system.get("player-names", [])
+    system = index.table("transition-system")
+    kinds = ("players", "states", "choices", "branches", "choice-actions", "observations")
+    counts = {name: system.count(f"#{name}") for name in kinds}
+    names = system.data.get("player-names", [])
     if not isinstance(names, list) or not all(isinstance(x, str) for x in names):
         raise ValueError(f"{place}player-names is {_shown(names)}; expected a list of texts.")
-    _check_kind(system, counts, place)
+    _check_kind(system, counts)
     probability = None
-    if "branch-probability-type" in system:
-        probability = _type(system["branch-probability-type"], "branch-probability-type", place)
+    if "branch-probability-type" in system.data:
+        probability = system.type("branch-probability-type", "branch-probability-type", place)
         _check_number(probability, "branch-probability-type", place)
-    annotations = _annotations(data.get("annotations", {}), place)
+    annotations = _annotations(index)
     for one in annotations:
         if one.type.name not in ("bool", "int", "uint"):
             _check_number(one.type, f"the annotation {one.name!r}", place)
     return Index(
-        counts["players"],
-        counts["states"],
-        counts["choices"],
-        counts["branches"],
-        counts["choice-actions"],
+        *(counts[name] for name in kinds[:-1]),
         probability,
         annotations,
-        *_records(data.get("valuations", {}), _texts_of_ours(data), place),
+        *_records(index),
         tuple(names),
     )
 
 
-def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: str) -> None:
-    time = _get(system, "time", place)
+class _Table:
+    """An object of the index, with the place that errors name."""
+
+    def __init__(self, data: object, subject: str, place: str) -> None:
+        if not isinstance(data, dict):
+            raise ValueError(f"{place}{subject} is {_shown(data)}; expected an object.")
+        self.data: Mapping[str, object] = data
+        self.place = place
+
+    def get(self, key: str) -> object:
+        if key not in self.data:
+            raise ValueError(f"{self.place}{key!r} is missing.")
+        return self.data[key]
+
+    def table(self, key: str, subject: str = "", default: object = None) -> _Table:
+        """A table in this one, required unless it has a default."""
+        data = self.get(key) if default is None else self.data.get(key, default)
+        return _Table(data, subject or key, self.place)
+
+    def within(self, subject: str) -> _Table:
+        """The same table, with a subject in its place."""
+        return _Table(self.data, subject, f"{self.place}{subject}: ")
+
+    def count(self, key: str) -> int:
+        value = self.get(key)
+        if type(value) is not int or not 0 <= value < 2**64:
+            raise ValueError(
+                f"{self.place}{key} is {_shown(value)}; expected a whole number from 0 to 2^64 - 1."
+            )
+        return value
+
+    def type(self, key: str, subject: str, place: str) -> Type:
+        """The type of values of a subject."""
+        data = _Table(self.get(key), f"the type of {subject}", place).within(subject)
+        name, place = data.get("type"), data.place
+        if not isinstance(name, str) or name not in _SIZES:
+            raise ValueError(
+                f"{place}the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
+            )
+        size = data.count("size") if "size" in data.data else _SIZES[name]
+        fixed = name in ("double", "double-interval", "string")
+        if not 0 < size < 2**32 or (fixed and size != _SIZES[name]):
+            raise ValueError(f"{place}a {name} of {size} bits; expected {_SIZES[name]}.")
+        if name == "rational" and size % 2:
+            raise ValueError(f"{place}a rational of {size} bits; expected an even number.")
+        return Type(name, size)
+
+
+def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
+    place, time = system.place, system.get("time")
     if time != "discrete":
         raise ValueError(
             f"{place}time is {_shown(time)}; expected discrete, models with rates are not supported."
@@ -217,50 +260,39 @@ def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: 
         )
     if not counts["states"]:
         raise ValueError(f"{place}#states is 0; a model needs at least one.")
-    for name in ("states", "choices"):
+    for name in ("states", "choices", "choice-actions"):
         if counts[name] > _MOST_STATES:
             raise ValueError(f"{place}#{name} is {counts[name]}; at most {_MOST_STATES} are read.")
-    if counts["choice-actions"] > _MOST_STATES:
-        raise ValueError(
-            f"{place}#choice-actions is {counts['choice-actions']}; at most "
-            f"{_MOST_STATES} are read."
-        )
     if counts["branches"] >= 2**60:
         raise ValueError(f"{place}#branches is {counts['branches']}; expected less than 2^60.")
 
 
-def _annotations(data: object, place: str) -> tuple[Annotation, ...]:
+def _annotations(index: _Table) -> tuple[Annotation, ...]:
     """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
+    groups = index.table("annotations", default={})
     annotations: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
-        table = _table(
-            _table(data, "annotations", place).get(group, {}), f"the group {group}", place
+        table = groups.table(group, f"the group {group}", {})
+        annotations += [_annotation(group, key, table) for key in table.data]
+    named = [(x.group == "rewards", x.name) for x in annotations if x.group != INITIAL]
+    if twice := [name for name, times in Counter(named).items() if times > 1]:
+        raise ValueError(
+            f"{index.place}two annotations are named {twice[0][1]!r}; expected distinct names."
         )
-        annotations += [_annotation(group, key, value, place) for key, value in table.items()]
-    seen: set[tuple[bool, str]] = set()
-    for one in annotations:
-        if one.group == INITIAL:
-            continue
-        key = (one.group == "rewards", one.name)
-        if key in seen:
-            raise ValueError(
-                f"{place}two annotations are named {one.name!r}; expected distinct names."
-            )
-        seen.add(key)
     return tuple(annotations)
 
 
-def _annotation(group: str, key: str, value: object, place: str) -> Annotation:
+def _annotation(group: str, key: str, table: _Table) -> Annotation:
     path = f"annotations/{group}/{key}"
     if not re.fullmatch(r"[0-9a-z_-]{1,100}", key):
         raise ValueError(
-            f"{place}{_shown(path)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
+            f"{table.place}{_shown(path)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
         )
-    value = _table(value, path, place)
-    name = value.get("alias", key)
+    value = table.table(key, path).within(path)
+    place, name = value.place, value.data.get("alias", key)
     if not isinstance(name, str):
-        raise ValueError(f"{place}{path}: alias is {_shown(name)}; expected a text.")
-    applies = _get(value, "applies-to", f"{place}{path}: ")
+        raise ValueError(f"{place}alias is {_shown(name)}; expected a text.")
+    applies = value.get("applies-to")
     parts = ["states"] if group != "rewards" else list(PARTS)
     if (
         not isinstance(applies, list)
@@ -269,68 +301,60 @@ def _annotation(group: str, key: str, value: object, place: str) -> Annotation:
         or len(set(applies)) < len(applies)
     ):
         raise ValueError(
-            f"{place}{path}: applies-to is {_shown(applies)}; expected a list of "
-            f"{', '.join(parts)}."
+            f"{place}applies-to is {_shown(applies)}; expected a list of {', '.join(parts)}."
         )
-    if "probability-type" in value:
-        raise ValueError(f"{place}{path}: random values are not supported; expected numbers.")
-    kind = _type(_get(value, "type", f"{place}{path}: "), path, place)
+    if "probability-type" in value.data:
+        raise ValueError(f"{place}random values are not supported; expected numbers.")
+    kind = value.type("type", path, table.place)
     numbers = ("double", "rational", "int", "uint", "double-interval", "rational-interval")
     types = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))
     longer = kind.name.startswith("rational")  # than usual, it may be
     if kind.name not in types or (not longer and kind.size != _SIZES[kind.name]):
         raise ValueError(
-            f"{place}{path}: its type is {kind.name} of {kind.size} bits; expected "
+            f"{place}its type is {kind.name} of {kind.size} bits; expected "
             f"{' or '.join(types)} of the usual size."
         )
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _texts_of_ours(data: object) -> frozenset[str]:
-    """Integer variables that jaxltl uses as string indices; Storm refuses the type string."""
-    for key in ("file-data", "parameters", TEXTS):
-        data = data.get(key, {}) if isinstance(data, dict) else {}
-    names = data if isinstance(data, list) else []
-    return frozenset(name for name in names if isinstance(name, str))
-
-
-def _records(
-    data: object, texts_of_ours: frozenset[str], place: str
-) -> tuple[tuple[Record, ...], int]:
+def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
     """Record layouts of the classes of states, and the number of strings."""
-    valuations = _table(data, "valuations", place)
-    if "states" not in valuations:
+    valuations = index.table("valuations", default={})
+    if "states" not in valuations.data:
         return (), 0
-    states = _table(valuations["states"], VALUATIONS, place)
-    classes = _get(states, "classes", f"{place}{VALUATIONS}: ")
+    states = valuations.table("states", VALUATIONS).within(VALUATIONS)
+    classes = states.get("classes")
     if not isinstance(classes, list) or not classes:
-        raise ValueError(f"{place}{VALUATIONS}: classes is {_shown(classes)}; expected a list.")
-    texts = _count(states, "#strings", f"{place}{VALUATIONS}: ") if "#strings" in states else 0
+        raise ValueError(f"{states.place}classes is {_shown(classes)}; expected a list.")
+    texts = states.count("#strings") if "#strings" in states.data else 0
     if texts > _MOST_STATES:
-        raise ValueError(
-            f"{place}{VALUATIONS}: #strings is {texts}; at most {_MOST_STATES} are read."
-        )
-    return tuple(_record(one, texts_of_ours, f"{place}{VALUATIONS}: ") for one in classes), texts
+        raise ValueError(f"{states.place}#strings is {texts}; at most {_MOST_STATES} are read.")
+    # Integer variables that jaxltl uses as string indices; Storm refuses the type string.
+    ours: object = index.data
+    for key in ("file-data", "parameters", TEXTS):
+        ours = ours.get(key, {}) if isinstance(ours, dict) else {}
+    names = [name for name in ours if isinstance(name, str)] if isinstance(ours, list) else []
+    return tuple(_record(one, names, states.place) for one in classes), texts
 
 
-def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
-    variables = _get(_table(data, "a class", place), "variables", place)
+def _record(data: object, names_of_texts: Sequence[str], place: str) -> Record:
+    variables = _Table(data, "a class", place).get("variables")
     if not isinstance(variables, list):
         raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
     variable_of_name: dict[str, Variable] = {}
     start = 0
-    for one in variables:
-        one = _table(one, "a variable", place)
-        if "padding" in one:
-            start += _count(one, "padding", place)
+    for each in variables:
+        one = _Table(each, "a variable", place)
+        if "padding" in one.data:
+            start += one.count("padding")
         else:
-            name = _get(one, "name", place)
+            name = one.get("name")
             if not isinstance(name, str) or name in variable_of_name:
                 raise ValueError(
                     f"{place}a variable is named {_shown(name)}; expected distinct texts."
                 )
-            kind = _type(_get(one, "type", place), f"the variable {name!r}", place)
-            offset, optional = one.get("offset", 0), one.get("is-optional", False)
+            kind = one.type("type", f"the variable {name!r}", place)
+            offset, optional = one.data.get("offset", 0), one.data.get("is-optional", False)
             if type(offset) is not int or not -(2**63) <= offset < 2**63:
                 raise ValueError(
                     f"{place}the offset of {name!r} is {_shown(offset)}; expected a "
@@ -341,7 +365,7 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
                     f"{place}is-optional of {name!r} is {_shown(optional)}; expected true or false."
                 )
             presence, start = (start, start + 1) if optional else (None, start)
-            is_text = kind.name == "uint" and name in texts_of_ours
+            is_text = kind.name == "uint" and name in names_of_texts
             variable_of_name[name] = Variable(name, kind, offset, start, presence, is_text)
             start += kind.size
         if start > 8 * _MOST_RECORD:
@@ -356,23 +380,6 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
     return Record(tuple(variable_of_name.values()), start // 8)
 
 
-def _type(data: object, subject: str, place: str) -> Type:
-    data = _table(data, f"the type of {subject}", place)
-    name = _get(data, "type", f"{place}{subject}: ")
-    if not isinstance(name, str) or name not in _SIZES:
-        raise ValueError(
-            f"{place}{subject}: the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
-        )
-    size = _count(data, "size", f"{place}{subject}: ") if "size" in data else _SIZES[name]
-    if not 0 < size < 2**32 or (
-        name in ("double", "double-interval", "string") and size != _SIZES[name]
-    ):
-        raise ValueError(f"{place}{subject}: a {name} of {size} bits; expected {_SIZES[name]}.")
-    if name == "rational" and size % 2:
-        raise ValueError(f"{place}{subject}: a rational of {size} bits; expected an even number.")
-    return Type(name, size)
-
-
 def _check_number(kind: Type, subject: str, place: str) -> None:
     """Raises ValueError unless the type is numeric, with a size in whole words."""
     types = ("double", "rational", "double-interval", "rational-interval")
@@ -381,27 +388,6 @@ def _check_number(kind: Type, subject: str, place: str) -> None:
             f"{place}{subject} is {kind.name} of {kind.size} bits; expected double of 64, rational of "
             "a multiple of 128, double-interval of 128 or rational-interval of a multiple of 256."
         )
-
-
-def _table(data: object, subject: str, place: str) -> Mapping[str, object]:
-    if not isinstance(data, dict):
-        raise ValueError(f"{place}{subject} is {_shown(data)}; expected an object.")
-    return data
-
-
-def _get(data: Mapping[str, object], key: str, place: str) -> object:
-    if key not in data:
-        raise ValueError(f"{place}{key!r} is missing.")
-    return data[key]
-
-
-def _count(data: Mapping[str, object], key: str, place: str) -> int:
-    value = _get(data, key, place)
-    if type(value) is not int or not 0 <= value < 2**64:
-        raise ValueError(
-            f"{place}{key} is {_shown(value)}; expected a whole number from 0 to 2^64 - 1."
-        )
-    return value
 
 
 def _shown(value: object) -> str:
