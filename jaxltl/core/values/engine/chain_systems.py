@@ -8,6 +8,7 @@ digits than the number of steps costs; those over a mesh are solved by refined B
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -18,12 +19,15 @@ from jax import lax
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.host_callback import host_callback
+from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
+from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import (
     DENSE_LIMIT,
+    Inverse,
     inverse,
     krylov_refined,
     norm,
@@ -46,6 +50,15 @@ class ChainSystem(NamedTuple):
     mask: jax.Array  # ``bool[S]``, the transient states
     # ``int32[S]``, the flat state from which a state takes its row; None for its own
     row_of: jax.Array | None = None
+
+    def image(
+        self, x: jax.Array, reward: jax.Array | float = 0, outside: jax.Array | float = 0
+    ) -> jax.Array:
+        """``(r + P x)_pi`` in the transient states, `outside` elsewhere."""
+        ahead = action_mean(self.policy, reward + expectation(self.model, x))
+        if self.row_of is not None:
+            ahead = ahead.ravel()[self.row_of]
+        return jnp.where(self.mask, ahead, outside)
 
     def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
         """The solution of ``matvec(x) = b`` for the system itself."""
@@ -76,6 +89,22 @@ class ChainSystem(NamedTuple):
         result = jax.ShapeDtypeStruct(b.shape, b.dtype)
         x = host_callback(_eliminated(transposed), result, self, b)
         return _unless(jnp.all(jnp.isfinite(x)), x, lambda: krylov_refined(matvec, b))
+
+
+def with_derivative(
+    value: jax.Array,
+    chain: ChainSystem,
+    *,
+    reward: jax.Array | float = 0,
+    outside: jax.Array | float = 0,
+    inverse: Inverse | None = None,
+) -> jax.Array:
+    """The value of a policy, ``x = (r + P x)_pi`` in transient states, with its derivative."""
+    # That of an optimum is the derivative of the policy that attains it (Danskin).
+    image = partial(chain.image, reward=reward, outside=outside)
+    if inverse is None:
+        return implicit(image, value, system=lax.stop_gradient(chain))
+    return implicit(image, value, solve=inverse.solve, transpose_solve=inverse.transpose_solve)
 
 
 def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -> jax.Array:

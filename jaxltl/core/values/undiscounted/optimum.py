@@ -26,7 +26,6 @@ from jaxltl.core.models.ops.double_word import double_word, normalised_rows
 from jaxltl.core.models.ops.operators import (
     combined,
     action_argmax,
-    action_mean,
     expectation,
     is_representable,
     policy_operator,
@@ -37,8 +36,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
-from jaxltl.core.values.engine.chain_systems import ChainSystem
-from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import in_turn, iterate
 from jaxltl.core.values.engine.linear import MOST_PRODUCTS, Inverse, System, is_small, solver
 from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
@@ -78,15 +76,12 @@ def policy_reachability(
         max_steps = jnp.minimum(max_steps, min(MOST_PRODUCTS, 8 * model.num_states + 64))
     linear = solver(system, method, max_steps=max_steps)
 
-    def image(model: ActionModel, policy: jax.Array, y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
-
     constant = lax.stop_gradient((model, policy))
-    onward, chain = partial(image, *constant), ChainSystem(*constant, undecided)
+    chain = ChainSystem(*constant, undecided)
     goal, rows = 2 * _half_width(model, tolerance), normalised_rows(*constant)
 
     def eliminated() -> tuple[jax.Array, ...]:
-        solve = partial(chain.solve, lambda x: x - onward(x))
+        solve = partial(chain.solve, lambda x: x - chain.image(x))
         return m_matrix_error(rows, solve, solve(one), one, undecided)
 
     start, n = linear.counted(one)
@@ -108,11 +103,10 @@ def policy_reachability(
             jnp.max(upper - lower) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
         ),
     )
-    solvers: dict[str, PyTree] = {"system": chain}
-    if isinstance(linear, Inverse):
-        solvers = {"solve": linear.solve, "transpose_solve": linear.transpose_solve}
-    differentiable = implicit(lambda y: one + image(model, policy, y), value, **solvers)
-    solution = replace(lax.stop_gradient(solution), value=differentiable, policy=policy)
+    inverse = linear if isinstance(linear, Inverse) else None
+    given = ChainSystem(model, policy, undecided)
+    value = with_derivative(value, given, outside=one, inverse=inverse)
+    solution = replace(lax.stop_gradient(solution), value=value, policy=policy)
     return refuse(solution, checked)
 
 
@@ -302,14 +296,8 @@ def _optimize(
     code = status_code(True, True, valid=is_representable(model))
     solution = replace(solution, status=jnp.maximum(solution.status, code))
     solution = jax.tree.map(lax.stop_gradient, solution)
-
-    def follow(y: jax.Array) -> jax.Array:
-        ahead = action_mean(solution.policy, expectation(model, y))
-        return jnp.where(undecided, ahead if row_of is None else ahead.ravel()[row_of], one)
-
-    # The optimum's derivative is that of the policy that attains it (Danskin).
-    system = ChainSystem(lax.stop_gradient(model), solution.policy, undecided, row_of)
-    return replace(solution, value=implicit(follow, solution.value, system=system))
+    chain = ChainSystem(model, solution.policy, undecided, row_of)
+    return replace(solution, value=with_derivative(solution.value, chain, outside=one))
 
 
 def _by_policy_iteration(

@@ -50,8 +50,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse
-from jaxltl.core.values.engine.chain_systems import ChainSystem
-from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import System, bicgstab, inverse, is_small, norm
 
@@ -141,16 +140,9 @@ def total_reward_by_sweeps(
     found: Found = in_turn(
         partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
     )
-    # The optimum's derivative is that of the policy that attains it (Danskin).
     chosen = found.policy if weight is None else weight
-
-    def follow(y: jax.Array) -> jax.Array:
-        ahead = action_mean(chosen, reward + expectation(model, y))
-        return jnp.where(found.open, ahead.ravel()[found.leaves], 0)
-
-    finite = found.finite & earns
-    system = ChainSystem(model, chosen, found.open, found.leaves)
-    value = implicit(follow, found.value, system=lax.stop_gradient(system))
+    chain = ChainSystem(model, chosen, found.open, found.leaves)
+    value, finite = with_derivative(found.value, chain, reward=reward), found.finite & earns
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
