@@ -30,6 +30,14 @@ if TYPE_CHECKING:
     from jaxltl.core.automata.automaton import Automaton
 
 
+_PATH = click.Path(path_type=Path)
+_task_file = click.argument("task_file", metavar="TASK.toml", type=_PATH)
+_out = click.option("--out", type=_PATH, help="Directory for the results.  [default: out/NAME]")
+_as_json = click.option(
+    "--json", "as_json", is_flag=True, help="End with the result as one JSON line."
+)
+
+
 def _say(text: str) -> None:
     """Prints a line of progress to standard error."""
     click.echo(text, err=True)
@@ -60,10 +68,8 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Directory for the results.  [default: out/NAME]"
-)
+@_task_file
+@_out
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1))
 @click.option(
     "--seeds",
@@ -75,7 +81,7 @@ def main() -> None:
 @click.option(
     "--again", is_flag=True, help="Repeat a finished run, or overwrite the result of another task."
 )
-@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_as_json
 @over_devices
 @compiling(fast=True)
 @plain_errors
@@ -120,7 +126,7 @@ def learn(
 
 
 @main.command()
-@click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
+@_task_file
 @compiling(fast=True)
 @plain_errors
 def check(task_file: Path) -> None:
@@ -140,10 +146,8 @@ def check(task_file: Path) -> None:
 
 
 @main.command()
-@click.argument("game_file", metavar="GAME.toml", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Directory for the results.  [default: out/NAME]"
-)
+@click.argument("game_file", metavar="GAME.toml", type=_PATH)
+@_out
 @click.option(
     "--environment",
     nargs=2,
@@ -153,7 +157,7 @@ def check(task_file: Path) -> None:
     "[default: the cell where the strategy forbids most moves]",
 )
 @click.option("--again", is_flag=True, help="Overwrite the result of another game.")
-@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_as_json
 @compiling(fast=True)
 @plain_errors
 def synthesize(
@@ -287,10 +291,8 @@ def _formula_lines(source: str | None) -> list[tuple[str, str]]:
 def _render(result: Automaton, form: str, formula: str) -> str:
     from jaxltl.core.automata.text import to_dict, to_dot, to_text
 
-    if form == "text":
-        return to_text(result)
-    if form == "dot":
-        return to_dot(result)
+    if form in ("text", "dot"):
+        return to_text(result) if form == "text" else to_dot(result)
     if form == "json":
         return json.dumps(to_dict(result))
     if form == "hoa":
@@ -319,11 +321,11 @@ class _Reading(TypedDict):
 
 
 @main.command()
-@click.argument("model_file", metavar="MODEL", type=click.Path(path_type=Path))
+@click.argument("model_file", metavar="MODEL", type=_PATH)
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
 @click.option(
     "--strategy",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     metavar="FILE",
     help="File for optimal strategies, as JSON.",
 )
@@ -335,7 +337,7 @@ class _Reading(TypedDict):
     help="Width of the bounds: absolute for probabilities, else relative.",
 )
 @click.option("--relative", is_flag=True, help="Width relative to the value in any case.")
-@click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
+@_as_json
 @click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
 @click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
 @click.option(
@@ -347,7 +349,7 @@ class _Reading(TypedDict):
 )
 @click.option(
     "--checkpoint",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     metavar="DIRECTORY",
     help="With --mesh: directory of checkpoints, from which long solves resume.",
 )
@@ -436,15 +438,13 @@ def solve(
 
 
 @main.command()
-@click.argument("log", metavar="LOG|POLICY", type=click.Path(path_type=Path))
+@click.argument("log", metavar="LOG|POLICY", type=_PATH)
 @click.argument("formula", required=False)
 @click.option("--confidence", type=float, help="In (0, 1), such as 0.95; required for a log.")
 @click.option("--initial", multiple=True, metavar="STATE", help="Initial state.")
 @click.option("--terminal", multiple=True, metavar="STATE", help="State where episodes end.")
-@click.option("--labels", type=click.Path(path_type=Path), help="Table of states and labels.")
-@click.option(
-    "--model", type=click.Path(path_type=Path), help="Model file with the transition graph."
-)
+@click.option("--labels", type=_PATH, help="Table of states and labels.")
+@click.option("--model", type=_PATH, help="Model file with the transition graph.")
 @click.option(
     "--graph",
     type=click.Choice(["seen", "complete"]),
@@ -463,13 +463,13 @@ def solve(
     type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]),
 )
 @click.option("--min", "smallest", is_flag=True, help="Minimise the probability.")
-@click.option("--policy", type=click.Path(path_type=Path), help="File for the policy, .npz.")
+@click.option("--policy", type=_PATH, help="File for the policy, .npz.")
 @click.option(
     "--curve",
-    type=click.Path(path_type=Path),
+    type=_PATH,
     help="Draw the bound over the number of samples (.svg, .png or .pdf).",
 )
-@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_as_json
 @plain_errors
 def certify(
     log: Path,
@@ -534,18 +534,14 @@ _EXPERIMENTS = {
 
 @main.command(epilog="\n\n".join(f"{k}: {v}." for k, v in _EXPERIMENTS.items()))
 @click.argument("what", type=click.Choice(list(_EXPERIMENTS)))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="Directory of the pictures.  [default: out/reproduce]",
-)
+@click.option("--out", type=_PATH, help="Directory of the pictures. [default: out/reproduce]")
 @click.option(
     "--seeds",
     type=click.IntRange(1),
     help="Number of seeds, in todirl, pac and cce.  [default: 10; in cce "
     "50 for the regulator, 5 for the robot]",
 )
-@click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
+@_as_json
 @compiling(fast=False)
 @plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:

@@ -48,7 +48,7 @@ from jaxltl.core.values.discounted.soft import softmax_policy
 from jaxltl.core.values.undiscounted.mixture import at_starts, certified, from_starts
 from jaxltl.core.values import optimal_actions, optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
-from jaxltl.app.wording import Record, many
+from jaxltl.app.wording import Record, enclosure, many
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.policies.policy_file import save_policy
 
@@ -424,7 +424,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     data = None
     if setup.world.logged is not None:
         # Import here: only worlds of logs have intervals.
-        from jaxltl.app.logged import guaranteed
+        from jaxltl.app.certify import guaranteed
 
         training.stage("certifying")
         data = guaranteed(setup.world.logged, model, setup.task.formula, policy)
@@ -512,17 +512,13 @@ def _within_steps(setup: Setup, learned: Learned, chosen: int) -> tuple[Learned,
 
 
 def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarray) -> Record:
-    value, lower, upper = (
-        from_starts(model, x) for x in (solution.value, solution.lower, solution.upper)
-    )
+    parts = solution.value, solution.lower, solution.upper
+    value, lower, upper = (from_starts(model, x) for x in parts)
     worst = int(starts[np.argmin(value[starts])])
-    names = ("value", "lower", "upper")
     return {
-        "mean": {name: at_starts(model, getattr(solution, name), "mean")[0] for name in names},
+        "mean": enclosure(*(at_starts(model, x, "mean")[0] for x in parts)),
         "minimum": {
-            "value": value[worst],
-            "lower": lower[starts].min(),
-            "upper": upper[worst],
+            **enclosure(value[worst], lower[starts].min(), upper[worst]),
             **world.where(worst),
         },
         "num_starts": len(starts),

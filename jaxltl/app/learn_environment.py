@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -155,7 +156,8 @@ def describe(setup: Setup) -> str:
     """Sizes of the environment, of learning and of the evaluation, as text."""
     task, made = setup.task, setup.environment
     actions = made.actions
-    seen = sum(x.size for x in jax.tree.leaves(_shapes(setup)))
+    shapes = jax.eval_shape(lambda key: made.observe(made.reset(key)), jax.random.key(0))
+    seen = sum(x.size for x in jax.tree.leaves(shapes))
     does = (
         f"{actions.num} actions"
         if isinstance(actions, Finite)
@@ -168,18 +170,9 @@ def describe(setup: Setup) -> str:
         f"({setup.automaton.acceptance}); {task.learner.method} with "
         f"{setup.method.description}: {many(steps, 'step')} of at most "
         f"{setup.method.transitions:,} simulated steps, {steps * setup.method.transitions:,} in "
-        f"total per seed; evaluated by {_num_episodes(task):,} fresh episodes of at most "
+        f"total per seed; evaluated by {task.evaluation.episodes:,} fresh episodes of at most "
         f"{many(setup.num_steps, 'step')}"
     )
-
-
-def _shapes(setup: Setup) -> PyTree:
-    made = setup.environment
-    return jax.eval_shape(lambda key: made.observe(made.reset(key)), jax.random.key(0))
-
-
-def _num_episodes(task: EnvironmentTask) -> int:
-    return task.evaluation.episodes
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
@@ -192,18 +185,14 @@ def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
 def learn(setup: Setup, training: Training) -> Outcome:
     """Learns with N seeds, selects the best by separate episodes, and evaluates all of them."""
     method, seed, num_seeds = setup.method, training.seed, training.num_seeds
-    found, history = run_seeds(
-        method.algorithm,
-        method.problem,
-        method.hparams,
-        training,
-        num_steps=setup.task.learner.steps,
-    )
+    parts = method.algorithm, method.problem, method.hparams
+    found, history = run_seeds(*parts, training, num_steps=setup.task.learner.steps)
     # A single cost of a search is a curve like others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
     # Distinct from all keys of the learner.
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2), 3)
-    agents = [_agent(setup, found.state, i) for i in range(num_seeds)]
+    states = [jax.tree.map(lambda x, i=i: x[i], found.state) for i in range(num_seeds)]
+    agents = [_acting(setup, state) for state in states]
     chosen = 0
     if num_seeds > 1:
         training.stage("choosing")
@@ -216,19 +205,12 @@ def learn(setup: Setup, training: Training) -> Outcome:
         _evaluated(keys[1], agent, setup, threshold=i == chosen) for i, agent in enumerate(agents)
     ]
     training.stage("drawing")
-    run = jax.jit(run_episode, static_argnames="num_steps")
+    run = partial(jax.jit(run_episode, static_argnames="num_steps"), num_steps=setup.num_steps)
     shown = [
-        jax.device_get(
-            run(
-                jax.random.fold_in(keys[2], i),
-                setup.environment,
-                agents[chosen],
-                num_steps=setup.num_steps,
-            )
-        )
+        jax.device_get(run(jax.random.fold_in(keys[2], i), setup.environment, agents[chosen]))
         for i in range(_DRAWN)
     ]
-    proof = _proven(setup, jax.tree.map(lambda x: x[chosen], found.state), training.stage)
+    proof = _proven(setup, states[chosen], training.stage)
     return Outcome(setup, found.state, history, chosen, each, shown, seed, proof)
 
 
@@ -257,11 +239,6 @@ def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> proofs.Proof
     return proofs.Proof(found, run)
 
 
-def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
-    """The policy of a seed."""
-    return _acting(setup, jax.tree.map(lambda x: x[i], states))
-
-
 def _acting(setup: Setup, state: PyTree) -> Agent:
     return setup.method.agent(state, setup.acts == "likeliest")
 
@@ -272,7 +249,7 @@ def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -
         key,
         agent,
         _unshaped(setup.environment),
-        num_episodes=_num_episodes(setup.task),
+        num_episodes=asked.episodes,
         num_steps=setup.num_steps,
         confidence=asked.confidence,
         discount=asked.discount,
@@ -353,11 +330,8 @@ def _transitions(outcome: Outcome) -> int:
 
 
 def _as_numbers(found: Evaluation) -> Record:
-    numbers: Record = {}
-    for name, value in vars(found).items():
-        numbers[name] = vars(value) if isinstance(value, Estimate) else value
     return {
-        **numbers,
+        **{k: vars(x) if isinstance(x, Estimate) else x for k, x in vars(found).items()},
         "status": found.status.name,
         "estimates": [n for n in ESTIMATES if getattr(found, n) is not None],
     }
@@ -365,12 +339,8 @@ def _as_numbers(found: Evaluation) -> Record:
 
 def _drawn(outcome: Outcome) -> list[str]:
     """Names of the scalar metrics with finite values."""
-    history = outcome.history
-    return [
-        n
-        for n in outcome.setup.method.figures
-        if history[n].ndim == 2 and np.isfinite(history[n]).any()
-    ]
+    figures = ((name, outcome.history[name]) for name in outcome.setup.method.figures)
+    return [name for name, x in figures if x.ndim == 2 and np.isfinite(x).any()]
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
@@ -404,13 +374,6 @@ def live(outcome: Outcome) -> list[Curves]:
     return [curves("learning", "Learning", caption, outcome.history, _drawn(outcome))]
 
 
-_VERDICTS = {
-    Verdict.SATISFIED: "satisfied",
-    Verdict.VIOLATED: "violated",
-    Verdict.UNDECIDED: "undecided",
-}
-
-
 def _pictured(outcome: Outcome) -> Picture | None:
     """Some episodes, if the world has positions; drawn here, since its code is the user's."""
     # Deferred: matplotlib.
@@ -420,7 +383,7 @@ def _pictured(outcome: Outcome) -> Picture | None:
     titles = []
     for one in outcome.episodes:
         verdict = Verdict(int(np.asarray(one.world.verdict)[int(one.valid.sum())]))
-        titles.append(f"{_VERDICTS[verdict]} after {many(int(one.valid.sum()), 'step')}")
+        titles.append(f"{verdict.name.lower()} after {many(int(one.valid.sum()), 'step')}")
     try:
         figure = draw_episodes(outcome.setup.environment, outcome.episodes, titles=titles)
     except ValueError:

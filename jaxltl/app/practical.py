@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxltl.app.wording import Record
+from jaxltl.app.wording import Record, enclosure
 from jaxltl.core.models.product import Product
 from jaxltl.core.values.undiscounted.mixture import Mixture, least_mixture
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Quickest, Steps
+from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Quickest
 from jaxltl.core.values.undiscounted.steps_front import meeting, steps_front
 
 _SHARES = np.linspace(0, 0.9, 7)  # of the quickest policy, in the trade-off with the likelihood
@@ -107,8 +107,14 @@ def about_steps(
         "status": learned.status.name,
     }
     shares = [0.0] if np.isinf(bound.limit) else sorted({*_SHARES.tolist(), kept.share})
+    mixed = [(x, (1 - x) * before + x * bound.anchor) for x in shares]
     found["likelihood"] = [
-        _traded(clock, (1 - x) * before + x * bound.anchor, x, counts) for x in shares
+        {
+            "share": share,
+            "steps": enclosure(*clock.steps(policy)[:3]),
+            "neg_log_likelihood": neg_log_likelihood(policy, counts),
+        }
+        for share, policy in mixed
     ]
     if model.automaton.is_cosafe:
         found["front"] = front(model, bound.quickest)
@@ -118,21 +124,9 @@ def about_steps(
 def front(model: Product, quickest: Quickest | None = None) -> list[Record]:
     """The front of probability and steps of a co-safe task."""
     return [
-        {
-            name: dict(zip(("value", "lower", "upper"), numbers, strict=True))
-            for name, numbers in (("probability", one.probability), ("steps", one.steps))
-        }
+        {"probability": enclosure(*one.probability), "steps": enclosure(*one.steps)}
         for one in steps_front(model, quickest)
     ]
-
-
-def _traded(clock: Clock, policy: np.ndarray, share: float, counts: np.ndarray) -> Record:
-    steps: Steps = clock.steps(policy)
-    return {
-        "share": share,
-        "steps": {"value": steps.value, "lower": steps.lower, "upper": steps.upper},
-        "neg_log_likelihood": neg_log_likelihood(policy, counts),
-    }
 
 
 def neg_log_likelihood(policy: np.ndarray, counts: np.ndarray) -> float:

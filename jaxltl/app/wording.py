@@ -17,6 +17,11 @@ def where(state: int, shape: Sequence[int] | None) -> Record:
     return {"state": int(state), "row": row + 1, "column": column + 1}
 
 
+def enclosure(*numbers: object) -> Record:
+    """A number with its lower and upper bound."""
+    return dict(zip(("value", "lower", "upper"), numbers, strict=True))
+
+
 def place(where: Result) -> str:
     """Text of a position: row and column on a map, else the state's name or number."""
     if "row" in where:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, reduce
 from hashlib import sha256
 
 import jax
@@ -272,6 +272,22 @@ class Malformed(ValueError):
 def constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
     """Constant polynomial."""
     return {(0,) * len(parameters): Fraction(value)} if value else {}
+
+
+def number(parameters: tuple[str, ...], value: Fraction | int) -> RationalFunction:
+    """Constant rational function."""
+    return RationalFunction(constant(parameters, value), constant(parameters, 1))
+
+
+def parameter(parameters: tuple[str, ...], name: str) -> RationalFunction:
+    """One of the parameters as a rational function."""
+    powers = tuple(int(x == name) for x in parameters)
+    return RationalFunction({powers: Fraction(1)}, constant(parameters, 1))
+
+
+def power(base: RationalFunction, exponent: int, one: RationalFunction) -> RationalFunction:
+    """Exact power of a rational function, with an exponent of at least 0."""
+    return reduce(multiply, [base] * exponent, one)
 
 
 def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:

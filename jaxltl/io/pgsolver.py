@@ -104,12 +104,8 @@ class _Reader:
     def __init__(self, name: str, text: str) -> None:
         self.name, self.text = name, text
         self.start: int | None = None
-        self.place: list[int] = []  # where each vertex is defined
-        self.vertex: list[int] = []
-        self.priority: list[int] = []
-        self.owner: list[bool] = []
-        self.successors: list[str] = []
-        self.names: list[str] = []
+        # Of each vertex: where it is defined, its number, priority, owner, successors and name.
+        self.rows: list[tuple[int, int, int, bool, str, str]] = []
 
     def error(self, place: int, problem: str) -> ValueError:
         line = self.text.count("\n", 0, place) + 1
@@ -117,70 +113,59 @@ class _Reader:
 
     def game(self) -> ParityGame:
         self._statements()
-        if not self.vertex:
+        if not self.rows:
             raise self.error(
                 len(self.text),
                 "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'.",
             )
-        vertex, priority = np.array(self.vertex), np.array(self.priority)
+        place, *numbers, owner, successors, names = zip(*self.rows, strict=True)
+        vertex, priority = map(np.array, numbers)
         for values, kind in ((vertex, "vertex"), (priority, "priority")):
             if values.max() > MAX_NUMBER:
                 i = int(np.argmax(values > MAX_NUMBER))
                 raise self.error(
-                    self.place[i], f"{kind} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
+                    place[i], f"{kind} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
                 )
         order = np.argsort(vertex, kind="stable")
         ordered = vertex[order]
         if (twice := np.flatnonzero(ordered[1:] == ordered[:-1])).size:
             first, again = order[twice[0]], order[twice[0] + 1]
-            line = self.text.count("\n", 0, self.place[first]) + 1
+            line = self.text.count("\n", 0, place[first]) + 1
             raise self.error(
-                self.place[again],
+                place[again],
                 f"vertex {vertex[again]} is defined a second time, "
                 f"first in line {line}; keep one of them.",
             )
-        degree = np.array([text.count(",") + 1 for text in self.successors])
-        target = self._targets()
+        degree = np.array([text.count(",") + 1 for text in successors])
+        try:
+            target = np.array([int(x) for x in ",".join(successors).split(",")], np.int64)
+        except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63
+            long = next(i for i, text in enumerate(successors) if re.search("[0-9]{11}", text))
+            raise self.error(
+                place[long], f"a successor is beyond {MAX_NUMBER}; give the number of a vertex."
+            ) from None
         where = np.searchsorted(ordered, target)
         missing = (where == ordered.size) | (ordered[np.minimum(where, ordered.size - 1)] != target)
         if missing.any():
             edge = int(np.argmax(missing))
             source = int(np.searchsorted(degree.cumsum(), edge, "right"))
             raise self.error(
-                self.place[source],
+                place[source],
                 f"vertex {vertex[source]} leads to vertex "
                 f"{target[edge]}, which is not defined; define it.",
             )
-        return self._made(vertex, priority, degree, order[where])
-
-    def _targets(self) -> Integers:
-        try:
-            return np.array([int(x) for x in ",".join(self.successors).split(",")], np.int64)
-        except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63
-            long = next(i for i, text in enumerate(self.successors) if re.search("[0-9]{11}", text))
-            raise self.error(
-                self.place[long],
-                f"a successor is beyond {MAX_NUMBER}; give the number of a vertex.",
-            ) from None
-
-    def _made(
-        self, vertex: Integers, priority: Integers, degree: Integers, successor: Integers
-    ) -> ParityGame:
         valuation = {"vertex": vertex, "priority": priority}
-        if any(self.names):
-            valuation["name"] = np.array(self.names, object)
-        initial = None
-        if self.start is not None:
-            initial = (vertex == self.start).astype(np.float64)
+        if any(names):
+            valuation["name"] = np.array(names, object)
         model = make_sparse(
             np.concatenate([[0], degree.cumsum()]),
-            np.arange(successor.size + 1),
-            successor,
-            np.ones(successor.size),
-            initial=initial,
+            np.arange(target.size + 1),
+            order[where],
+            np.ones(target.size),
+            initial=None if self.start is None else (vertex == self.start).astype(np.float64),
             valuation=valuation,
         )
-        game = make_game(model, np.array(self.owner))
+        game = make_game(model, np.array(owner))
         return ParityGame(game, objective_of(game))
 
     def _statements(self) -> None:
@@ -197,19 +182,15 @@ class _Reader:
             if match is None:
                 raise self._broken(at)
             number, priority, owner, successors, name = match.groups()
-            self.place.append(at)
-            self.vertex.append(int(number))
-            self.priority.append(int(priority))
-            self.owner.append(owner == "0")
-            self.successors.append(successors)
-            self.names.append(name or "")
+            row = at, int(number), int(priority), owner == "0", successors, name or ""
+            self.rows.append(row)
             at = match.end()
             if text.startswith("/", at):
                 at = self._skipped(at)
         if start:
             digits = start[1]
             self.start = int(digits) if len(digits) < 19 else MAX_NUMBER + 1
-            if self.start not in self.vertex:
+            if all(row[1] != self.start for row in self.rows):
                 raise self.error(
                     start_place, f"the start, vertex {digits:.30}, is not defined; define it."
                 )
@@ -221,7 +202,7 @@ class _Reader:
     def _broken(self, at: int) -> ValueError:
         """ValueError for the malformed statement at an offset."""
         text, begin = self.text, at
-        if not self.vertex and re.match("[a-z]", text[at]):
+        if not self.rows and re.match("[a-z]", text[at]):
             return self.error(
                 at,
                 f"found {text[at : at + 20]!r}; expected 'parity MAX;', "

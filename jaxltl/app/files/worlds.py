@@ -21,7 +21,7 @@ from jaxltl.envs.text_map import parse_map
 from jaxltl.app.wording import Record, place, where
 
 if TYPE_CHECKING:
-    from jaxltl.app.logged import Logged
+    from jaxltl.app.certify import Logged
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def load_world(path: Path, table: WorldTable) -> World:
     with errors_in(f"{path}: [world] "):
         # Imports here: most tasks have a map, and need no reader of logs or models.
         if table.transitions is not None:
-            from jaxltl.app.logged import load_logged
+            from jaxltl.app.certify import load_logged
 
             mdp, actions, logged = load_logged(path.parent, table)
             return World(mdp, None, actions, logged)

@@ -22,7 +22,7 @@ from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_grounding as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import Explorer
-from jaxltl.app.wording import Record, many
+from jaxltl.app.wording import Record, enclosure, many
 from jaxltl.core.models.construct.lifting import project_policy, project_trajectories
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.product import Product, product
@@ -224,9 +224,9 @@ def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
 
 def _mean(answer: Answer, solution: Solution) -> Record:
     """A probability from the initial distribution, with its bounds."""
-    parts = {name: getattr(solution, name) for name in ("value", "lower", "upper")}
-    found: Record = {name: at_starts(answer.model, x, "mean")[0] for name, x in parts.items()}
-    return {**found, "status": Status(int(solution.status)).name}
+    parts = (solution.value, solution.lower, solution.upper)
+    mean = enclosure(*(at_starts(answer.model, x, "mean")[0] for x in parts))
+    return {**mean, "status": Status(int(solution.status)).name}
 
 
 def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
@@ -275,7 +275,7 @@ def summary(outcome: Outcome) -> Record:
                 "attained": _mean(x, x.attained),
                 "best_achievable": _mean(x, x.best),
                 "robust": x.robust
-                and {"worst": x.robust.worst, "lower": x.robust.lower, "upper": x.robust.upper},
+                and {k: getattr(x.robust, k) for k in ("worst", "lower", "upper")},
             }
             for x in outcome.answers
         ],

@@ -10,9 +10,7 @@ from jaxltl.app.files.scenes import Scene
 from jaxltl.app.job import about, plain, took
 from jaxltl.app.todirl.results import (
     Judged,
-    Learned,
     Outcome,
-    Setup,
     Worlds,
     counted_worlds,
     part_of,
@@ -21,7 +19,7 @@ from jaxltl.app.practical import StepBound, front
 from jaxltl.core.models.product import product
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
-from jaxltl.app.wording import Record
+from jaxltl.app.wording import Record, enclosure
 
 
 def summary(outcome: Outcome) -> Record:
@@ -67,7 +65,13 @@ def summary(outcome: Outcome) -> Record:
         and setup.test
         and _about_worlds(setup.test, outcome.test, infeasible[count:], leave_out, bounds[count:]),
         "learning": {
-            **_about_learning(learned, i),
+            **{k: history[k][-1][i] for k in ("loss", "neg_log_likelihood", "gradient_norm")},
+            "held_out": learned.held_out[i],
+            "best_step": learned.best_step[i],
+            "stopped_early": bool(learned.stopped[i]),
+            "steps": learned.num_steps,
+            "solver": Status(int(history["status"][:, i].max())).name,
+            "solver_error": history["error"][:, i].max(),
             "hyperparameters": task.learner.hyperparameters(),
         },
         "history": {
@@ -92,31 +96,11 @@ def summary(outcome: Outcome) -> Record:
         },
         **took(outcome.seconds),
     }
-    _add_front(setup, result["training"].get("expected_steps"))
-    return plain(result)
-
-
-def _add_front(setup: Setup, time: Record | None) -> None:
-    """Adds the front of probability and steps in the world of the largest multiple."""
-    if time and setup.judge.is_cosafe:
+    time: Record | None = result["training"].get("expected_steps")
+    if time and setup.judge.is_cosafe:  # in the world of the largest multiple
         scene = setup.worlds.scenes[setup.worlds.names.index(time["worst_world"])]
-        time["front"] = front(product(scene.mdp, setup.judge, label_on=setup.task.label_on))
-
-
-def _about_learning(learned: Learned, i: int) -> Record:
-    """The final figures of one seed."""
-    history = learned.history
-    return {
-        "loss": history["loss"][-1][i],
-        "neg_log_likelihood": history["neg_log_likelihood"][-1][i],
-        "held_out": learned.held_out[i],
-        "best_step": learned.best_step[i],
-        "stopped_early": bool(learned.stopped[i]),
-        "steps": learned.num_steps,
-        "gradient_norm": history["gradient_norm"][-1][i],
-        "solver": Status(int(history["status"][:, i].max())).name,
-        "solver_error": history["error"][:, i].max(),
-    }
+        time["front"] = front(product(scene.mdp, setup.judge, label_on=task.label_on))
+    return plain(result)
 
 
 def _about_worlds(
@@ -130,7 +114,7 @@ def _about_worlds(
     for who, performance in judged.performance.items():
         mean = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
         found[who] = {
-            "mean": {"value": mean.mean, "lower": mean.lower, "upper": mean.upper},
+            "mean": enclosure(mean.mean, mean.lower, mean.upper),
             "std": mean.std,
             "worst_world": {"name": mean.worst_world, "value": mean.worst},
             "worst_start": mean.worst_start,
@@ -166,11 +150,9 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> Recor
     one = part_of(judged.performance["learned"], w)
     return {
         "name": scene.name,
-        "mean": {"value": one.mean, "lower": one.lower, "upper": one.upper},
+        "mean": enclosure(one.mean, one.lower, one.upper),
         "minimum": {
-            "value": one.worst,
-            "lower": one.worst_lower,
-            "upper": one.worst_upper,
+            **enclosure(one.worst, one.worst_lower, one.worst_upper),
             **scene.place(int(one.worst_state)),
         },
         "status": Status(int(one.status)).name,
@@ -178,9 +160,9 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> Recor
         "random": judged.performance["random"].mean[w],
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
         "infeasible_starts": infeasible,
-        **(
-            {}
-            if judged.share is None or judged.attained is None
-            else {"share": judged.share[w], "attained": judged.attained[w]}
-        ),
+        **{
+            key: x[w]
+            for key, x in (("share", judged.share), ("attained", judged.attained))
+            if x is not None
+        },
     }

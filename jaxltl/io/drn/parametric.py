@@ -1,17 +1,21 @@
-"""Parametric models from DRN files: rational functions as probabilities and rewards."""
+"""Parametric models from DRN files and programs, with rational functions as probabilities."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
+from typing import cast
 
 import numpy as np
 
 from jaxltl.core.array_types import Integers
-from jaxltl.io.drn.body import Numbers, names_of, read_body, read_header, rewards_of
+from jaxltl.core.language.expressions import Expression
+from jaxltl.core.programs.build import MAX_STATES, build_rows
+from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
 from jaxltl.io.files import read_bytes
 from jaxltl.io.parametric_model import (
     MOST_DEPTH,
@@ -20,12 +24,13 @@ from jaxltl.io.parametric_model import (
     ParametricModel,
     RationalFunction,
     add,
-    constant,
     divide,
     multiply,
+    number,
+    parameter,
+    power,
 )
-from jaxltl.io.prism.parametric import parametric_program
-from jaxltl.io.prism.program import Constants, is_program
+from jaxltl.io.prism.program import Constants, is_program, read_program
 from jaxltl.io.tokens import Block, Text, as_fraction, numbered, refuse
 
 _TOKEN = re.compile(
@@ -70,7 +75,7 @@ def read_parametric(
       [0.75, 0.25, 1.0]
     """
     if is_program(path):
-        return parametric_program(path, constants, max_states)
+        return _of_program(path, constants, max_states)
     if constants is not None or max_states is not None:
         raise ValueError(f"{str(path)!r} is no program; constants and max_states are for programs.")
     name, data = str(path), read_bytes(path)
@@ -78,7 +83,7 @@ def read_parametric(
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
     index_of_text = {b"0": 0}
-    functions = [RationalFunction({}, constant(header.parameters, 1))]
+    functions = [number(header.parameters, 0)]
     placeholders: dict[str, RationalFunction] = {}
     for place, text in header.placeholders.items():
         try:
@@ -114,7 +119,7 @@ def read_parametric(
             np.concatenate(body.successor),
             np.concatenate(body.value).astype(np.int32, copy=False),
             {
-                key: (_everywhere(of_state, body.num_states), _everywhere(of_choice, body.num_rows))
+                key: (_numbers(of_state, body.num_states), _numbers(of_choice, body.num_rows))
                 for key, of_state, of_choice in rewards_of(header, body)
             },
             names_of(header, body),
@@ -123,9 +128,9 @@ def read_parametric(
         refuse(name, "it is too large for the memory.")
 
 
-def _everywhere(function: Numbers, size: int) -> Integers:
-    """Function numbers of a reward; all zero (the zero function) where the reward is absent."""
-    return function.astype(np.int32, copy=False) if function.size else np.zeros(size, np.int32)
+def _numbers(given: Numbers | None, size: int) -> Integers:
+    """Numbers of functions of a reward; 0, the zero function, where the reward is absent."""
+    return np.zeros(size, np.int32) if given is None or not given.size else given.astype(np.int32)
 
 
 def _starts(owner: Integers, size: int) -> Integers:
@@ -175,9 +180,6 @@ class _Reader:
         self.place += 1
         return self.tokens[self.place - 1] if self.place <= len(self.tokens) else ""
 
-    def number(self, value: Fraction | int) -> RationalFunction:
-        return RationalFunction(constant(self.parameters, value), constant(self.parameters, 1))
-
     def sum(self, depth: int) -> RationalFunction:
         if depth > MOST_DEPTH:
             raise Malformed("nested too deeply")
@@ -185,7 +187,9 @@ class _Reader:
         while self.next() in ("+", "-"):
             sign = self.take()
             other = self.product(depth)
-            result = add(result, other if sign == "+" else multiply(self.number(-1), other))
+            result = add(
+                result, other if sign == "+" else multiply(number(self.parameters, -1), other)
+            )
         return result
 
     def product(self, depth: int) -> RationalFunction:
@@ -205,12 +209,11 @@ class _Reader:
             exponent = self.take()
             if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > MOST_POWER:
                 raise Malformed("no whole power up to 1000")
-            base, result = result, self.number(1)
-            if (max(len(base.numerator), len(base.denominator)) - 1) * int(exponent) > MOST_POWER:
+            terms = max(len(result.numerator), len(result.denominator))
+            if (terms - 1) * int(exponent) > MOST_POWER:
                 raise Malformed("too large")
-            for _ in range(int(exponent)):
-                result = multiply(result, base)
-        return result if sign == 1 else multiply(self.number(-1), result)
+            result = power(result, int(exponent), number(self.parameters, 1))
+        return result if sign == 1 else multiply(number(self.parameters, -1), result)
 
     def atom(self, depth: int) -> RationalFunction:
         token = self.take()
@@ -220,9 +223,84 @@ class _Reader:
                 raise Malformed("without a closing bracket")
             return result
         if token in self.parameters:
-            powers = tuple(int(name == token) for name in self.parameters)
-            return RationalFunction({powers: Fraction(1)}, constant(self.parameters, 1))
-        number = as_fraction(token.encode())
-        if number is None:
+            return parameter(self.parameters, token)
+        value = as_fraction(token.encode())
+        if value is None:
             raise Malformed(f"malformed at {token[:20]!r}" if token else "cut")
-        return self.number(number)
+        return number(self.parameters, value)
+
+
+# --- programs -------------------------------------------------------------------------------
+
+
+def _of_program(
+    path: str | os.PathLike[str], constants: Constants, max_states: int | None
+) -> ParametricModel:
+    """The model of a program, with its constants of type double without a value as parameters."""
+    program = read_program(path, constants)
+    name = repr(program.source.name)
+    if not program.parameters:
+        raise ValueError(f"{name}: every constant has a value, so there is no parameter.")
+    if program.kind == "smg" or program.has_intervals:
+        raise ValueError(f"{name}: games and intervals with parameters are not supported.")
+    rows = build_rows(program, max_states=MAX_STATES if max_states is None else max_states)
+    reader = _Functions(program.parameters)
+    functions = []
+    for e in rows.functions:
+        try:
+            functions.append(reader.function(e))
+        except Malformed as error:
+            raise ValueError(
+                f"{name}: {e} is {error}; probabilities and rewards with parameters are quotients "
+                "of polynomials in them."
+            ) from None
+    num_states, num_choices = rows.row_start.size - 1, rows.entry_start.size - 1
+    return ParametricModel(
+        program.parameters,
+        tuple(functions),
+        rows.row_start,
+        rows.entry_start,
+        rows.successor,
+        rows.weight.astype(np.int32),
+        {
+            key: (_numbers(state, num_states), _numbers(choice, num_choices))
+            for key, (state, choice) in rows.rewards.items()
+        },
+        cast(Names, rows.annotations),
+    )
+
+
+class _Functions:
+    """Rational functions of expressions over some parameters."""
+
+    def __init__(self, parameters: Sequence[str]) -> None:
+        self.parameters = tuple(parameters)
+        self.known: dict[Expression, RationalFunction] = {}
+
+    def function(self, e: Expression) -> RationalFunction:
+        if (found := self.known.get(e)) is None:
+            found = self.known[e] = self._function(e)
+        return found
+
+    def _function(self, e: Expression) -> RationalFunction:
+        if e.operator == "literal":
+            return number(self.parameters, Fraction(str(e.value)))  # decimals as they are written
+        if e.operator == "name":
+            return parameter(self.parameters, str(e.value))
+        if e.operator == "pow":
+            return self._power(*e.operands)
+        if e.operator not in ("+", "-", "*", "/", "neg"):
+            raise Malformed(f"no rational function, because of {e.operator}")
+        parts = [self.function(x) for x in e.operands]
+        if e.operator in ("-", "neg"):  # of the last operand
+            parts[-1] = multiply(number(self.parameters, -1), parts[-1])
+        if e.operator == "/":
+            return divide(*parts)
+        return reduce(multiply if e.operator == "*" else add, parts)
+
+    def _power(self, base: Expression, exponent: Expression) -> RationalFunction:
+        value, one = exponent.value, number(self.parameters, 1)
+        if not (exponent.is_literal and isinstance(value, int) and abs(value) <= MOST_POWER):
+            raise Malformed(f"no power with an integer up to {MOST_POWER}")
+        found = power(self.function(base), abs(value), one)
+        return found if value >= 0 else divide(one, found)
