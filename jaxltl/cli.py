@@ -180,7 +180,7 @@ def synthesize(
     _begin(f"solving {game_file}")
     from jaxltl.app import synthesize as synthesis
     from jaxltl.app.files.game import read_game
-    from jaxltl.app.reports import synthesize as report, synthesize_page
+    from jaxltl.app.reports import synthesize as report
 
     file = read_game(game_file)
     out = run_job.directory(out, file.name)
@@ -193,7 +193,7 @@ def synthesize(
         found = synthesis.synthesize(file, progress)
         place = report.place_of(found, environment)
         progress("writing")
-        written = synthesize_page.write(found, out, place, time.perf_counter() - begin)
+        written = report.write(found, out, place, time.perf_counter() - begin)
     click.echo(report.table(written, found))
     click.echo(f"\nwrote {out}/result.json and the files beside it")
     if as_json:

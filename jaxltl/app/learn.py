@@ -18,7 +18,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.algos import mlirl
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn as report  # noqa: F401 - part of the job
-from jaxltl.app.reports.learn_pictures import (
+from jaxltl.app.reports.learn import (
     live as live,
     pictures as pictures,
     task_pictures as task_pictures,

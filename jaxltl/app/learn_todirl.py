@@ -27,11 +27,11 @@ from jaxltl.app.todirl.guarantee import (
     step_bounds,
     within_steps,
 )
-from jaxltl.app.todirl.summary import summary as summary
+from jaxltl.app.todirl.results import summary as summary
 from jaxltl.app.todirl.results import LENGTH, Judged, Learned, Outcome, Setup, Worlds, part_of
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_todirl as report  # noqa: F401 - part of the job
-from jaxltl.app.reports.todirl_pictures import (
+from jaxltl.app.reports.learn_todirl import (
     live as live,
     pictures as pictures,
     task_pictures as task_pictures,

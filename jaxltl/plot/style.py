@@ -35,7 +35,7 @@ Point: TypeAlias = Sequence[float] | NDArray[np.float64]
 
 def blank(width: float, height: float, *, padded: bool = False) -> Figure:
     """An empty figure with a constrained layout, with more space between rows if padded."""
-    layout = ConstrainedLayoutEngine(h_pad=0.1) if padded else "constrained"
+    layout = ConstrainedLayoutEngine(h_pad=0.1 if padded else None)
     return Figure(figsize=(width, height), layout=layout, facecolor=PAPER)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.app.certify import guaranteed
 from jaxltl.app.files.demonstrations import load_demonstrations
 from jaxltl.app.files.task_mlirl import read_task
 from jaxltl.app.files.worlds import load_world
-from jaxltl.app.certify import guaranteed
 from jaxltl.app.reports.learn import remarks
 from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.models.product import product

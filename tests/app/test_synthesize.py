@@ -10,7 +10,7 @@ from jaxltl import plot
 from jaxltl.app import synthesize as synthesis
 from jaxltl.app.files.game import load_game, read_game
 from jaxltl.app.reports import synthesize as report
-from jaxltl.app.reports.synthesize_page import play_explorer
+from jaxltl.app.reports.synthesize import play_explorer
 from jaxltl.io.policies import load_policy
 from tests.support import replaced
 from tests.test_cli import failure, run

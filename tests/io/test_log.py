@@ -15,8 +15,8 @@ import pytest
 from jaxltl.core.models.construct.counts import align_counts
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.io import csv_columns as _columns
 from jaxltl.io import log
+from jaxltl.io import log as _columns
 from jaxltl.io.log import read_labels, read_log
 
 NAMES = ("hall", "kitchen, lower", "bath", 'the "den"', "Büro", "0", "1", "x y")

@@ -1,14 +1,38 @@
-"""Report of a transferable reward: satisfaction probabilities in training and test worlds."""
+"""Report of a transferable reward: satisfaction probabilities in worlds, and pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.drawing import Picture
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import (
+    LONGEST_RUN,
+    START,
+    Curves,
+    Explorer,
+    Layer,
+    Run,
+    TooLarge,
+    View,
+    curves,
+    demonstrated_runs,
+    explorer,
+    learned_runs,
+)
 from jaxltl.app.reports.figures import Remark, certified, number, probability
 from jaxltl.app.reports.page import Part, render_page, render_remarks, render_table
+from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app.todirl.results import summary
 from jaxltl.app.wording import Result, many
+from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
+from jaxltl.envs.gridworld import ACTIONS
 
 
 _POLICIES = {
@@ -163,3 +187,233 @@ def remarks(result: Result) -> list[Remark]:
         counted_worlds=counted,
     )
     return found + steps.unused(result["guarantee"])
+
+
+# --- pictures --------------------------------------------------------------------------------
+
+
+_PICTURES = 3  # worlds that are drawn, of each kind
+
+
+_END = {
+    "cosafe": "is satisfied or violated",
+    **dict.fromkeys(("safety", "buchi", "parity"), f"is violated, or for {LONGEST_RUN} steps"),
+}
+_FIGURES = ("per_pair", "held_out", "gradient_norm")
+
+
+def task_pictures(setup: Setup) -> list[Picture]:
+    """Pictures of the automata of the formula and of the memory."""
+    same = setup.memory is setup.judge
+    found = [automaton_picture(setup.judge, "training-1" if same else "")]
+    if not same:
+        found.append(
+            Picture(
+                "memory.svg",
+                "Memory of the learner",
+                drawing("automaton", setup.memory),
+                "The automaton whose state is the learner's memory; the formula's automaton evaluates it.",
+                "training-1",
+            )
+        )
+    return found
+
+
+def pictures(outcome: Outcome) -> list[Picture]:
+    """Pictures of learning curves and of policies in worlds."""
+    history = outcome.learned.history
+    found = [
+        Picture(
+            "learning.svg",
+            "Learning",
+            drawing("curves", {k: history[k].T for k in _FIGURES}, steps=history["step"]),
+            _caption_of_curves(outcome),
+            "learning",
+        )
+    ]
+    if time := summary(outcome)["training"].get("expected_steps"):
+        found += steps.pictures({**time, "likelihood": []})
+    for one in _drawn_worlds(outcome):
+        found += _draw(outcome, one)
+    return found
+
+
+def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
+    """Interactive policies in worlds, and learning curves."""
+    found: list[Explorer | TooLarge | Curves] = [
+        _look_into(outcome, one) for one in _drawn_worlds(outcome)
+    ]
+    history = outcome.learned.history
+    return [*found, curves("learning", "Learning", _caption_of_curves(outcome), history, _FIGURES)]
+
+
+def _caption_of_curves(outcome: Outcome) -> str:
+    return (
+        "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
+        "if there are any, and the norm of the gradient, before each step"
+        + (
+            ""
+            if np.isnan(outcome.learned.held_out).any()
+            else ". The parameters with the least held-out figure are kept"
+        )
+        + over_seeds(len(outcome.learned.held_out))
+    )
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A world that is drawn: its index, file stem, title, and demonstrations."""
+
+    worlds: Worlds
+    judged: Judged
+    w: int
+    stem: str
+    title: str
+    arrows: bool
+    demonstrations: Trajectories | None
+
+    @property
+    def live(self) -> str:
+        return self.stem.replace("_", "-")
+
+    @property
+    def policy(self) -> np.ndarray:
+        """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
+        return self.judged.policy[self.w][..., : self.worlds.scenes[self.w].mdp.num_states, :, :]
+
+    @property
+    def value(self) -> np.ndarray:
+        """``[S]``: the satisfaction probability from an initial state."""
+        size = self.worlds.scenes[self.w].mdp.num_states
+        return np.asarray(self.judged.performance["learned"].value[self.w])[:size]
+
+
+def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
+    setup, training, test = outcome.setup, outcome.setup.training, outcome.setup.test
+
+    def title(worlds: Worlds, judged: Judged, w: int) -> str:
+        mean = float(judged.performance["learned"].mean[w])
+        return f"{worlds.scenes[w].name} ({mean:.4f})"
+
+    judged = outcome.training
+    for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
+        text = f"Training world: {title(training, judged, w)}"
+        yield _Drawn(training, judged, w, f"training_{w + 1}", text, True, shown)
+    if test is not None and outcome.test is not None:
+        for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
+            text = f"Test world, {rank}: {title(test, outcome.test, w)}"
+            yield _Drawn(test, outcome.test, w, f"test_{n + 1}", text, n == 0, None)
+
+
+_CAPTION = (
+    "One map for each memory state; lengths of arrows are the probabilities of actions{}. The "
+    "title has the mean satisfaction probability."
+)
+
+
+def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
+    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
+    stationary = policy.ndim == 3
+    moving = policy if stationary else policy[0]
+    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
+    layers = {
+        str(q): Layer(f"memory state {q}: {names[q]}", None, moving[:, q])
+        for q in _memory_shown(setup)
+    }
+    starts = np.asarray(scene.mdp.initial) > 0
+    layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
+    model = part_of(one.worlds.model, one.w)
+    shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
+    place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
+    return explorer(
+        View(
+            name=one.live,
+            title=one.title,
+            caption=_CAPTION.format("" if stationary else " at the first step"),
+            size=scene.mdp.num_states,
+            place=place,
+            actions=ACTIONS,
+            label="satisfaction probability",
+            wall=setup.task.world.wall or "#",
+            goal="the formula" if setup.memory is setup.judge else "the memory's formula",
+        ),
+        setup.memory,
+        layers,
+        [*shown, *_runs(outcome, one)],
+    )
+
+
+def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
+    """The test worlds of least, median and greatest satisfaction probability."""
+    counted = np.flatnonzero(counted_worlds(setup))
+    mean = np.asarray(judged.performance["learned"].mean)
+    order = counted[np.argsort(mean[counted], kind="stable")]
+    ranks = {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
+    found: dict[int, str] = {}
+    for rank, w in ranks.items():
+        found.setdefault(int(w), rank)
+    return [(rank, w) for w, rank in found.items()]
+
+
+def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
+    """Pictures of a world: its policy, and trajectories."""
+    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
+    moving = policy if policy.ndim == 3 else policy[0]
+    shown = _memory_shown(setup)
+    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
+    # About as many characters as a panel is wide.
+    width = int(np.clip(5 * scene.shape[1], 9, 50))
+    titles = [short_name(f"memory state {q}: {names[q]}", width) for q in shown]
+    caption = _CAPTION.format("" if policy.ndim == 3 else " at the first step")
+    if scene.colored is None:
+        assert scene.cells is not None
+        drawn = drawing(
+            "grid",
+            scene.cells,
+            np.broadcast_to(one.value, (len(shown), one.value.size)),
+            moving.transpose(1, 0, 2)[shown],
+            titles=titles,
+            label="satisfaction probability",
+            wall=setup.task.world.wall or "#",
+        )
+        caption += " Colours: the satisfaction probability from there as an initial state."
+        return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
+    found: list[Picture] = []
+    if one.arrows:
+        drawn = drawing(
+            "temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown, title=titles
+        )
+        found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
+    pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
+    if policy.ndim == 3 and any(pairs):
+        walks = make_trajectories(scene.mdp, [each for each in pairs if each])
+        found.append(
+            Picture(
+                f"{one.stem}_runs.svg",
+                f"Trajectories in {scene.name}" if one.arrows else one.title,
+                drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
+                f"{len(walks.length)} trajectories of the learned policy from random initial states, "
+                f"each until the formula {_END[setup.judge.acceptance]}.",
+                one.live,
+            )
+        )
+    return found
+
+
+def _memory_shown(setup: Setup) -> list[int]:
+    """The undecided memory states."""
+    undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
+    return [int(q) for q in undecided] or [0]
+
+
+def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
+    """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
+    setup, policy, count = outcome.setup, one.policy, 1
+    if setup.memory is not setup.judge:
+        # The formula's automaton state varies fastest.
+        policy, count = (
+            np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge)),
+            len(setup.judge.delta),
+        )
+    found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)
+    return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]

@@ -191,8 +191,13 @@ def parse_index(content: bytes, place: str) -> Index:
     for one in annotations:
         if one.type.name not in ("bool", "int", "uint"):
             _check_number(one.type, f"the annotation {one.name!r}", place)
+    players, states, choices, branches, actions, _ = counts.values()
     return Index(
-        *(counts[name] for name in kinds[:-1]),
+        players,
+        states,
+        choices,
+        branches,
+        actions,
         probability,
         annotations,
         *_records(index),
