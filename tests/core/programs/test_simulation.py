@@ -251,7 +251,8 @@ def test_what_has_no_simulation_is_refused(text, options, message):
 
 WHEEL = """mdp module m x : [0..6]; [a] true -> 0.3 : (x'=mod(x+1, 7)) + 0.7 : true;
   [] x>2 -> x/10 : (x'=0) + 1 - x/10 : (x'=x-1); [] x=4 -> (x'=1); endmodule
-module n y : [0..3]; b : bool; [a] y<3 -> 0.1 : (y'=y+1) + 0.9 : (b'=!b); [a] b -> (y'=0); endmodule"""
+module n y : [0..3]; b : bool; [a] y<3 -> 0.1 : (y'=y+1) + 0.9 : (b'=!b); [a] b -> (y'=0);
+  [] y=3 & !b -> (b'=true); endmodule"""
 
 
 @pytest.mark.slow
