@@ -253,45 +253,35 @@ class Search:
         while begin < number.size:
             limit = (end[begin - 1] if begin else 0) + _ENTRIES
             stop = max(int(np.searchsorted(end, limit, "right")), begin + 1)
-            self._entries(rows, tables, words, number, begin, stop)
+            self._entries(rows, tables, words, begin, stop)
             begin = stop
 
     def _entries(
-        self,
-        rows: _Rows,
-        tables: list[Choices],
-        words: Words,
-        number: Integers,
-        begin: int,
-        stop: int,
+        self, rows: _Rows, tables: list[Choices], words: Words, begin: int, stop: int
     ) -> None:
-        """Successors of the rows from `begin` to `stop`."""
-        number = number[begin:stop]
-        row = np.arange(stop - begin).repeat(number)
-        state = rows.state[begin:stop][row]
+        """Successors of the rows from `begin` to `stop`: products of one module after the other."""
+        size = stop - begin
+        row, state = np.arange(size), rows.state[begin:stop]
         target = [w[state] for w in words]
         weight: Weight | None = None
-        rest: Integers | None = None
         for table, chosen in zip(tables, rows.chosen, strict=True):
-            if chosen is None:
+            low, high = np.searchsorted(chosen[0], (begin, stop)) if chosen else (0, 0)
+            if chosen is None or low == high:
                 continue
-            whole, of_whole = chosen
-            low, high = np.searchsorted(whole, (begin, stop))
-            if low == high:
-                continue
-            local = np.full(stop - begin, -1)
-            local[whole[low:high] - begin] = of_whole[low:high]
-            chosen_row = local[row]
-            everywhere = high - low == stop - begin
-            part = slice(None) if everywhere else (chosen_row >= 0).nonzero()[0]
-            chosen_row = chosen_row[part]
-            entry = table.start[chosen_row]
-            if table.width.max() > 1:
-                if rest is None:
-                    rest = concatenated_ranges(np.zeros(number.size, np.int64), number)
-                width = table.width[chosen_row]
-                entry = entry + rest[part] % width
-                rest[part] //= width
+            local = np.full(size, -1)
+            local[chosen[0][low:high] - begin] = chosen[1][low:high]
+            width = np.where(local < 0, 1, table.width[local])
+            if width.max() > 1:
+                width = width[row]
+                again = np.arange(row.size).repeat(width)
+                entry = concatenated_ranges(table.start[local[row]], width)
+                row, target = row[again], [one[again] for one in target]
+                weight = None if weight is None else weight[again]
+            else:
+                entry = table.start[local[row]]
+            everywhere = high - low == size
+            part = slice(None) if everywhere else (local[row] >= 0).nonzero()[0]
+            entry = entry[part]
             for one, change in zip(target, table.change, strict=True):
                 one[part] += change[entry]
             more = table.weight[entry]
