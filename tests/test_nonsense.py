@@ -26,8 +26,8 @@ from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core import validation
 from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.statistics.binomial import bounded_mean
 from jaxltl.core.statistics.confidence_sets import samples_needed
-from jaxltl.core.statistics.empirical_bernstein import bounded_mean
 from jaxltl.core.values.evaluation.evaluation import share_estimate
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.multi_objective.multi_objective import multi_objective

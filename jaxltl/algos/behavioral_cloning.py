@@ -30,9 +30,7 @@ Example: a policy of the state and the automaton state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,15 +38,13 @@ import optax
 from flax import linen as nn
 
 from jaxltl.algos.common import learner, trees
-from jaxltl.algos.common.early_stopping import Best, stop_early
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.learner import Best, stop_early
+from jaxltl.algos.common.settings import COUNT, Number, require_output, static, traced
 from jaxltl.core import struct
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
 
 # --- policy networks -----------------------------------------------------------------------------
@@ -66,11 +62,10 @@ class ConvolutionalPolicy(nn.Module):
       kernels: number of kernels of each convolution, 2 x 2 with stride 1 and no padding.
       hidden: widths of the dense layers.
 
-    Example:
-      >>> read = jnp.zeros((7, 45)), jnp.zeros((7, 2))
-      >>> jax.eval_shape(
-      ...     ConvolutionalPolicy().init_with_output, jax.random.key(0), *read)[0].shape
-      (7, 4)
+    >>> read = jnp.zeros((7, 45)), jnp.zeros((7, 2))
+    >>> jax.eval_shape(
+    ...     ConvolutionalPolicy().init_with_output, jax.random.key(0), *read)[0].shape
+    (7, 4)
     """
 
     observation_shape: Sequence[int] = (3, 3, 5)
@@ -119,7 +114,6 @@ def _dense_layers(
 # --- the learner's data --------------------------------------------------------------------------
 
 
-@brief
 @struct.dataclass
 class Problem:
     """Observations in worlds, and demonstrations.
@@ -140,7 +134,6 @@ class Problem:
     network: nn.Module = struct.field(pytree_node=False, default=ConvolutionalPolicy())
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -158,7 +151,6 @@ class Hparams:
     batch: int = static(COUNT, default=128)
 
 
-@brief
 @struct.dataclass
 class State:
     """Parameters; once `stopped`, only the step counter changes.
@@ -167,7 +159,7 @@ class State:
       key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
-      best: the best held-out parameters, :class:`~jaxltl.algos.common.early_stopping.Best`.
+      best: the best held-out parameters, :class:`~jaxltl.algos.common.learner.Best`.
       stopped: ``bool[]``, whether patience is exhausted.
     """
 
@@ -179,8 +171,7 @@ class State:
     stopped: jax.Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
@@ -205,7 +196,7 @@ def make_problem(
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
     network: nn.Module | None = None,
 ) -> Problem:
-    """A checked :class:`Problem`, on the host.
+    """A checked :class:`Problem` with arrays stacked over W worlds, on the host.
 
     Args:
       models: a product, several, or products stacked along a first axis of W worlds.
@@ -215,9 +206,6 @@ def make_problem(
         stopping; None or 0: no early stopping.
       network: the policy; default :class:`ConvolutionalPolicy` with the models' number of
         actions.
-
-    Returns:
-      :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
       ValueError: worlds of different shapes, observations or scores of a wrong shape, or
@@ -233,11 +221,6 @@ def make_problem(
         held_out=other,
         network=ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network,
     )
-    _require_scores(problem)
-    return problem
-
-
-def _require_scores(problem: Problem) -> None:
     height_width_channels = getattr(problem.network, "observation_shape", None)
     size = problem.observation.shape[-1]
     if height_width_channels is not None and int(np.prod(height_width_channels)) != size:
@@ -245,16 +228,14 @@ def _require_scores(problem: Problem) -> None:
             f"an observation has {size} numbers, which do not fit the shape "
             f"{tuple(height_width_channels)}; set ConvolutionalPolicy(observation_shape=...)."
         )
-    found = jax.eval_shape(
-        lambda *x: problem.network.init_with_output(jax.random.key(0), *x)[0], *_inputs(problem)
+    require_output(
+        "the network's scores have",
+        problem.network,
+        _inputs(problem),
+        counts.shape[1:],
+        "one number for each state, memory and action.",
     )
-    expected = problem.counts.shape[1:]
-    if getattr(found, "shape", None) != expected:
-        what = getattr(found, "shape", type(found).__name__)
-        raise ValueError(
-            f"the network's scores have shape {what}; expected {expected}, one number for each "
-            "state, memory and action."
-        )
+    return problem
 
 
 def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
@@ -305,7 +286,7 @@ def _log_policy(scores: jax.Array, available: jax.Array) -> jax.Array:
     return jnp.where(available, log_policy, 0)
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.observation.dtype
     drawn = problem.network.init(learner.init_key(key), *_inputs(problem))
@@ -314,9 +295,7 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         key=key,
         step=jnp.int32(0),
         parameters=parameters,
-        optimizer=jax.tree.map(
-            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
-        ),
+        optimizer=trees.strong(_optimizer(hparams).init(parameters)),
         best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
@@ -363,7 +342,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     ), metrics
 
 
-def _draw(key: chex.PRNGKey, counts: jax.Array, num: int) -> tuple[jax.Array, ...]:
+def _draw(key: Key, counts: jax.Array, num: int) -> tuple[jax.Array, ...]:
     """Indices ``int32[num]`` on each axis of `counts`, with probabilities proportional to them."""
     total = jnp.cumsum(counts.ravel())
     point = jax.random.uniform(key, (num,), total.dtype) * total[-1]
@@ -374,8 +353,7 @@ def _draw(key: chex.PRNGKey, counts: jax.Array, num: int) -> tuple[jax.Array, ..
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
-    rate = optax.scale_by_learning_rate(hparams.learning_rate)
-    return optax.chain(optax.scale_by_adam(), rate)
+    return optax.chain(optax.scale_by_adam(), optax.scale_by_learning_rate(hparams.learning_rate))
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -23,27 +23,21 @@ Example: to stay in the second state pays, and one action leads there.
 
 from __future__ import annotations
 
-from functools import partial
-
-import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.play import check_reward, explicit_game
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core import struct
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.operators import sample_successor
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
+from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.validation import Range
 
 
-@brief
 @struct.dataclass
 class Problem:
     """A `model` with the allowed actions alone, and a `reward` ``float[S, A]``."""
@@ -52,7 +46,6 @@ class Problem:
     reward: jax.Array
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -72,7 +65,6 @@ class Hparams:
     num_transitions: int = static(COUNT, default=100)
 
 
-@brief
 @struct.dataclass
 class State:
     """A root `key`, the number `step`, the table `q` ``float[S, A]``, and the model's state `position`."""
@@ -83,8 +75,7 @@ class State:
     position: jax.Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Of a step: the `value` at the initial states by the table, the largest absolute
     temporal-difference error `residual`, and a `status`, NONFINITE or COMPLETED."""
@@ -94,7 +85,7 @@ class Metrics:
     status: jax.Array
 
 
-def make_problem(model: MDP, reward: chex.Array, *, allowed: chex.Array | None = None) -> Problem:
+def make_problem(model: MDP, reward: Array, *, allowed: Array | None = None) -> Problem:
     """A checked :class:`Problem` of an explicit `model`; `allowed`, ``bool[S, A]``: default all actions.
 
     Raises:
@@ -105,7 +96,7 @@ def make_problem(model: MDP, reward: chex.Array, *, allowed: chex.Array | None =
     return Problem(game.mdp, check_reward(game, reward))
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     first = jax.random.categorical(learner.init_key(key), jnp.log(problem.model.initial))
     return State(key, jnp.int32(0), jnp.zeros_like(problem.reward), first.astype(jnp.int32))
 
@@ -121,7 +112,7 @@ def _epsilon_greedy(q: jax.Array, allowed: jax.Array, epsilon: Number) -> jax.Ar
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     model = problem.model
 
-    def transition(carry: PyTree, key: chex.PRNGKey) -> PyTree:
+    def transition(carry: PyTree, key: Key) -> PyTree:
         q, s = carry
         restart_key, start_key, action_key, successor_key = jax.random.split(key, 4)
         first = jax.random.categorical(start_key, jnp.log(model.initial)).astype(s.dtype)

@@ -47,19 +47,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import action_distributions
-from jaxltl.algos.common.actor_critic import dense
+from jaxltl.algos.common.actor_critic import ActorCritic, dense
 from jaxltl.algos.common.moments import normalized
 from jaxltl.algos.common.settings import applied
+from jaxltl.core import struct, validation
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
@@ -74,11 +73,11 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.task_environment import TaskObservation
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief
 
 
-class SequenceNetwork(nn.Module):
+class SequenceNetwork(ActorCritic):
     """An actor and a critic that read a :class:`~sequence_task.SequenceObservation`.
 
     With `events_seen`, each place is described by whether the current steps of the sequence reach or
@@ -95,11 +94,7 @@ class SequenceNetwork(nn.Module):
       embedding: width of the layer that embeds a step's events.
     """
 
-    num_actions: int = 0
-    shape: Sequence[int] = ()
-    hidden: Sequence[int] = (64, 64)
     activation: str = "relu"
-    initial_deviation: float = 1.0
     events_seen: Callable[[PyTree], jax.Array] | None = None
     by_name: bool = False
     detailed: int = 4
@@ -128,16 +123,10 @@ class SequenceNetwork(nn.Module):
         x = jnp.concatenate([*parts, ahead])
         for i, width in enumerate(self.hidden):
             x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
-        scores = dense(self.num_actions or int(np.prod(self.shape)), 0.01, "actor")(x)
-        value = dense(1, 1.0, "critic")(x)[0]
-        if self.num_actions:
-            return scores, value
-        start = nn.initializers.constant(np.log(self.initial_deviation))
-        spread = self.param("log_deviation", start, tuple(self.shape), x.dtype)
-        return (scores.reshape(self.shape), spread), value
+        outputs = dense(self.num_outputs, 0.01, "actor")(x)
+        return self.action_parameters(outputs), dense(1, 1.0, "critic")(x)[0]
 
 
-@brief
 @struct.dataclass
 class Plan:
     """For each automaton state the sequences that lead to acceptance, shortest first.
@@ -145,9 +134,9 @@ class Plan:
     `reach` and `avoid` are ``bool[Q, M, D, E]``, and `length` ``int32[Q, M]``, 0 for padding.
     """
 
-    reach: chex.Array
-    avoid: chex.Array
-    length: chex.Array
+    reach: Array
+    avoid: Array
+    length: Array
 
 
 def make_plan(
@@ -258,7 +247,7 @@ def sequence_agent(
 
 
 def sequence_policy(
-    network: Callable[..., PyTree], plan: Plan, observation: PyTree, memory: chex.Numeric
+    network: Callable[..., PyTree], plan: Plan, observation: PyTree, memory: Numeric
 ) -> jax.Array:
     """The action probabilities ``float[A]`` of an agent that selects its sequence anew at every step.
 
@@ -349,7 +338,7 @@ def _act(
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> tuple[PyTree, PyTree]:
     how, space, network, plan = agent
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
@@ -364,8 +353,7 @@ def _act(
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, values = _judged(network, plan, seen, state)
     best = jnp.argmax(values)
-    better = (best != memory.sequence) & (values[best] > memory.worth)
-    kept = (memory.state == state) & ~better
+    kept = (memory.state == state) & ~((best != memory.sequence) & (values[best] > memory.worth))
     taken = jnp.where(kept, memory.sequence, best).astype(jnp.int32)
     late = (1 - _FORGETS) * memory.worth + _FORGETS * values[taken]
     worth = jnp.where(kept, late, values[best]).astype(memory.worth.dtype)
@@ -408,7 +396,7 @@ class _Stages(TypedDict, total=False):
 
 
 def train_in_stages(
-    key: chex.PRNGKey,
+    key: Key,
     problems: Sequence[PyTree],
     hparams: PyTree,
     *,

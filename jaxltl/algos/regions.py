@@ -79,9 +79,8 @@ class Regions:
       lower, upper: ``float64[N]``, certified bounds of the value over each box.
       verdict: ``int8[N]``: 1 if every point meets the threshold, -1 if none does, 0 if undecided.
 
-    Example:
-      >>> Regions(np.zeros((1, 1)), np.ones((1, 1)), np.zeros(1), np.ones(1), np.ones(1)).share(1)
-      1.0
+    >>> Regions(np.zeros((1, 1)), np.ones((1, 1)), np.zeros(1), np.ones(1), np.ones(1)).share(1)
+    1.0
     """
 
     low: np.ndarray
@@ -142,8 +141,7 @@ def _bounds(
     problem: Problem, model: IntervalMDP, reward: Array, large: bool
 ) -> tuple[float, float]:
     """Bounds of the mean over the initial distribution with maximising or minimising nature."""
-    maximize = problem.objective == "max"
-    query = Query(maximize, large, depth=problem.model.roundings)
+    query = Query(problem.objective == "max", large, depth=problem.model.roundings)
     if problem.reward is None:
         found = reachability(model.host, problem.target, query, stay=problem.stay)
     else:

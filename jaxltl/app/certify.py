@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxltl.core import validation
 from jaxltl.core.pretty_print import rounded_outward
-from jaxltl.core.statistics.graph_assumption import Graph, LeastProbability
+from jaxltl.core.statistics.confidence_sets import Graph, LeastProbability
 from jaxltl.core.validation import Range
 from jaxltl.app.files.models import padded
 from jaxltl.app.files.task_mlirl import WorldTable

@@ -10,9 +10,11 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     Array = jax.Array | NDArray[Any]
+    Numeric: TypeAlias = Any  # a number or an array
+    Key: TypeAlias = jax.Array  # a random key
     SparseMatrix: TypeAlias = csr_array
 else:  # packages without JAX import this module
-    Array = SparseMatrix = np.ndarray
+    Array = Key = Numeric = SparseMatrix = np.ndarray
 
 PyTree: TypeAlias = Any  # a tree of arrays, such as the state of a simulated environment
 

@@ -11,15 +11,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 from flax.struct import field
 
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.status import Status
 
-__all__ = ["dataclass", "field", "register", "register_annotated_pytree"]
+__all__ = ["dataclass", "field", "metrics", "register", "register_annotated_pytree"]
 
 ClassT = TypeVar("ClassT")
+_CODES = {"status": Status}
 
 
 def register(cls: type, array_fields: Iterable[str], static_fields: Iterable[str] = ()) -> None:
@@ -44,15 +48,21 @@ def register(cls: type, array_fields: Iterable[str], static_fields: Iterable[str
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))
 def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
-    """Decorator: a frozen dataclass with ``replace``, registered as a pytree of its fields.
+    """Decorator: a frozen dataclass with ``replace`` and a short ``repr``, a pytree of its fields.
 
     Fields made by ``field(pytree_node=False)`` are static: part of the structure, compared by value.
     """
-    made: Any = dataclasses.dataclass(frozen=True, **options)(cls)
+    made: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
     made.replace = _replace
     static = [f.name for f in dataclasses.fields(made) if not f.metadata.get("pytree_node", True)]
     register(made, [f.name for f in dataclasses.fields(made) if f.name not in static], static)
     return made
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))
+def metrics(cls: type[ClassT]) -> type[ClassT]:
+    """Decorator: a :func:`dataclass` of a learner's metrics, whose ``repr`` shows the last row."""
+    return brief(facts=partial(history, codes=_CODES))(dataclass(cls))
 
 
 def _replace(self: Any, **updates: Any) -> Any:

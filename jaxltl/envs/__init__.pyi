@@ -1,11 +1,13 @@
-from . import continuous_worlds as continuous_worlds
-from . import lqr as lqr
-from . import navigation as navigation
-from . import navigation_steps as navigation_steps
-from . import networks as networks
-from . import post_offices as post_offices
-from . import robots as robots
-from . import temporal_gridworld as temporal_gridworld
+from . import (
+    continuous_worlds as continuous_worlds,
+    lqr as lqr,
+    navigation as navigation,
+    navigation_steps as navigation_steps,
+    networks as networks,
+    post_offices as post_offices,
+    robots as robots,
+    temporal_gridworld as temporal_gridworld,
+)
 from .adapters.brax import from_brax as from_brax
 from .adapters.craftax import from_craftax as from_craftax
 from .adapters.gymnax import from_gymnax as from_gymnax

@@ -11,17 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.pretty_print import brief
 
 # Colour, place and radius of each disc.
@@ -36,36 +35,25 @@ DISCS = (
     ("green", 1.5, -0.75, 0.4),
     ("aqua", 0.8, 0.2, 0.3),
 )
-_ROOT = 0.5**0.5
-_MOVES = (
-    (0, 1),
-    (1, 0),
-    (0, -1),
-    (-1, 0),
-    (_ROOT, _ROOT),
-    (_ROOT, -_ROOT),
-    (-_ROOT, _ROOT),
-    (-_ROOT, -_ROOT),
-    (0, 0),
-)
+_R = 0.5**0.5
+_MOVES = ((0, 1), (1, 0), (0, -1), (-1, 0), (_R, _R), (_R, -_R), (-_R, _R), (-_R, -_R), (0, 0))
 
 
 @brief
 class FlatState(NamedTuple):
     """State of a flat world: `place` is ``float32[2]``."""
 
-    place: chex.Array
+    place: Array
 
 
-@brief
 @struct.dataclass
 class Discs:
     """Centres, radii and one-hot colours of D discs in a square of half a side `extent`."""
 
-    center: chex.Array
-    radius: chex.Array
-    color: chex.Array
-    extent: chex.Array
+    center: Array
+    radius: Array
+    color: Array
+    extent: Array
 
 
 class _Starts(TypedDict, total=False):
@@ -104,10 +92,9 @@ def flat_world(
       ValueError: no disc, a number that is not positive, a start outside of the square, or discs that
         leave hardly any initial position.
 
-    Example:
-      >>> world = flat_world()
-      >>> world.propositions
-      ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
+    >>> world = flat_world()
+    >>> world.propositions
+    ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
     """
     start, num_starts, seed = validation.options(
         "flat_world", starts, start=None, num_starts=2**16, seed=0
@@ -118,17 +105,14 @@ def flat_world(
             f"discs is {validation.shorten(discs)}; give (colour, x, y, radius) of each."
         )
     names = tuple(sorted({name for name, *_ in rows}))
-    numbers = (
-        validation.float_array("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
-    )
+    table = validation.float_array("discs", [row[1:] for row in rows])
+    numbers = table.astype(np.float32).reshape(-1, 3)
     if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
         raise ValueError(
             "flat_world: discs are (colour, x, y, radius), at least one, with radii above zero."
         )
-    extent, time_step = (
-        validation.finite_number("extent", extent),
-        validation.finite_number("time_step", time_step),
-    )
+    extent = validation.finite_number("extent", extent)
+    time_step = validation.finite_number("time_step", time_step)
     num_starts = validation.integer("num_starts", num_starts, least=1, most=2**26)
     seed, discrete = validation.integer("seed", seed), validation.boolean("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
@@ -147,13 +131,12 @@ def flat_world(
         reset = Partial(_begin_at, np.asarray(start, np.float32))
     else:
         reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
-    velocity = 9 if discrete else make_box(-1, 1, (2,), np.float32)
     most = extent + time_step  # of the step that leaves the square the place outside is seen
     world = make_environment(
         reset,
         Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None),
         _see,
-        actions=velocity,
+        actions=9 if discrete else make_box(-1, 1, (2,), np.float32),
         labels=Partial(_labels, scene),
         propositions=names,
         observations=make_box(-most, most, (2,), np.float32),
@@ -209,11 +192,10 @@ def events_around(
     Raises:
       ValueError: events of another shape, distances that are not positive, or no direction.
 
-    Example:
-      >>> world = flat_world()
-      >>> look = events_around(world, np.eye(7, dtype=bool), radii=[0.5], directions=4)
-      >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
-      [0, 0, 0, 0, 0, 0, 1]
+    >>> world = flat_world()
+    >>> look = events_around(world, np.eye(7, dtype=bool), radii=[0.5], directions=4)
+    >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
+    [0, 0, 0, 0, 0, 0, 1]
     """
     scene, rows = discs_of(environment), validation.float_array("events", events).astype(bool)
     if rows.ndim != 2 or not len(rows) or rows.shape[1] != len(environment.propositions):
@@ -254,22 +236,18 @@ def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarr
     return np.concatenate(found)[:count]
 
 
-def _begin(places: chex.Array, key: chex.PRNGKey) -> FlatState:
+def _begin(places: Array, key: Key) -> FlatState:
     drawn = jax.random.bits(key, (), jnp.uint32) % np.uint32(places.shape[0])
     return FlatState(jnp.asarray(places)[drawn])
 
 
-def _begin_at(place: chex.Array, key: chex.PRNGKey) -> FlatState:
+def _begin_at(place: Array, key: Key) -> FlatState:
     del key
     return FlatState(jnp.asarray(place))
 
 
 def _move(
-    number: chex.Array,
-    moves: chex.Array | None,
-    world: FlatState,
-    action: PyTree,
-    key: chex.PRNGKey,
+    number: Array, moves: Array | None, world: FlatState, action: PyTree, key: Key
 ) -> Timestep:
     del key
     velocity = jnp.clip(action, -1, 1) if moves is None else jnp.asarray(moves)[action]
@@ -283,6 +261,5 @@ def _see(world: FlatState) -> jax.Array:
 
 
 def _labels(scene: Discs, world: FlatState) -> jax.Array:
-    apart = jnp.sum((world.place - scene.center) ** 2, axis=-1)
-    inside = apart < scene.radius**2
+    inside = jnp.sum((world.place - scene.center) ** 2, axis=-1) < scene.radius**2
     return (scene.color & inside[:, None]).any(axis=0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-import chex
 import numpy as np
 
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.protocols import Array
 from jaxltl.envs.text_map import parse_map
 
 ACTIONS = ("up", "down", "left", "right")
@@ -23,7 +23,7 @@ def gridworld(
     absorbing: Collection[str] = (),
     legend: Mapping[str, Collection[str]] | None = None,
     wall: str = "#",
-    initial: str | chex.Array | None = None,
+    initial: str | Array | None = None,
 ) -> MDP:
     """Gridworld MDP with labels and the actions up, down, left, right.
 
@@ -45,10 +45,9 @@ def gridworld(
       ValueError: a malformed map, a cell that is missing in the legend, a probability outside [0, 1],
         an unknown proposition, or no initial cell.
 
-    Example:
-      >>> world = gridworld("b . y", absorbing=["y"])
-      >>> world.successor[:, 3, 0].tolist()  # right
-      [1, 2, 2]
+    >>> world = gridworld("b . y", absorbing=["y"])
+    >>> world.successor[:, 3, 0].tolist()  # right
+    [1, 2, 2]
     """
     cells = parse_map(text)
     rows, columns = cells.shape
@@ -63,8 +62,7 @@ def gridworld(
     moved = np.empty((state.size, len(ACTIONS)), np.int32)
     for a, (down, right) in enumerate(_MOVES):
         r, c = row + down, column + right
-        inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
-        target = np.where(inside, r * columns + c, state)
+        target = np.where((r >= 0) & (r < rows) & (c >= 0) & (c < columns), r * columns + c, state)
         moved[:, a] = np.where(is_wall[target] | stays, state, target)
     if slip == 0:
         successor = moved[:, :, None]
@@ -112,8 +110,7 @@ def _holds_one_of(
                 f"{argument}: {name!r} is not a proposition of the map; "
                 f"it has {', '.join(propositions) or '(none)'}."
             )
-    chosen = label[:, [propositions.index(n) for n in names]]
-    return np.asarray(chosen.any(axis=1))
+    return np.asarray(label[:, [propositions.index(n) for n in names]].any(axis=1))
 
 
 def _initial(

@@ -48,12 +48,11 @@ def run_policy(
     Raises:
       ValueError: an environment without a limit of steps, or a state that the policy does not have.
 
-    Example:
-      >>> import gymnasium
-      >>> lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
-      >>> found = run_policy(lake, lambda observation: 2, num_episodes=9)  # to the right
-      >>> found.reward.mean, found.truncated, found.success
-      (0.0, 9, None)
+    >>> import gymnasium
+    >>> lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
+    >>> found = run_policy(lake, lambda observation: 2, num_episodes=9)  # to the right
+    >>> found.reward.mean, found.truncated, found.success
+    (0.0, 9, None)
     """
     count = validation.integer("num_episodes", num_episodes, least=1)
     confidence = validation.fraction("confidence", confidence, ends=(False, False))

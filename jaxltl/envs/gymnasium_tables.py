@@ -36,13 +36,12 @@ def from_gymnasium(
     Raises:
       ValueError: the environment has no table, or the table is malformed: naming state and action.
 
-    Example:
-      >>> class Corridor:  # to the right, to the goal
-      ...     P = {0: {0: [(0.5, 0, 0.0, False), (0.5, 1, 1.0, True)]},
-      ...          1: {0: [(1.0, 1, 0.0, True)]}}
-      >>> model = from_gymnasium(Corridor(), labels={"goal": [1]}, initial=[1, 0])
-      >>> model.num_states, model.propositions, model.label[2].tolist()
-      (3, ('goal', 'terminated'), [True, True])
+    >>> class Corridor:  # to the right, to the goal
+    ...     P = {0: {0: [(0.5, 0, 0.0, False), (0.5, 1, 1.0, True)]},
+    ...          1: {0: [(1.0, 1, 0.0, True)]}}
+    >>> model = from_gymnasium(Corridor(), labels={"goal": [1]}, initial=[1, 0])
+    >>> model.num_states, model.propositions, model.label[2].tolist()
+    (3, ('goal', 'terminated'), [True, True])
     """
     env = _made(env)
     table = _read(env)

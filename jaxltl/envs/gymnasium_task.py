@@ -47,20 +47,18 @@ def gymnasium_task(
     Raises:
       ValueError: an unknown proposition, or gymnasium is not installed.
 
-    Example:
-      >>> import gymnasium
-      >>> lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
-      >>> task = gymnasium_task(lake, "F (corner & F goal)",
-      ...     lambda seen, info: {3: {"corner"}, 15: {"goal"}}.get(seen, set()))
-      >>> int(task.observation_space.n), task.reset(seed=0)[0]
-      (48, 0)
+    >>> import gymnasium
+    >>> lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
+    >>> task = gymnasium_task(lake, "F (corner & F goal)",
+    ...     lambda seen, info: {3: {"corner"}, 15: {"goal"}}.get(seen, set()))
+    >>> int(task.observation_space.n), task.reset(seed=0)[0]
+    (48, 0)
     """
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     names = tuple(automaton.propositions if propositions is None else propositions)
     if "embedding" in options:
         raise ValueError("embedding: observations of a gymnasium product are one-hot.")
-    tables = make_task_tables(automaton, names, **options)
-    return _wrapper()(env, tables, labels, names)
+    return _wrapper()(env, make_task_tables(automaton, names, **options), labels, names)
 
 
 @functools.cache  # one class, made when gymnasium is first needed
@@ -115,8 +113,7 @@ class _Steps:
 
     def reset(self, *, seed: int | None = None, options: PyTree = None) -> PyTree:
         seen, info = self.env.reset(seed=seed, options=options)
-        letter = self._letter(seen, info)
-        self._memory = int(self._tables.delta[self._tables.initial, letter])
+        self._memory = int(self._tables.delta[self._tables.initial, self._letter(seen, info)])
         return self._observe(seen), self._told(info, self._tables.verdict[self._memory])
 
     def step(self, action: PyTree) -> PyTree:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.text_map import parse_map
 
@@ -38,8 +38,8 @@ class LetterState(NamedTuple):
       place: ``int32[]``, the agent's cell.
     """
 
-    letter: chex.Array
-    place: chex.Array
+    letter: Array
+    place: Array
 
 
 class Maps(TypedDict, total=False):
@@ -89,10 +89,9 @@ def letter_world(
       ValueError: letters that do not fit on the map, a malformed layout, an invalid start, or too few
         connected maps of this size.
 
-    Example:
-      >>> world = letter_world()
-      >>> world.propositions[:3], world.observations.shape, world.horizon
-      (('a', 'b', 'c'), (7, 7, 13), 75)
+    >>> world = letter_world()
+    >>> world.propositions[:3], world.observations.shape, world.horizon
+    (('a', 'b', 'c'), (7, 7, 13), 75)
     """
     validation.keywords("letter_world", maps, Maps)
     names, starts = _names(letters), None
@@ -156,8 +155,7 @@ def _given(
     """Letters of the cells of a given map, its size, and the names."""
     if isinstance(layout, str):
         cells = parse_map(layout)
-        found = [str(x) for x in np.unique(cells) if x != "."]
-        for name in found:
+        for name in [str(x) for x in np.unique(cells) if x != "."]:
             if name not in names:
                 raise ValueError(
                     f"layout: {name!r} is none of the letters {list(names)}; name it in letters=."
@@ -221,10 +219,8 @@ def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     grids = maps.reshape(-1, size, size)
     turned = [np.rot90(grids, k, (1, 2)) for k in range(4)]
     every = np.concatenate(turned + [x.transpose(0, 2, 1) for x in turned]).reshape(-1, size * size)
-    used = maps[0].sum()
-    slot = np.where(every, np.cumsum(every, axis=1) - 1, used)
-    empty = np.nonzero(~every)[1].reshape(len(every), -1)
-    return slot.astype(np.uint8), empty.astype(np.uint8)
+    slot = np.where(every, np.cumsum(every, axis=1) - 1, maps[0].sum())
+    return slot.astype(np.uint8), np.nonzero(~every)[1].reshape(len(every), -1).astype(np.uint8)
 
 
 def _neighbors(size: int) -> np.ndarray:
@@ -244,9 +240,7 @@ def _views(size: int) -> np.ndarray:
 # --- of one trajectory ----------------------------------------------------------------------------
 
 
-def _draw_connected(
-    slot: chex.Array, empty: chex.Array, each: chex.Array, key: chex.PRNGKey
-) -> LetterState:
+def _draw_connected(slot: Array, empty: Array, each: Array, key: Key) -> LetterState:
     copies, count = each.shape
     used = copies * count
     bits = jax.random.bits(key, used + 2, jnp.uint32)
@@ -261,7 +255,7 @@ def _draw_connected(
     return LetterState(letter, jnp.asarray(empty)[drawn, place].astype(jnp.int32))
 
 
-def _draw_any(cells: chex.Array, each: chex.Array, key: chex.PRNGKey) -> LetterState:
+def _draw_any(cells: Array, each: Array, key: Key) -> LetterState:
     copies, count = each.shape
     order = jax.random.permutation(key, cells.size)
     letter = jnp.where(order < copies * count, order // copies, count).astype(jnp.int8)
@@ -269,38 +263,32 @@ def _draw_any(cells: chex.Array, each: chex.Array, key: chex.PRNGKey) -> LetterS
     return LetterState(letter, jnp.argmax(order).astype(jnp.int32))
 
 
-def _begin(letter: chex.Array, places: chex.Array, key: chex.PRNGKey) -> LetterState:
-    place = jax.random.choice(key, jnp.asarray(places))
-    return LetterState(jnp.asarray(letter), place)
+def _begin(letter: Array, places: Array, key: Key) -> LetterState:
+    return LetterState(jnp.asarray(letter), jax.random.choice(key, jnp.asarray(places)))
 
 
-def _starts(letter: chex.Array, places: chex.Array) -> tuple[LetterState, jax.Array]:
+def _starts(letter: Array, places: Array) -> tuple[LetterState, jax.Array]:
     count = len(places)
     every = jnp.broadcast_to(jnp.asarray(letter), (count, *letter.shape))
     return LetterState(every, jnp.asarray(places)), jnp.full(count, 1 / count)
 
 
-def _move(
-    neighbors: chex.Array, world: LetterState, action: jax.Array, key: chex.PRNGKey
-) -> Timestep:
+def _move(neighbors: Array, world: LetterState, action: jax.Array, key: Key) -> Timestep:
     del key
     place = jnp.asarray(neighbors)[world.place, action]
     return Timestep(world._replace(place=place), reward=0.0, terminated=False)
 
 
-def _see(
-    views: chex.Array, shape: chex.Array, numbers: chex.Array, world: LetterState
-) -> jax.Array:
+def _see(views: Array, shape: Array, numbers: Array, world: LetterState) -> jax.Array:
     seen = world.letter[jnp.asarray(views)[world.place]]
     cells, count = views.shape[0], numbers.shape[0] - 1
     planes = seen[:, None] == numbers
     size = round(cells**0.5)
-    middle = jnp.arange(cells) == size // 2 * (size + 1)
-    planes = planes.at[:, count].set(middle)
+    planes = planes.at[:, count].set(jnp.arange(cells) == size // 2 * (size + 1))
     return planes.astype(jnp.float32).reshape(shape.shape)
 
 
-def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
+def _labels(numbers: Array, world: LetterState) -> jax.Array:
     return world.letter[world.place] == numbers
 
 

@@ -12,21 +12,19 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax import lax
 from numpy.typing import ArrayLike, DTypeLike
 
+from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 
-@brief
 @struct.dataclass
 class LQR:
     """A regulator problem, see :func:`lqr`.
@@ -40,14 +38,14 @@ class LQR:
       horizon: N, the number of controls; static.
     """
 
-    dynamics: chex.Array
-    control: chex.Array
-    state_cost: chex.Array
-    control_cost: chex.Array
-    low: chex.Array
-    high: chex.Array
-    start: chex.Array
-    scale: chex.Array
+    dynamics: Array
+    control: Array
+    state_cost: Array
+    control_cost: Array
+    low: Array
+    high: Array
+    start: Array
+    scale: Array
     horizon: int = struct.field(pytree_node=False)
 
 
@@ -108,10 +106,9 @@ def lqr(
     Raises:
       ValueError: incompatible shapes, costs that are not definite, or low above high.
 
-    Example:
-      >>> world = lqr()
-      >>> world.horizon, round(float(world.scale))
-      (20, 2470)
+    >>> world = lqr()
+    >>> world.horizon, round(float(world.scale))
+    (20, 2470)
     """
     low, high, scale = validation.options("lqr", limits, low=-0.2, high=0.2, scale=None)
     a, b, q, r = (np.asarray(x, float) for x in (dynamics, control, state_cost, control_cost))
@@ -161,10 +158,9 @@ def evaluator(world: LQR, network: Network | str = "2-2-1") -> jax.tree_util.Par
     Raises:
       ValueError: a network with inputs or outputs other than those of `world`.
 
-    Example:
-      >>> evaluate = evaluator(lqr(), "2-2-1")
-      >>> [float(x) for x in evaluate(jnp.zeros(9), None)]
-      [-1.0, 0.0]
+    >>> evaluate = evaluator(lqr(), "2-2-1")
+    >>> [float(x) for x in evaluate(jnp.zeros(9), None)]
+    [-1.0, 0.0]
     """
     return jax.tree_util.Partial(_evaluate, _fitting(world, network), world)
 
@@ -196,10 +192,9 @@ def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
       world, network: the problem and the network, or the sizes of one with biases.
       parameters: ``float[D]``, or ``float[D, lanes]`` with any number of axes of lanes.
 
-    Example:
-      >>> run = simulate(lqr(), "2-2-1", jnp.zeros(9))
-      >>> run.state[:3].tolist(), float(run.total)
-      ([[1.0, -1.0], [0.0, -1.0], [-1.0, -1.0]], 2470.0)
+    >>> run = simulate(lqr(), "2-2-1", jnp.zeros(9))
+    >>> run.state[:3].tolist(), float(run.total)
+    ([[1.0, -1.0], [0.0, -1.0], [-1.0, -1.0]], 2470.0)
     """
     return _simulate(_fitting(world, network), world, jnp.asarray(parameters))
 
@@ -303,9 +298,8 @@ class Plant(NamedTuple):
 
     `state` is ``float[n]``, `violation` the largest so far, and `time` the number of steps.
 
-    Example:
-      >>> Plant(state=[1.0, -1.0], violation=0.0, time=0).time
-      0
+    >>> Plant(state=[1.0, -1.0], violation=0.0, time=0).time
+    0
     """
 
     state: jax.Array
@@ -319,18 +313,16 @@ def as_environment(world: LQR, dtype: DTypeLike | None = None) -> Environment:
     Rewards add up to -J, and costs, the increments of the largest violation, to the violation. States
     are observed; controls are unbounded.
 
-    Example:
-      >>> plant = as_environment(lqr())
-      >>> found = plant.step(plant.reset(None), jnp.array([-0.5]), None)
-      >>> found.world.state.tolist(), round(float(found.reward), 4), round(float(found.cost), 4)
-      ([-0.5, -1.5], -0.325, 0.3)
+    >>> plant = as_environment(lqr())
+    >>> found = plant.step(plant.reset(None), jnp.array([-0.5]), None)
+    >>> found.world.state.tolist(), round(float(found.reward), 4), round(float(found.cost), 4)
+    ([-0.5, -1.5], -0.325, 0.3)
     """
     dtype = jnp.dtype(dtype or jnp.result_type(float))
     world = jax.tree.map(lambda x: np.asarray(x, dtype), world)
-    reset, step = (jax.tree_util.Partial(f, world) for f in (_first_state, _controlled))
     return make_environment(
-        reset,
-        step,
+        jax.tree_util.Partial(_first_state, world),
+        jax.tree_util.Partial(_controlled, world),
         _observed,
         actions=make_box(-np.inf, np.inf, world.control.shape[-1:], dtype),
         horizon=world.horizon,
@@ -368,24 +360,13 @@ def optimum(world: LQR) -> Optimum:
     Raises:
       ValueError: the method did not finish.
 
-    Example:
-      >>> f"{optimum(lqr()).total:.10f}"
-      '3.7510604123'
+    >>> f"{optimum(lqr()).total:.10f}"
+    '3.7510604123'
     """
     from scipy.optimize import lsq_linear
 
-    a, b, q, r, low, high, start = (
-        np.asarray(x, float)
-        for x in (
-            world.dynamics,
-            world.control,
-            world.state_cost,
-            world.control_cost,
-            world.low,
-            world.high,
-            world.start,
-        )
-    )
+    names = ("dynamics", "control", "state_cost", "control_cost", "low", "high", "start")
+    a, b, q, r, low, high, start = (np.asarray(getattr(world, x), float) for x in names)
     matrix, offset = _least_squares(a, b, q, r, start, world.horizon)
     bounds = np.tile(low, world.horizon), np.tile(high, world.horizon)
     pinned = bounds[0] == bounds[1]  # constants are eliminated
@@ -424,10 +405,8 @@ def _least_squares(
     rows, offsets = [], []
     for t in range(horizon):
         now = slice(t * m, (t + 1) * m)
-        effect = a @ effect
+        effect, state, own = a @ effect, a @ state, np.zeros((m, horizon * m))
         effect[:, now] += b
-        state = a @ state
-        own = np.zeros((m, horizon * m))
         own[:, now] = root_r
         rows += [root_q @ effect, own]
         offsets += [root_q @ state, np.zeros(m)]

@@ -28,14 +28,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax import lax
 from numpy.typing import ArrayLike
 
+from jaxltl.core import struct, validation
+from jaxltl.core.environments.environment import as_partial
+from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 
@@ -46,7 +47,6 @@ PROPOSITIONS = ("goal", "obstacle")
 Scores = Callable[..., tuple[jax.Array, jax.Array]]
 
 
-@brief
 @struct.dataclass
 class Navigation:
     """A map, a robot and its sensors, see :func:`navigation`.
@@ -63,16 +63,16 @@ class Navigation:
       horizon: N, the states of a trajectory; static.
     """
 
-    goal: chex.Array
-    obstacle: chex.Array
-    bounds: chex.Array
-    start: chex.Array
-    speed: chex.Array
-    turn: chex.Array
-    time_step: chex.Array
-    offset: chex.Array
-    strip: chex.Array
-    weight: chex.Array
+    goal: Array
+    obstacle: Array
+    bounds: Array
+    start: Array
+    speed: Array
+    turn: Array
+    time_step: Array
+    offset: Array
+    strip: Array
+    weight: Array
     horizon: int = struct.field(pytree_node=False)
 
     @property
@@ -114,9 +114,8 @@ class Settings(TypedDict, total=False):
       num_directions: points on each circle, evenly spaced, the first ahead; default: 12.
       strip, weight: see :class:`Navigation`; default: (-2, -0.2) and 30.
 
-    Example:
-      >>> navigation(**Settings(speed=0.5, radii=[1.0])).num_observations
-      14
+    >>> navigation(**Settings(speed=0.5, radii=[1.0])).num_observations
+    14
     """
 
     speed: float
@@ -147,10 +146,9 @@ def navigation(
     Raises:
       ValueError: an empty box or range, or a size that is not positive.
 
-    Example:
-      >>> world = navigation()
-      >>> world.num_observations, policy_network(world).num_parameters
-      (62, 2882)
+    >>> world = navigation()
+    >>> world.num_observations, policy_network(world).num_parameters
+    (62, 2882)
     """
     boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
     corners = {name: _box(name, box) for name, box in boxes.items()}
@@ -195,9 +193,8 @@ def _box(name: str, corners: ArrayLike) -> np.ndarray:
 def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
     """The policy network for a `world`: ReLU layers of widths `hidden`, and tanh to speed and turn.
 
-    Example:
-      >>> policy_network(navigation()).sizes
-      (62, 30, 30, 2)
+    >>> policy_network(navigation()).sizes
+    (62, 30, 30, 2)
     """
     return make_network((world.num_observations, *hidden, 2), output="tanh")
 
@@ -206,20 +203,16 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 
 
 def start_states(
-    world: Navigation,
-    key: chex.PRNGKey,
-    shape: tuple[int, ...] = (),
-    dtype: np.dtype | type | None = None,
+    world: Navigation, key: Key, shape: tuple[int, ...] = (), dtype: np.dtype | type | None = None
 ) -> State:
     """The initial states, uniform in the start box of `world` and in the heading, drawn from `key`.
 
     They are arrays of a `shape` and a `dtype` (default: JAX's).
 
-    Example:
-      >>> drawn = jax.eval_shape(
-      ...     lambda key: start_states(navigation(), key, (5,)), jax.random.key(0))
-      >>> drawn.x.shape
-      (5,)
+    >>> drawn = jax.eval_shape(
+    ...     lambda key: start_states(navigation(), key, (5,)), jax.random.key(0))
+    >>> drawn.x.shape
+    (5,)
     """
     dtype = dtype or jnp.result_type(float)
     low, high = jnp.asarray(world.start, dtype)
@@ -233,10 +226,9 @@ def move(world: Navigation, state: State, action: jax.Array) -> State:
 
     The `action` is ``float[..., 2]``, speed and turn as shares of the largest, clipped to [-1, 1].
 
-    Example:
-      >>> state = move(navigation(), State(*jnp.array([3.75, 0.0, 0.0])), jnp.array([1.0, -3.0]))
-      >>> [round(float(v), 4) for v in state]
-      [4.0, 0.0, -0.5236]
+    >>> state = move(navigation(), State(*jnp.array([3.75, 0.0, 0.0])), jnp.array([1.0, -3.0]))
+    >>> [round(float(v), 4) for v in state]
+    [4.0, 0.0, -0.5236]
     """
     world = _as(world, state.x)
     share = jnp.clip(action, -1, 1)
@@ -263,10 +255,9 @@ def observe(world: Navigation, state: State) -> jax.Array:
     The labels of the M points, circle by circle, then the unit vector to the goal's centre (ahead, to
     the left), zero in the centre. Differentiable in the direction.
 
-    Example:
-      >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
-      >>> seen[:12].astype(int).tolist(), seen[-2:].tolist()
-      ([1, 0, 0, -1, -1, -1, -1, -1, -1, -1, 0, 0], [1.0, 0.0])
+    >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
+    >>> seen[:12].astype(int).tolist(), seen[-2:].tolist()
+    ([1, 0, 0, -1, -1, -1, -1, -1, -1, -1, 0, 0], [1.0, 0.0])
     """
     world = _as(world, state.x)
     x, y = state.x[..., None], state.y[..., None]
@@ -300,9 +291,8 @@ def _as(world: Navigation, like: jax.Array) -> Navigation:
 def labels(world: Navigation, state: State) -> jax.Array:
     """The labels :data:`PROPOSITIONS` of a `state` of a `world`, ``bool[..., 2]``; boxes are closed.
 
-    Example:
-      >>> labels(navigation(), State(*jnp.array([2.0, 1.5, 0.0]))).tolist()
-      [True, False]
+    >>> labels(navigation(), State(*jnp.array([2.0, 1.5, 0.0]))).tolist()
+    [True, False]
     """
     world = _as(world, state.x)
     return jnp.stack(
@@ -313,10 +303,9 @@ def labels(world: Navigation, state: State) -> jax.Array:
 def obstacle_distance(world: Navigation, state: State) -> jax.Array:
     """The signed distance of a `state` from the obstacle of a `world`, negative inside; differentiable.
 
-    Example:
-      >>> x, y = jnp.array([4.0, -3.0, 0.5]), jnp.array([6.0, 1.0, 1.0])
-      >>> obstacle_distance(navigation(), State(x, y, x)).tolist()
-      [5.0, 2.0, -0.5]
+    >>> x, y = jnp.array([4.0, -3.0, 0.5]), jnp.array([6.0, 1.0, 1.0])
+    >>> obstacle_distance(navigation(), State(x, y, x)).tolist()
+    [5.0, 2.0, -0.5]
     """
     world = _as(world, state.x)
     (left, bottom), (right, top) = world.obstacle
@@ -331,10 +320,9 @@ def obstacle_distance(world: Navigation, state: State) -> jax.Array:
 def reward(world: Navigation, state: State) -> jax.Array:
     """The contribution of a `state` to J in tasks 1 and 4 of a `world`, ``float[...]``.
 
-    Example:
-      >>> x = jnp.array([2.0, 0.0, 0.0])
-      >>> reward(navigation(), State(x, jnp.array([1.5, -1.5, 0.0]), x)).tolist()
-      [1.0, 3.0, 0.0]
+    >>> x = jnp.array([2.0, 0.0, 0.0])
+    >>> reward(navigation(), State(x, jnp.array([1.5, -1.5, 0.0]), x)).tolist()
+    [1.0, 3.0, 0.0]
     """
     low, high = jnp.asarray(world.strip, state.y.dtype)
     strip = jnp.where((state.y >= low) & (state.y <= high), 2 * jnp.abs(state.y), 0)
@@ -351,11 +339,10 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
     Raises:
       ValueError: an unknown task.
 
-    Example:
-      >>> x = jnp.array([[2.0, 2.0]])
-      >>> both = jax.jit(scores, static_argnums=2)(navigation(), State(x, x - 0.5, x), 3)
-      >>> [v.tolist() for v in both]  # a distance of 1, and twice in the goal
-      [[30.0], [-2.0]]
+    >>> x = jnp.array([[2.0, 2.0]])
+    >>> both = jax.jit(scores, static_argnums=2)(navigation(), State(x, x - 0.5, x), 3)
+    >>> [v.tolist() for v in both]  # a distance of 1, and twice in the goal
+    [[30.0], [-2.0]]
     """
     if task not in TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
@@ -377,7 +364,7 @@ def simulate(
     world: Navigation,
     network: Network,
     parameters: jax.Array,
-    key: chex.PRNGKey,
+    key: Key,
     *,
     num_trajectories: int = 10,
     absorbing: bool = False,
@@ -391,12 +378,11 @@ def simulate(
       num_trajectories: M, static.
       absorbing: make the goal absorbing; static.
 
-    Example:
-      >>> world = navigation()
-      >>> network = policy_network(world)
-      >>> run = simulate(world, network, jnp.zeros(network.num_parameters), jax.random.key(0))
-      >>> run.state.x.shape, run.action.shape
-      ((10, 30), (10, 30, 2))
+    >>> world = navigation()
+    >>> network = policy_network(world)
+    >>> run = simulate(world, network, jnp.zeros(network.num_parameters), jax.random.key(0))
+    >>> run.state.x.shape, run.action.shape
+    ((10, 30), (10, 30, 2))
     """
     _check_fits(world, network)
     settings = _Static((num_trajectories, validation.boolean("absorbing", absorbing)))
@@ -405,7 +391,7 @@ def simulate(
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _simulate(
-    network: Network, settings: _Static, world: Navigation, parameters: jax.Array, key: chex.PRNGKey
+    network: Network, settings: _Static, world: Navigation, parameters: jax.Array, key: Key
 ) -> Run:
     num_trajectories, absorbing = settings.value
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
@@ -447,24 +433,23 @@ def evaluator(
     Raises:
       ValueError: an unknown task, a network of other sizes, or no trajectories.
 
-    Example:
-      >>> world = navigation()
-      >>> evaluate = evaluator(world, 2)
-      >>> objective, cost = evaluate(jnp.zeros(2882), jax.random.key(0))
-      >>> 30 * 0.7 < objective < 30 * 4, float(cost)
-      (Array(True, dtype=bool), 0.0)
+    >>> world = navigation()
+    >>> evaluate = evaluator(world, 2)
+    >>> objective, cost = evaluate(jnp.zeros(2882), jax.random.key(0))
+    >>> 30 * 0.7 < objective < 30 * 4, float(cost)
+    (Array(True, dtype=bool), 0.0)
     """
     network = policy_network(world) if network is None else network
     _check_fits(world, network)
     if num_trajectories < 1:
         raise ValueError(f"num_trajectories={num_trajectories}; give at least 1.")
-    if not callable(task):
+    if callable(task):
+        score = as_partial(task)
+    else:
         if np.ndim(task) or task not in TASKS:
             raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
         absorbing = task == 1 if absorbing is None else absorbing
         score = jax.tree_util.Partial(_table_4, _Static(int(task)))
-    else:
-        score = task if isinstance(task, jax.tree_util.Partial) else jax.tree_util.Partial(task)
     absorbing = absorbing is not None and validation.boolean("absorbing", absorbing)
     settings = _Static((int(num_trajectories), absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
@@ -489,7 +474,7 @@ def _evaluate(
     world: Navigation,
     score: Scores,
     parameters: jax.Array,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> tuple[jax.Array, jax.Array]:
     num_trajectories, absorbing = settings.value
     run = simulate(

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State
@@ -25,10 +25,9 @@ class Place(NamedTuple):
     `first` is True in the first state; `nearest` is the least distance from the obstacle before it, and
     `goal` and `obstacle` are True if visited before it.
 
-    Example:
-      >>> task = as_environment(nav.navigation(), 1)
-      >>> jax.eval_shape(task.reset, jax.random.key(0)).time.dtype.name
-      'int32'
+    >>> task = as_environment(nav.navigation(), 1)
+    >>> jax.eval_shape(task.reset, jax.random.key(0)).time.dtype.name
+    'int32'
     """
 
     state: State
@@ -69,12 +68,11 @@ def as_environment(
     Raises:
       ValueError: an unknown task.
 
-    Example:
-      >>> task = as_environment(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
-      >>> place = task.reset(jax.random.key(0))
-      >>> made = task.step(place, jnp.zeros(2), None)
-      >>> float(made.reward), float(made.cost)
-      (30.0, -1.0)
+    >>> task = as_environment(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
+    >>> place = task.reset(jax.random.key(0))
+    >>> made = task.step(place, jnp.zeros(2), None)
+    >>> float(made.reward), float(made.cost)
+    (30.0, -1.0)
     """
     if np.ndim(task) or task not in nav.TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
@@ -96,7 +94,7 @@ def as_environment(
     )
 
 
-def _reset(settings: _Settings, world: Navigation, key: chex.PRNGKey) -> Place:
+def _reset(settings: _Settings, world: Navigation, key: Key) -> Place:
     state = nav.start_states(world, key, dtype=settings.dtype)
     no = jnp.bool_(False)
     return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no, jnp.int32(0))

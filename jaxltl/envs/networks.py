@@ -10,12 +10,12 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
@@ -24,8 +24,6 @@ from jaxltl.core.environments.environment import (
     flat_observation,
 )
 from jaxltl.core.environments.episodes import Agent
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "relu": lambda x: jnp.maximum(x, 0),
@@ -34,7 +32,6 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 }
 
 
-@brief
 @struct.dataclass
 class Network:
     """A network without parameters, see :func:`make_network`.
@@ -70,9 +67,8 @@ def make_network(
     Raises:
       ValueError: fewer than two sizes, a size below 1, or an unknown activation.
 
-    Example:
-      >>> make_network("2-2-1").num_parameters, make_network("2-2-1", biases=False).num_parameters
-      (9, 6)
+    >>> make_network("2-2-1").num_parameters, make_network("2-2-1", biases=False).num_parameters
+    (9, 6)
     """
     try:
         numbers = tuple(int(n) for n in (sizes.split("-") if isinstance(sizes, str) else sizes))
@@ -92,9 +88,8 @@ def make_network(
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
     """The number of parameters of layers of `sizes`, ``sum_l (n_l + [biases]) * n_(l+1)``.
 
-    Example:
-      >>> num_parameters((62, 30, 30, 2))
-      2882
+    >>> num_parameters((62, 30, 30, 2))
+    2882
     """
     return sum((n + bool(biases)) * m for n, m in pairwise(sizes))
 
@@ -113,10 +108,9 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
     Raises:
       ValueError: another number of parameters than the network has.
 
-    Example:
-      >>> (weight, bias), = layers(make_network("2-1"), jnp.array([3.0, 4.0, 5.0]))
-      >>> weight.tolist(), bias.tolist()
-      ([[3.0], [4.0]], [5.0])
+    >>> (weight, bias), = layers(make_network("2-1"), jnp.array([3.0, 4.0, 5.0]))
+    >>> weight.tolist(), bias.tolist()
+    ([[3.0], [4.0]], [5.0])
     """
     if parameters.ndim == 0 or len(parameters) != network.num_parameters:
         raise ValueError(
@@ -140,11 +134,10 @@ def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Arr
     `parameters` are ``float[D]``, see :func:`layers`, and `inputs` ``float[..., I]``; differentiable in
     both.
 
-    Example:
-      >>> clip = make_network("1-2-1")  # relu(x + 1) - relu(x - 1) - 1
-      >>> parameters = jnp.array([1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
-      >>> apply(clip, parameters, jnp.array([[-3.0], [-0.5], [0.5], [3.0]])).ravel().tolist()
-      [-1.0, -0.5, 0.5, 1.0]
+    >>> clip = make_network("1-2-1")  # relu(x + 1) - relu(x - 1) - 1
+    >>> parameters = jnp.array([1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+    >>> apply(clip, parameters, jnp.array([[-3.0], [-0.5], [0.5], [3.0]])).ravel().tolist()
+    [-1.0, -0.5, 0.5, 1.0]
     """
     return apply_layers(network, layers(network, parameters), inputs)
 
@@ -157,10 +150,9 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
     Raises:
       ValueError: inputs or parts of another shape.
 
-    Example:
-      >>> double = make_network("1-1", biases=False)
-      >>> apply_layers(double, layers(double, jnp.array([2.0])), jnp.array([3.0])).tolist()
-      [6.0]
+    >>> double = make_network("1-1", biases=False)
+    >>> apply_layers(double, layers(double, jnp.array([2.0])), jnp.array([3.0])).tolist()
+    [6.0]
     """
     if inputs.shape[-1:] != network.sizes[:1] or parts[0][0].ndim != 2:
         raise ValueError(
@@ -180,15 +172,13 @@ def padded(parts: Layers, multiple: int = 16) -> Layers:
     The new nodes are zero and have no effect, for activations that are 0 at 0. For loops over small
     products of matrices.
 
-    Example:
-      >>> parts = layers(make_network("3-5-1"), jnp.ones(26))
-      >>> [weight.shape for weight, _ in padded(parts)]
-      [(3, 16), (16, 1)]
+    >>> parts = layers(make_network("3-5-1"), jnp.ones(26))
+    >>> [weight.shape for weight, _ in padded(parts)]
+    [(3, 16), (16, 1)]
     """
     found, inputs = [], parts[0][0].shape[0]
     for i, (weight, bias) in enumerate(parts):
-        last = i == len(parts) - 1
-        more = 0 if last else -weight.shape[1] % multiple
+        more = 0 if i == len(parts) - 1 else -weight.shape[1] % multiple
         weight = jnp.pad(weight, ((0, inputs - weight.shape[0]), (0, more)))
         found.append((weight, None if bias is None else jnp.pad(bias, (0, more))))
         inputs = weight.shape[1]
@@ -208,10 +198,9 @@ def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> j
     Raises:
       ValueError: incompatible shapes.
 
-    Example:
-      >>> doubles_and_negates = jnp.array([[2.0, -1.0], [0.0, 0.0]])
-      >>> apply_lanes(make_network("1-1"), doubles_and_negates, jnp.array([[3.0, 4.0]])).tolist()
-      [[6.0, -4.0]]
+    >>> doubles_and_negates = jnp.array([[2.0, -1.0], [0.0, 0.0]])
+    >>> apply_lanes(make_network("1-1"), doubles_and_negates, jnp.array([[3.0, 4.0]])).tolist()
+    [[6.0, -4.0]]
     """
     lanes = parameters.shape[1:]
     outer = inputs.ndim - len(lanes)
@@ -242,9 +231,8 @@ def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
     A reduction would be a loop with strided memory access. `weight` is ``float[I, O, lanes]``, with the
     lanes of the `inputs` ``float[I, lanes]`` or 1.
 
-    Example:
-      >>> weighted(jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([1.0, 10.0])).tolist()
-      [31.0, 42.0]
+    >>> weighted(jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([1.0, 10.0])).tolist()
+    [31.0, 42.0]
     """
     terms = [weight[i] * inputs[i] for i in range(len(inputs))]
     while len(terms) > 1:  # pairwise, which is also more exact
@@ -264,16 +252,15 @@ def network_agent(network: Network, environment: Environment) -> Partial:
     Raises:
       ValueError: sizes that do not fit the observations or the actions.
 
-    Example:
-      >>> from jaxltl import make_environment
-      >>> from jaxltl.core.environments import Timestep
-      >>> world = make_environment(
-      ...     lambda key: jnp.ones(2), lambda x, a, key: Timestep(x, 0.0, False), lambda x: x,
-      ...     actions=3)
-      >>> agent = network_agent(make_network("2-3", biases=False), world)
-      >>> act = agent(jnp.array([1.0, 2.0, 0.0, 0.0, 1.0, 0.0])).act
-      >>> act((), jnp.ones(2), None, None)[0].tolist()
-      1
+    >>> from jaxltl import make_environment
+    >>> from jaxltl.core.environments import Timestep
+    >>> world = make_environment(
+    ...     lambda key: jnp.ones(2), lambda x, a, key: Timestep(x, 0.0, False), lambda x: x,
+    ...     actions=3)
+    >>> agent = network_agent(make_network("2-3", biases=False), world)
+    >>> act = agent(jnp.array([1.0, 2.0, 0.0, 0.0, 1.0, 0.0])).act
+    >>> act((), jnp.ones(2), None, None)[0].tolist()
+    1
     """
     actions, shown = environment.actions, environment.observations
     inputs = sum(
@@ -290,8 +277,7 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 
 def _agent(network: Network, actions: Finite | Box, parameters: jax.Array) -> Agent:
     # Taken apart here, for inside of a loop over steps it would be in every pass.
-    parts = padded(layers(network, parameters))
-    return Agent(Partial(_act, (network, actions, parts)))
+    return Agent(Partial(_act, (network, actions, padded(layers(network, parameters)))))
 
 
 def _act(
@@ -299,7 +285,7 @@ def _act(
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> tuple[jax.Array, PyTree]:
     del key
     network, actions, parts = policy

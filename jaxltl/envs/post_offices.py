@@ -43,13 +43,12 @@ def post_offices() -> Game:
     :func:`patrol_reward`. Initial states are uniform, the system to move. Propositions: ``p1`` in the
     upper right cell and ``p2`` in the lower left, at both turns. The game is deterministic.
 
-    Example:
-      >>> game = post_offices()
-      >>> game.num_states, game.num_actions, game.num_successors
-      (36, 6, 1)
-      >>> state = (2 * 2 + 1) * 2 + 1  # in the upper right, the light on, the system to move
-      >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
-      ['p1']
+    >>> game = post_offices()
+    >>> game.num_states, game.num_actions, game.num_successors
+    (36, 6, 1)
+    >>> state = (2 * 2 + 1) * 2 + 1  # in the upper right, the light on, the system to move
+    >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
+    ['p1']
     """
     world = gridworld(_MAP)
     cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
@@ -80,10 +79,9 @@ def surveillance() -> Automaton:
     been seen, is accepting and continues like ``q1``. Unlike the translation of the formula, it takes
     the visits in either order.
 
-    Example:
-      >>> automaton = surveillance()
-      >>> automaton.delta.tolist()  # reading neither, p1, p2, both
-      [[0, 1, 2, 3], [1, 1, 3, 3], [2, 3, 2, 3], [0, 1, 2, 3]]
+    >>> automaton = surveillance()
+    >>> automaton.delta.tolist()  # reading neither, p1, p2, both
+    [[0, 1, 2, 3], [1, 1, 3, 3], [2, 3, 2, 3], [0, 1, 2, 3]]
     """
     return make_automaton(
         [[0, 1, 2, 3], [1, 1, 3, 3], [2, 3, 2, 3], [0, 1, 2, 3]],
@@ -106,11 +104,10 @@ def patrol_reward(game: Game) -> jax.Array:
     Raises:
       ValueError: the game has other states.
 
-    Example:
-      >>> reward = patrol_reward(post_offices())
-      >>> state = (4 * 2 + 1) * 2 + 1  # in the middle, the light on, the system to move
-      >>> reward[state].tolist()  # up, down, left, right, off, on
-      [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    >>> reward = patrol_reward(post_offices())
+    >>> state = (4 * 2 + 1) * 2 + 1  # in the middle, the light on, the system to move
+    >>> reward[state].tolist()  # up, down, left, right, off, on
+    [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     """
     shape = (*game.state_shape, game.num_actions)
     if shape[0] != _WORLD_STATES or shape[-1] != len(ACTIONS):
@@ -120,8 +117,7 @@ def patrol_reward(game: Game) -> jax.Array:
         )
     world = cast(MDP, base_model(game))
     cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
-    target = np.asarray(world.successor)[:, :, 0] // 4
-    paid = _paid_moves()[light[:, None], cell[:, None], target]
+    paid = _paid_moves()[light[:, None], cell[:, None], np.asarray(world.successor)[:, :, 0] // 4]
     paid &= np.asarray(world.available) & (turn == 1)[:, None]
     reward = jnp.asarray(paid, game.dtype)
     return jnp.broadcast_to(jnp.expand_dims(reward, tuple(range(1, len(shape) - 1))), shape)
@@ -162,18 +158,16 @@ def patrol() -> Patrol:
     The automaton reads the label of the state before each move, at both turns. The task is winning from
     every state; the reward-optimal patrol visits neither post office.
 
-    Example:
-      >>> model = patrol()
-      >>> moves = model.game.available.sum(axis=1)
-      >>> int(moves[model.game.system].sum()), int(moves.sum())
-      (192, 336)
+    >>> model = patrol()
+    >>> moves = model.game.available.sum(axis=1)
+    >>> int(moves[model.game.system].sum()), int(moves.sum())
+    (192, 336)
     """
     world = post_offices()
     joint = product(world, surveillance(), label_on="exit")
     everywhere = np.full(joint.num_states, 1 / joint.num_states)
     whole = restrict(joint, everywhere)  # reachable states, here all, in order
-    initial = joint.initial.ravel()
-    game = replace(whole.model, mdp=replace(whole.model.mdp, initial=initial))
+    game = replace(whole.model, mdp=replace(whole.model.mdp, initial=joint.initial.ravel()))
     cell, light, _ = jnp.unravel_index(whole.base_state, (_CELLS, 2, 2))
     return Patrol(
         game=game,

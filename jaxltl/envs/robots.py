@@ -42,13 +42,12 @@ def robots(size: int) -> Game:
     Raises:
       ValueError: `size` is not an integer of at least 2, or exceeds the range of 32 bits.
 
-    Example:
-      >>> game = robots(3)
-      >>> game.num_states, game.num_actions, game.num_successors
-      (162, 5, 1)
-      >>> state = (4 * 9 + 0) * 2 + 1  # environment in the middle, system in the lower left
-      >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
-      ['diagonal', 'system_turn', 'system_lower_left']
+    >>> game = robots(3)
+    >>> game.num_states, game.num_actions, game.num_successors
+    (162, 5, 1)
+    >>> state = (4 * 9 + 0) * 2 + 1  # environment in the middle, system in the lower left
+    >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
+    ['diagonal', 'system_turn', 'system_lower_left']
     """
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 2 <= size <= _MOST:
         raise ValueError(
@@ -108,13 +107,12 @@ def grid_game(
     Raises:
       ValueError: an invalid map, legend, probability or start, or a place without moves.
 
-    Example:
-      >>> game = grid_game('''
-      ... a.#
-      ... ..b
-      ... ''', system_start="a", environment_start=(1, 2))
-      >>> game.num_states
-      50
+    >>> game = grid_game('''
+    ... a.#
+    ... ..b
+    ... ''', system_start="a", environment_start=(1, 2))
+    >>> game.num_states
+    50
     """
     legend, wall = validation.options("grid_game", reading, legend=None, wall="#")
     world = gridworld(text, slip=slip, legend=legend, wall=wall)
@@ -156,9 +154,8 @@ def grid_game(
 def places(text: str, *, wall: str = "#") -> np.ndarray:
     """The row and column ``int[C, 2]`` of each place of the map `text`, all cells but `wall`.
 
-    Example:
-      >>> places("a#\\n.b").tolist()
-      [[0, 0], [1, 0], [1, 1]]
+    >>> places("a#\\n.b").tolist()
+    [[0, 0], [1, 0], [1, 1]]
     """
     return np.argwhere(parse_map(text) != wall)
 
@@ -169,11 +166,10 @@ def arrival_reward(game: Game, condition: States) -> jax.Array:
     ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` in the system's states of the `game`,
     else 0. The `condition` is ``bool[S]``, or a Boolean formula over the game's propositions.
 
-    Example:
-      >>> game = robots(2)
-      >>> state = (3 * 4 + 1) * 2 + 1  # the system in the lower right, below the environment
-      >>> arrival_reward(game, "system_lower_left")[state].tolist()
-      [0.0, 0.0, 1.0, 0.0, 0.0]
+    >>> game = robots(2)
+    >>> state = (3 * 4 + 1) * 2 + 1  # the system in the lower right, below the environment
+    >>> arrival_reward(game, "system_lower_left")[state].tolist()
+    [0.0, 0.0, 1.0, 0.0, 0.0]
     """
     arrives = states_with_label(game, condition).astype(game.dtype)
     counts = game.system[..., None] & game.available
@@ -183,11 +179,10 @@ def arrival_reward(game: Game, condition: States) -> jax.Array:
 def diagonal_reward(game: Game) -> jax.Array:
     """The :func:`arrival_reward` of ``diagonal`` in a `game` of robots (dissertation, section 5.5).
 
-    Example:
-      >>> game = robots(3)
-      >>> state = (4 * 9 + 0) * 2 + 1  # the environment in the middle, the system in a corner
-      >>> diagonal_reward(game)[state].tolist()  # up, down, left, right, stay
-      [0.0, 0.0, 0.0, 0.0, 1.0]
+    >>> game = robots(3)
+    >>> state = (4 * 9 + 0) * 2 + 1  # the environment in the middle, the system in a corner
+    >>> diagonal_reward(game)[state].tolist()  # up, down, left, right, stay
+    [0.0, 0.0, 0.0, 0.0, 1.0]
     """
     return arrival_reward(game, "diagonal")
 
@@ -200,10 +195,9 @@ def reward_against_task() -> tuple[Game, jax.Array]:
     satisfied by leaving after n moves, for every n; the values
     ``10 * (1 - discount**(n + 1)) / (1 - discount)`` have a supremum that none attains.
 
-    Example:
-      >>> game, reward = reward_against_task()
-      >>> reward.tolist()
-      [[10.0, 10.0, 0.0], [0.0, 0.0, 0.0]]
+    >>> game, reward = reward_against_task()
+    >>> reward.tolist()
+    [[10.0, 10.0, 0.0], [0.0, 0.0, 0.0]]
     """
     available = np.array([[True, True, False], [False, False, True]])
     model = make_mdp(
@@ -234,8 +228,7 @@ def _moves(world: MDP, cells: np.ndarray) -> _Moves:
     number = np.zeros(world.num_states, np.int32)
     number[cells] = np.arange(count)
     own = np.arange(count, dtype=np.int32)[:, None]
-    width = world.num_successors
-    target = np.broadcast_to(own[:, :, None], (count, len(ACTIONS), width)).copy()
+    target = np.broadcast_to(own[:, :, None], (count, len(ACTIONS), world.num_successors)).copy()
     target[:, :_STAY] = number[np.asarray(world.successor)[cells]]
     probability = np.zeros(target.shape)
     probability[:, :_STAY] = np.asarray(world.probability)[cells]

@@ -12,13 +12,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
@@ -29,7 +29,6 @@ from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, rollout
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.envs.cell_kinds import (
@@ -38,19 +37,23 @@ from jaxltl.envs.cell_kinds import (
     OBSTACLES,
     Counts,
     Kinds,
+    Placement,
     categories,
     check_margin,
     codes_of,
+    filled,
     make_kinds,
+    placed,
+    plan_map,
+    planned,
+    stamps_of,
 )
-from jaxltl.envs.cell_patches import Placement, filled, placed, plan_map, planned, stamps_of
 from jaxltl.envs.gridworld import gridworld
 
 COMPLETE = "(!o2 & !o3 & !ob) U (o1 & ((!o3 & !ob) U (o2 & (!ob U o3))))"
 INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
 
 
-@brief
 @struct.dataclass
 class World:
     """A coloured gridworld, see :func:`make_world`.
@@ -84,11 +87,10 @@ def colored_world(
     `objects`, `obstacles` and `margin` are as for :func:`~jaxltl.envs.cell_kinds.categories`; `slip`
     is the probability of moving sideways. ValueError if no cell is a distractor.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> again = colored_world(np.asarray(world.colors))
-      >>> again.shape, int(again.mdp.label.sum())
-      ((4, 4), 1)
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> again = colored_world(np.asarray(world.colors))
+    >>> again.shape, int(again.mdp.label.sum())
+    ((4, 4), 1)
     """
     kind = categories(colors, objects=objects, obstacles=obstacles, margin=margin)
     kinds = make_kinds(objects, obstacles)
@@ -123,9 +125,8 @@ class Appearance(TypedDict, total=False):
       shape: rows and columns; default: 10 and 10.
       objects, obstacles, margin, slip: see :func:`colored_world`.
 
-    Example:
-      >>> make_world({}, 0, **Appearance(shape=(2, 3), margin=2)).colors.shape
-      (6, 7)
+    >>> make_world({}, 0, **Appearance(shape=(2, 3), margin=2)).colors.shape
+    (6, 7)
     """
 
     shape: tuple[int, int]
@@ -172,10 +173,9 @@ def make_world(
       seed: of the random colours. The inner rings do not depend on the margin.
       appearance: shape, kinds and slip, see :class:`Appearance`.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
-      >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
-      ([True, False, False, False], 2)
+    >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
+    >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
+    ([True, False, False, False], 2)
     """
     shape, kinds, _, margin, blank = _grid("make_world", appearance)
     kind = plan_map(plan, kinds, shape)
@@ -190,9 +190,8 @@ def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> Worl
 
     `margin` and `slip` are as for :func:`make_world`.
 
-    Example:
-      >>> training_world().mdp.label.sum(0).tolist()
-      [1, 1, 1, 5]
+    >>> training_world().mdp.label.sum(0).tolist()
+    [1, 1, 1, 5]
     """
     plan = {
         "o1": [(1, 7)],
@@ -236,10 +235,9 @@ def random_worlds(
     Raises:
       ValueError: an unknown proposition, or no placement found.
 
-    Example:
-      >>> worlds = random_worlds([3, 4], shape=(6, 8), num_obstacles=2)
-      >>> [world.shape for world in worlds]
-      [(6, 8), (6, 8)]
+    >>> worlds = random_worlds([3, 4], shape=(6, 8), num_obstacles=2)
+    >>> [world.shape for world in worlds]
+    [(6, 8), (6, 8)]
     """
     shape, kinds, num_objects, margin, blank = _grid("random_worlds", appearance)
     if num_obstacles < 0:
@@ -276,9 +274,8 @@ def random_worlds(
 def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
     """The world of :func:`random_worlds` of one `seed` and `task`, with the same `options`.
 
-    Example:
-      >>> random_world(3, shape=(6, 8), num_obstacles=2).shape
-      (6, 8)
+    >>> random_world(3, shape=(6, 8), num_obstacles=2).shape
+    (6, 8)
     """
     return random_worlds([seed], task, **options)[0]
 
@@ -334,9 +331,8 @@ def patches(world: World, radius: int = 1) -> jax.Array:
     Raises:
       ValueError: `radius` is negative or larger than the margin.
 
-    Example:
-      >>> patches(training_world())[6].tolist()  # o1 in cell (1, 7)
-      [[0, 4, 0], [4, 0, 4], [0, 4, 0]]
+    >>> patches(training_world())[6].tolist()  # o1 in cell (1, 7)
+    [[0, 4, 0], [4, 0, 4], [0, 4, 0]]
     """
     if not 0 <= radius <= world.margin:
         raise ValueError(
@@ -359,10 +355,9 @@ def observations(world: World, radius: int = 1) -> jax.Array:
 
     ``O = (2 * radius + 1)**2 * 5``, as an image ``[2 * radius + 1, 2 * radius + 1, 5]``.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> observations(world, 0).shape, observations(world, 0).sum().item()
-      ((16, 5), 16.0)
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> observations(world, 0).shape, observations(world, 0).sum().item()
+    ((16, 5), 16.0)
     """
     hot = jax.nn.one_hot(patches(world, radius), len(COLORS), dtype=world.mdp.dtype)
     return hot.reshape(hot.shape[0], -1)
@@ -375,22 +370,19 @@ def _distance(automaton: Automaton) -> jax.Array:
     def sweep(_: int, distance: jax.Array) -> jax.Array:
         return jnp.where(final, 0.0, jnp.minimum(distance, 1 + distance[delta].min(-1)))
 
-    start = jnp.where(final, 0.0, jnp.inf)
-    return jax.lax.fori_loop(0, delta.shape[0], sweep, start)
+    return jax.lax.fori_loop(0, delta.shape[0], sweep, jnp.where(final, 0.0, jnp.inf))
 
 
 def is_over(model: Product) -> jax.Array:
     """The memory states of a `model` in which a co-safe task is satisfied or violated, ``bool[S, Q]``.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> model = product(world.mdp, "F o1", label_on="exit")
-      >>> jax.jit(is_over)(model)[0].tolist()
-      [False, True]
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> model = product(world.mdp, "F o1", label_on="exit")
+    >>> jax.jit(is_over)(model)[0].tolist()
+    [False, True]
     """
     distance = _distance(model.automaton)
-    over = (distance == 0) | jnp.isinf(distance)
-    return jnp.broadcast_to(over, model.state_shape)
+    return jnp.broadcast_to((distance == 0) | jnp.isinf(distance), model.state_shape)
 
 
 def expert_reward(
@@ -408,11 +400,10 @@ def expert_reward(
     infinite, else `step`; afterwards `won` or `lost`. `model` is the product of a world and a co-safe
     task. Differentiable in the five rewards.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> model = product(world.mdp, "F o1", label_on="exit")
-      >>> jax.jit(expert_reward)(model)[:2, 0, 0].tolist()  # o1 is read where it is left
-      [-1.0, 10.0]
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> model = product(world.mdp, "F o1", label_on="exit")
+    >>> jax.jit(expert_reward)(model)[:2, 0, 0].tolist()  # o1 is read where it is left
+    [-1.0, 10.0]
     """
     dtype = model.dtype
     distance = _distance(model.automaton)
@@ -423,8 +414,7 @@ def expert_reward(
     reward = reward.astype(dtype)
     if model.label_on == "exit":
         return jnp.broadcast_to(reward[:, :, None], (*reward.shape, model.num_actions))
-    expect = partial(operators.expectation, model.mdp)
-    return jax.vmap(expect, in_axes=1, out_axes=1)(reward)
+    return jax.vmap(partial(operators.expectation, model.mdp), in_axes=1, out_axes=1)(reward)
 
 
 def expert_policy(
@@ -440,11 +430,10 @@ def expert_policy(
     The default reward is :func:`expert_reward`. `discount`, `method` and `tolerance` are those of
     :func:`~jaxltl.core.values.discounted.soft.soft_value`; use ``"newton"`` for discounts near 1.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> model = product(world.mdp, "F o1", label_on="exit")
-      >>> jax.eval_shape(lambda: expert_policy(model)).shape
-      (16, 2, 4)
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> model = product(world.mdp, "F o1", label_on="exit")
+    >>> jax.eval_shape(lambda: expert_policy(model)).shape
+    (16, 2, 4)
     """
     reward = expert_reward(model) if reward is None else reward
     return soft_value(model, reward, discount, method=method, tolerance=tolerance).policy
@@ -452,7 +441,7 @@ def expert_policy(
 
 @partial(jax.jit, static_argnames=("num", "horizon"))
 def demonstrations(
-    key: chex.PRNGKey, model: Product, policy: jax.Array, num: int, horizon: int = 100
+    key: Key, model: Product, policy: jax.Array, num: int, horizon: int = 100
 ) -> Trajectories:
     """The trajectories of a policy in the world, cut where the task is satisfied or violated.
 
@@ -460,14 +449,13 @@ def demonstrations(
       key, model, policy: the random key, the product, and ``float[S, Q, A]``.
       num, horizon: the number of trajectories and the largest number of steps; static.
 
-    Example:
-      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
-      >>> model = product(world.mdp, "F o1", label_on="exit")
-      >>> policy = jnp.full((*model.state_shape, 4), 0.25)
-      >>> runs = jax.eval_shape(
-      ...     lambda key: demonstrations(key, model, policy, num=3, horizon=5), jax.random.key(0))
-      >>> runs.state.shape, runs.state_shape
-      ((3, 5), (16,))
+    >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+    >>> model = product(world.mdp, "F o1", label_on="exit")
+    >>> policy = jnp.full((*model.state_shape, 4), 0.25)
+    >>> runs = jax.eval_shape(
+    ...     lambda key: demonstrations(key, model, policy, num=3, horizon=5), jax.random.key(0))
+    >>> runs.state.shape, runs.state_shape
+    ((3, 5), (16,))
     """
     runs = rollout(model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model))
     return project_trajectories(model, runs)

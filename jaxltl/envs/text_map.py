@@ -11,12 +11,11 @@ def parse_map(text: str) -> np.ndarray:
     One line per row. If any line has spaces inside, cells are words between spaces;
     otherwise each character is a cell. Blank lines are ignored.
 
-    Example:
-      >>> parse_map('''
-      ... ..y
-      ... b#.
-      ... ''').shape
-      (2, 3)
+    >>> parse_map('''
+    ... ..y
+    ... b#.
+    ... ''').shape
+    (2, 3)
     """
     lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
     if not lines:

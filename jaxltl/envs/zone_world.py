@@ -18,15 +18,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 
+from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.pretty_print import brief
 
 COLORS = ("green", "yellow", "blue", "magenta")
@@ -104,48 +104,26 @@ def zone_world(
     Raises:
       ValueError: numbers that are not positive, a repeated colour, or zones that do not fit.
 
-    Example:
-      >>> world = zone_world(num_maps=8)
-      >>> world.propositions, world.observations.shape, world.actions.shape
-      (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
+    >>> world = zone_world(num_maps=8)
+    >>> world.propositions, world.observations.shape, world.actions.shape
+    (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
     num_maps, seed = validation.options("zone_world", placements, num_maps=1024, seed=0)
     names = validation.distinct_names("colors", colors)
-    zones, num_maps = (
-        validation.integer("zones", zones),
-        validation.integer("num_maps", num_maps, most=2**20),
-    )
-    seed = validation.integer("seed", seed)
-    for name, number in (
-        ("radius", radius),
-        ("extent", extent),
-        ("saturation", saturation),
-        ("zones", zones),
-        ("num_maps", num_maps),
-        ("colors", len(names)),
-    ):
+    zones, seed = validation.integer("zones", zones), validation.integer("seed", seed)
+    num_maps = validation.integer("num_maps", num_maps, most=2**20)
+    sizes = {"radius": radius, "extent": extent, "saturation": saturation}
+    counts = {"zones": zones, "num_maps": num_maps, "colors": len(names)}
+    for name, number in (sizes | counts).items():
         if not 0 < validation.finite_number(name, number) < 1e7:
             raise ValueError(
                 f"zone_world: {name}={number}; it must be positive, and below ten million."
             )
     radius, extent, saturation = float(radius), float(extent), float(saturation)
     places = draw_places(len(names) * zones, extent, num_maps, seed)
-    numbers = _Numbers(
-        *(
-            np.float32(x)
-            for x in (
-                radius,
-                extent,
-                0.02,
-                0.3 * 0.05 / _MASS,
-                saturation,
-                0.01 / _MASS,
-                0.3 / 0.095,
-                3.0,
-                0.5,
-            )
-        )
-    )
+    thrust, drag = 0.3 * 0.05 / _MASS, 0.01 / _MASS
+    values = (radius, extent, 0.02, thrust, saturation, drag, 0.3 / 0.095, 3.0, 0.5)
+    numbers = _Numbers(*map(np.float32, values))
     count = len(names) * _BINS + 11
     world = make_environment(
         Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
@@ -189,7 +167,7 @@ def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.n
 # --- of one trajectory ----------------------------------------------------------------------------
 
 
-def _begin(places: chex.Array, each: chex.Array, key: chex.PRNGKey) -> ZoneState:
+def _begin(places: Array, each: Array, key: Key) -> ZoneState:
     zones, colors = each.shape
     bits = jax.random.bits(key, zones * colors + 3, jnp.uint32)
     drawn = jnp.asarray(places)[bits[0] % np.uint32(places.shape[0])]
@@ -208,7 +186,7 @@ def _ahead(heading: jax.Array) -> jax.Array:
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
-def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: chex.PRNGKey) -> Timestep:
+def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: Key) -> Timestep:
     del key
     action = jnp.clip(action, -1, 1).astype(jnp.float32)
     turning = jnp.clip(n.turn * action[1], -n.most_turn, n.most_turn)
@@ -219,8 +197,7 @@ def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: chex.PRNGKey) -
     velocity = toward + kept * (world.velocity - toward)
     place = world.place + n.time_step * toward + ((1 - kept) / n.drag * (world.velocity - toward))
     most = n.extent - _ROBOT
-    stopped = jnp.abs(place) > most
-    velocity = jnp.where(stopped, 0, velocity)
+    velocity = jnp.where(jnp.abs(place) > most, 0, velocity)
     place = jnp.clip(place, -most, most)
     acceleration = (velocity - world.velocity) / n.time_step
     heading = heading % np.float32(2 * np.pi)
@@ -266,5 +243,4 @@ def _see(n: _Numbers, world: ZoneState) -> jax.Array:
 
 
 def _labels(n: _Numbers, world: ZoneState) -> jax.Array:
-    apart = jnp.sum((world.zone - world.place) ** 2, axis=-1)
-    return (apart <= n.radius**2).any(axis=-1)
+    return (jnp.sum((world.zone - world.place) ** 2, axis=-1) <= n.radius**2).any(axis=-1)

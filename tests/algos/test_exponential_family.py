@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from jaxltl.algos.cce import _gamma_shape
 from jaxltl.algos.cce import exponential_family as ef
 
 # Each compiled as a whole, which takes much less long than operation by operation.
@@ -30,7 +29,7 @@ whole = SimpleNamespace(
         )
     },
     **{
-        name: jax.jit(getattr(_gamma_shape, name))
+        name: jax.jit(getattr(ef, f"_{name}"))
         for name in ("log_digamma_gap", "shape_of_gap", "convex_part")
     },
     **{

@@ -645,7 +645,7 @@ def test_metrics_are_thinned_and_end_with_the_last_step(num_steps, max_rows):
 @pytest.mark.parametrize("limits", [{"num_steps": 0}, {"num_steps": 5, "max_rows": 0}])
 def test_runs_have_at_least_one_step_and_row(limits):
     module, problem, hparams, _ = case("toy")
-    with pytest.raises(ValueError, match="both must be at least 1"):
+    with pytest.raises(ValueError, match="must be at least 1"):
         module.run(start("toy"), problem, hparams, **limits)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import maximin_q
-from jaxltl.algos.maximin_q._alias import alias_table
+from jaxltl.algos.common.play import alias_table
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, make_game

@@ -18,8 +18,14 @@ from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams
 from jaxltl.algos.trust_region import _policy_networks as nets
-from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights
-from jaxltl.algos.trust_region._step import fisher_product, surrogate
+from jaxltl.algos.trust_region._step import (
+    Case,
+    Dual,
+    cpo_dual,
+    cpo_weights,
+    fisher_product,
+    surrogate,
+)
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.environments.time_limit import with_time_limit

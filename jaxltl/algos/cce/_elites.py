@@ -6,14 +6,12 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common.schedules import SLACK
-from jaxltl.core.pretty_print import brief
+from jaxltl.core import struct
 
 
-@brief
 @struct.dataclass
 class Sample:
     """An evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
@@ -28,7 +26,6 @@ class Sample:
     found: jax.Array
 
 
-@brief
 @struct.dataclass
 class Pool:
     """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]``, and which of them are `active`."""
@@ -44,7 +41,6 @@ def num_elites(rho: float, num_samples: int) -> int:
     return math.ceil(rho * num_samples - SLACK)
 
 
-@brief
 @struct.dataclass
 class Elites:
     """The elites among n samples.
@@ -106,8 +102,7 @@ def elite_weights(
     least = jnp.finfo(objective.dtype).min
     logit = jnp.clip(objective / temperature, least, -least)
     if weighting != "literal":
-        by_objective = enough_feasible & (weighting == "until_feasible")
-        logit = jnp.where(by_objective, logit, 0)
+        logit = jnp.where(enough_feasible & (weighting == "until_feasible"), logit, 0)
     top = jnp.max(jnp.where(taken, logit, least))
     weight = jnp.where(taken, jnp.exp(jnp.where(taken, logit - top, 0)), 0)
     return weight / jnp.maximum(jnp.sum(weight), 1)

@@ -6,23 +6,20 @@ import math
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 
 from jaxltl.algos.cce import exponential_family as families
-from jaxltl.algos.cce._evaluation import scores
-from jaxltl.algos.cce.problem import Problem
-from jaxltl.algos.cce.state import Hparams, State
+from jaxltl.algos.cce.state import Hparams, Problem, State, scores
 from jaxltl.algos.common.schedules import Polynomial as Polynomial
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key
 from jaxltl.core.environments.environment import require_key
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status
 
 
-@brief
 @struct.dataclass
 class Assessment:
     """A policy with fresh evaluations.
@@ -73,7 +70,7 @@ class Result(NamedTuple):
 
 
 def assess(
-    problem: Problem, parameters: jax.Array, key: chex.PRNGKey, *, num_evaluations: int = 1000
+    problem: Problem, parameters: jax.Array, key: Key, *, num_evaluations: int = 1000
 ) -> Assessment:
     """The :class:`Assessment` of a policy `parameters`, ``float[D]``, on fresh evaluations.
 
@@ -100,7 +97,7 @@ def assess(
 
 @partial(jax.jit, static_argnames="num_evaluations")
 def _assessed(
-    problem: Problem, parameters: jax.Array, key: chex.PRNGKey, num_evaluations: int
+    problem: Problem, parameters: jax.Array, key: Key, num_evaluations: int
 ) -> Assessment:
     from scipy.special import stdtrit
 
@@ -132,12 +129,7 @@ def _moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def result(
-    state: State,
-    problem: Problem,
-    hparams: Hparams,
-    key: chex.PRNGKey,
-    *,
-    num_evaluations: int = 1000,
+    state: State, problem: Problem, hparams: Hparams, key: Key, *, num_evaluations: int = 1000
 ) -> Result:
     """The :class:`Result` of a search: the mean policy and the best sample on fresh evaluations.
 

@@ -11,28 +11,27 @@ density ``f_v(x) = exp(v . Gamma(x) - K(v))`` (dissertation, definition 2) and *
 Gaussian with mean 3 and standard deviation 1e-3 is negative in single precision; here every
 variance is a sum of squares.
 
-Example:
-  >>> import jax, jax.numpy as jnp
-  >>> from jaxltl.algos.cce import exponential_family as families
-  >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
-  >>> def moved(key):  # halfway to eight of its samples
-  ...     samples = families.sample(start, key, 8)
-  ...     family = families.project(start, samples, jnp.ones(8), rate=0.5)
-  ...     return family, families.log_density(family, samples)
-  >>> family, density = jax.eval_shape(moved, jax.random.key(0))
-  >>> family.mean.shape, density.shape
-  ((2,), (8,))
-  >>> families.standard_deviation(families.widen(start, 3.0)).tolist()
-  [2.0, 2.0]
-  >>> families.at_least(start, 4.0).variance.tolist()
-  [4.0, 4.0]
-  >>> first, second = families.mean_parameter(start)  # E x and E x^2
-  >>> second.tolist(), families.center(start).tolist()
-  ([1.0, 1.0], [0.0, 0.0])
-  >>> shapes = jax.eval_shape(lambda key: families.sufficient_statistics(
-  ...     start, families.sample_antithetic(start, key, 8)), jax.random.key(0))
-  >>> shapes[1].shape  # of mirrored pairs
-  (8, 2)
+>>> import jax, jax.numpy as jnp
+>>> from jaxltl.algos.cce import exponential_family as families
+>>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
+>>> def moved(key):  # halfway to eight of its samples
+...     samples = families.sample(start, key, 8)
+...     family = families.project(start, samples, jnp.ones(8), rate=0.5)
+...     return family, families.log_density(family, samples)
+>>> family, density = jax.eval_shape(moved, jax.random.key(0))
+>>> family.mean.shape, density.shape
+((2,), (8,))
+>>> families.standard_deviation(families.widen(start, 3.0)).tolist()
+[2.0, 2.0]
+>>> families.at_least(start, 4.0).variance.tolist()
+[4.0, 4.0]
+>>> first, second = families.mean_parameter(start)  # E x and E x^2
+>>> second.tolist(), families.center(start).tolist()
+([1.0, 1.0], [0.0, 0.0])
+>>> shapes = jax.eval_shape(lambda key: families.sufficient_statistics(
+...     start, families.sample_antithetic(start, key, 8)), jax.random.key(0))
+>>> shapes[1].shape  # of mirrored pairs
+(8, 2)
 """
 
 from __future__ import annotations
@@ -41,22 +40,18 @@ import math
 from dataclasses import replace
 from functools import singledispatch
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
 from numpy.typing import ArrayLike
 
-from jaxltl.algos.cce._gamma_shape import convex_part, log_digamma_gap, shape_of_gap
 from jaxltl.algos.common import splitmix
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief
+from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array, Key, PyTree
 
 
-@brief
 @struct.dataclass
 class DiagonalGaussian:
     """Independent normal entries, `mean` and `variance` ``float[D]``; ``Gamma(x) = (x, x^2)``."""
@@ -65,7 +60,6 @@ class DiagonalGaussian:
     variance: jax.Array
 
 
-@brief
 @struct.dataclass
 class FullGaussian:
     """Normal vectors with any covariance; ``Gamma(x) = (x, x x')``.
@@ -78,7 +72,6 @@ class FullGaussian:
     factor: jax.Array
 
 
-@brief
 @struct.dataclass
 class Gamma:
     """Independent gamma entries, mean `shape` / `rate`, ``float[D]``; ``Gamma(x) = (x, log x)``."""
@@ -90,15 +83,14 @@ class Gamma:
 Family = DiagonalGaussian | FullGaussian | Gamma
 
 
-def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaussian:
+def diagonal_gaussian(mean: Array, std: Array | float) -> DiagonalGaussian:
     """A :class:`DiagonalGaussian` of a `mean` ``float[D]`` and positive `std`, ``float[D]`` or a number.
 
     Raises:
       ValueError: `mean` is not a vector, `std` does not fit it, or is not positive.
 
-    Example:
-      >>> diagonal_gaussian([0.0, 1.0], 0.5).variance.tolist()
-      [0.25, 0.25]
+    >>> diagonal_gaussian([0.0, 1.0], 0.5).variance.tolist()
+    [0.25, 0.25]
     """
     mean = _vector("mean", mean)
     std = _like("std", std, mean)
@@ -106,15 +98,14 @@ def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaus
     return DiagonalGaussian(mean, jnp.square(std))
 
 
-def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
+def full_gaussian(mean: Array, covariance: Array) -> FullGaussian:
     """A :class:`FullGaussian` of a `mean` ``float[D]`` and positive definite `covariance`.
 
     Raises:
       ValueError: a wrong shape, or a covariance that is not symmetric and positive definite.
 
-    Example:
-      >>> full_gaussian([0.0, 0.0], [[4.0, 2.0], [2.0, 2.0]]).factor.tolist()
-      [[2.0, 0.0], [1.0, 1.0]]
+    >>> full_gaussian([0.0, 0.0], [[4.0, 2.0], [2.0, 2.0]]).factor.tolist()
+    [[2.0, 0.0], [1.0, 1.0]]
     """
     mean = _vector("mean", mean)
     covariance = jnp.asarray(covariance, mean.dtype)
@@ -127,15 +118,14 @@ def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
     return FullGaussian(mean, jnp.linalg.cholesky(covariance))
 
 
-def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
+def gamma(shape: Array, rate: Array | float) -> Gamma:
     """A :class:`Gamma` of positive `shape` ``float[D]`` and `rate`, ``float[D]`` or a number.
 
     Raises:
       ValueError: a wrong shape, or a number that is not positive.
 
-    Example:
-      >>> center(gamma([2.0, 3.0], 2.0)).tolist()
-      [1.0, 1.5]
+    >>> center(gamma([2.0, 3.0], 2.0)).tolist()
+    [1.0, 1.5]
     """
     shape = _vector("shape", shape)
     rate = _like("rate", rate, shape)
@@ -212,13 +202,13 @@ def log_density(family: PyTree, samples: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def sample(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def sample(family: PyTree, key: Key, num_samples: int) -> jax.Array:
     """``float[num_samples, D]``, independent samples of a `family` by a `key`; `num_samples` is static."""
     raise TypeError(_unknown(family))
 
 
 @singledispatch
-def sample_antithetic(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def sample_antithetic(family: PyTree, key: Key, num_samples: int) -> jax.Array:
     """``float[num_samples, D]``: samples 2 i and 2 i + 1 of `family` by `key` are mirrored at the mean.
 
     Raises:
@@ -277,7 +267,7 @@ def _unknown(family: PyTree) -> str:
     )
 
 
-def _normal(key: chex.PRNGKey, num_samples: int, like: jax.Array) -> jax.Array:
+def _normal(key: Key, num_samples: int, like: jax.Array) -> jax.Array:
     """Standard normal numbers ``float[num_samples, D]``.
 
     Only D streams are drawn from the key: one keyed hash for each number would cost more than the
@@ -299,19 +289,11 @@ def _shares(weights: jax.Array) -> jax.Array:
 # --- diagonal Gaussians ---------------------------------------------------------------------
 
 
-@sufficient_statistics.register
-def _(family: DiagonalGaussian, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return samples, jnp.square(samples)
-
-
-@mean_parameter.register
-def _(family: DiagonalGaussian) -> tuple[jax.Array, jax.Array]:
-    return family.mean, jnp.square(family.mean) + family.variance
-
-
-@from_mean_parameter.register
-def _(family: DiagonalGaussian, eta: tuple[jax.Array, jax.Array]) -> DiagonalGaussian:
-    return DiagonalGaussian(eta[0], eta[1] - jnp.square(eta[0]))
+sufficient_statistics.register(DiagonalGaussian, lambda f, samples: (samples, jnp.square(samples)))
+mean_parameter.register(DiagonalGaussian, lambda f: (f.mean, jnp.square(f.mean) + f.variance))
+from_mean_parameter.register(
+    DiagonalGaussian, lambda f, eta: DiagonalGaussian(eta[0], eta[1] - jnp.square(eta[0]))
+)
 
 
 @log_density.register
@@ -320,10 +302,10 @@ def _(family: DiagonalGaussian, samples: jax.Array) -> jax.Array:
     return -0.5 * jnp.sum(square + jnp.log(2 * math.pi * family.variance), axis=-1)
 
 
-@sample.register
-def _(family: DiagonalGaussian, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    noise = _normal(key, num_samples, family.mean)
-    return family.mean + jnp.sqrt(family.variance) * noise
+sample.register(
+    DiagonalGaussian,
+    lambda f, key, num_samples: f.mean + jnp.sqrt(f.variance) * _normal(key, num_samples, f.mean),
+)
 
 
 @project.register
@@ -339,42 +321,26 @@ def _(
     return DiagonalGaussian(family.mean + rate * shift, variance)
 
 
-@center.register
-def _(family: DiagonalGaussian) -> jax.Array:
-    return family.mean
-
-
-@standard_deviation.register
-def _(family: DiagonalGaussian) -> jax.Array:
-    return jnp.sqrt(family.variance)
-
-
-@widen.register
-def _(family: DiagonalGaussian, variance: jax.Array | float) -> DiagonalGaussian:
-    return replace(family, variance=family.variance + variance)
-
-
-@at_least.register
-def _(family: DiagonalGaussian, variance: jax.Array | float) -> DiagonalGaussian:
-    return replace(family, variance=jnp.maximum(family.variance, variance))
-
+center.register(DiagonalGaussian, lambda f: f.mean)
+standard_deviation.register(DiagonalGaussian, lambda f: jnp.sqrt(f.variance))
+widen.register(DiagonalGaussian, lambda f, variance: replace(f, variance=f.variance + variance))
+at_least.register(
+    DiagonalGaussian, lambda f, variance: replace(f, variance=jnp.maximum(f.variance, variance))
+)
 
 # --- full Gaussians -------------------------------------------------------------------------
 
 
-@sufficient_statistics.register
-def _(family: FullGaussian, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return samples, samples[..., :, None] * samples[..., None, :]
-
-
-@mean_parameter.register
-def _(family: FullGaussian) -> tuple[jax.Array, jax.Array]:
-    return family.mean, jnp.outer(family.mean, family.mean) + family.factor @ family.factor.T
-
-
-@from_mean_parameter.register
-def _(family: FullGaussian, eta: tuple[jax.Array, jax.Array]) -> FullGaussian:
-    return FullGaussian(eta[0], jnp.linalg.cholesky(eta[1] - jnp.outer(eta[0], eta[0])))
+sufficient_statistics.register(
+    FullGaussian, lambda f, samples: (samples, samples[..., :, None] * samples[..., None, :])
+)
+mean_parameter.register(
+    FullGaussian, lambda f: (f.mean, jnp.outer(f.mean, f.mean) + f.factor @ f.factor.T)
+)
+from_mean_parameter.register(
+    FullGaussian,
+    lambda f, eta: FullGaussian(eta[0], jnp.linalg.cholesky(eta[1] - jnp.outer(eta[0], eta[0]))),
+)
 
 
 @log_density.register
@@ -387,9 +353,10 @@ def _(family: FullGaussian, samples: jax.Array) -> jax.Array:
     return -0.5 * (square + offset.shape[-1] * math.log(2 * math.pi)) - volume
 
 
-@sample.register
-def _(family: FullGaussian, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    return family.mean + _normal(key, num_samples, family.mean) @ family.factor.T
+sample.register(
+    FullGaussian,
+    lambda f, key, num_samples: f.mean + _normal(key, num_samples, f.mean) @ f.factor.T,
+)
 
 
 @project.register
@@ -414,14 +381,10 @@ def _factor(rows: jax.Array) -> jax.Array:
     return (jnp.where(jnp.diagonal(upper) < 0, -1, 1)[:, None] * upper).T
 
 
-@center.register
-def _(family: FullGaussian) -> jax.Array:
-    return family.mean
-
-
-@standard_deviation.register
-def _(family: FullGaussian) -> jax.Array:
-    return jnp.sqrt(jnp.sum(jnp.square(family.factor), axis=-1))
+center.register(FullGaussian, lambda f: f.mean)
+standard_deviation.register(
+    FullGaussian, lambda f: jnp.sqrt(jnp.sum(jnp.square(f.factor), axis=-1))
+)
 
 
 @widen.register
@@ -437,7 +400,7 @@ def _(family: FullGaussian, variance: jax.Array | float) -> FullGaussian:
     return replace(family, factor=_factor(length[:, None] * axes))
 
 
-def _mirrored(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def _mirrored(family: PyTree, key: Key, num_samples: int) -> jax.Array:
     half = sample(family, key, -(-num_samples // 2))
     pairs = jnp.stack([half, 2 * center(family) - half], axis=1)
     return pairs.reshape(-1, half.shape[-1])[:num_samples]
@@ -450,19 +413,60 @@ sample_antithetic.register(FullGaussian, _mirrored)
 # --- gamma distributions --------------------------------------------------------------------
 
 
-@sufficient_statistics.register
-def _(family: Gamma, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return samples, jnp.log(samples)
+def _convex_part(z: jax.Array) -> jax.Array:
+    """``z - log(1 + z)``, accurate near zero, for z > -1."""
+    small = jnp.abs(z) < 0.05
+    safe = jnp.where(small, z, 0)
+    series = jnp.zeros_like(z)
+    for n in range(13, 1, -1):
+        series = (-1) ** n / n + safe * series
+    least = -1 + jnp.finfo(z.dtype).epsneg
+    return jnp.where(small, safe * safe * series, z - jnp.log1p(jnp.maximum(z, least)))
 
 
-@mean_parameter.register
-def _(family: Gamma) -> tuple[jax.Array, jax.Array]:
-    return family.shape / family.rate, digamma(family.shape) - jnp.log(family.rate)
+# Coefficients of 1/k^2, 1/k^4, ... in the asymptotic series of log k - digamma(k) - 1/(2k).
+_SERIES = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
+
+
+def _log_digamma_gap(shape: jax.Array) -> jax.Array:
+    """``log k - digamma(k)``, positive and decreasing, without cancellation."""
+    bound = 4.0 if jnp.finfo(shape.dtype).bits < 64 else 10.0  # the series is exact above
+    large = shape > bound
+    inverse = 1 / jnp.where(large, shape, bound)
+    square = jnp.square(inverse)
+    series = jnp.zeros_like(shape)
+    for c in reversed(_SERIES):
+        series = square * (c + series)
+    small = jnp.where(large, bound, shape)
+    return jnp.where(large, inverse / 2 + series, jnp.log(small) - digamma(small))
+
+
+def _shape_of_gap(gap: jax.Array) -> jax.Array:
+    """The shape k with ``log k - digamma(k) = gap``, by Newton's method on logarithms.
+
+    ``log gap`` is nearly linear in ``log k``, of slope -1 at both ends, so that a few steps
+    from Minka's (2002) approximation suffice everywhere.
+    """
+    gap = jnp.maximum(gap, jnp.finfo(gap.dtype).tiny * 16)
+    start = (3 - gap + jnp.sqrt(jnp.square(gap - 3) + 24 * gap)) / (12 * gap)
+
+    def newton(_: object, log_shape: jax.Array) -> jax.Array:
+        def log_gap(x: jax.Array) -> jax.Array:
+            return jnp.log(_log_digamma_gap(jnp.exp(x)))
+
+        value, slope = jax.jvp(log_gap, (log_shape,), (jnp.ones_like(log_shape),))
+        return log_shape - (value - jnp.log(gap)) / slope
+
+    return jnp.exp(lax.fori_loop(0, 5, newton, jnp.log(start)))
+
+
+sufficient_statistics.register(Gamma, lambda f, samples: (samples, jnp.log(samples)))
+mean_parameter.register(Gamma, lambda f: (f.shape / f.rate, digamma(f.shape) - jnp.log(f.rate)))
 
 
 @from_mean_parameter.register
 def _(family: Gamma, eta: tuple[jax.Array, jax.Array]) -> Gamma:
-    shape = shape_of_gap(jnp.log(eta[0]) - eta[1])
+    shape = _shape_of_gap(jnp.log(eta[0]) - eta[1])
     return Gamma(shape, shape / eta[0])
 
 
@@ -474,7 +478,7 @@ def _(family: Gamma, samples: jax.Array) -> jax.Array:
 
 
 @sample.register
-def _(family: Gamma, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def _(family: Gamma, key: Key, num_samples: int) -> jax.Array:
     dtype = family.shape.dtype
     draws = jax.random.gamma(key, family.shape, (num_samples, *family.shape.shape), dtype)
     # Tiny shapes draw numbers that round to zero; their logarithm is not finite.
@@ -488,21 +492,15 @@ def _(family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | f
     mean = old + rate * (weights @ (samples - old))
     # log E x - E log x of the mixture. The linear terms, which sum to zero, are taken out of
     # the logarithms, so that only numbers that are not negative are added.
-    own = weights @ convex_part((samples - mean) / mean)
-    rest = log_digamma_gap(family.shape) + convex_part((old - mean) / mean)
-    shape = shape_of_gap(rate * own + (1 - rate) * rest)
+    own = weights @ _convex_part((samples - mean) / mean)
+    rest = _log_digamma_gap(family.shape) + _convex_part((old - mean) / mean)
+    shape = _shape_of_gap(rate * own + (1 - rate) * rest)
     shape = jnp.where(rate > 0, shape, family.shape)
     return Gamma(shape, jnp.where(rate > 0, shape / mean, family.rate))
 
 
-@center.register
-def _(family: Gamma) -> jax.Array:
-    return family.shape / family.rate
-
-
-@standard_deviation.register
-def _(family: Gamma) -> jax.Array:
-    return jnp.sqrt(family.shape) / family.rate
+center.register(Gamma, lambda f: f.shape / f.rate)
+standard_deviation.register(Gamma, lambda f: jnp.sqrt(f.shape) / f.rate)
 
 
 def _with_variance(family: Gamma, variance: jax.Array) -> Gamma:
@@ -510,9 +508,9 @@ def _with_variance(family: Gamma, variance: jax.Array) -> Gamma:
     return Gamma(jnp.square(mean) / variance, mean / variance)
 
 
-@widen.register
-def _(family: Gamma, variance: jax.Array | float) -> Gamma:
-    return _with_variance(family, jnp.square(standard_deviation(family)) + variance)
+widen.register(
+    Gamma, lambda f, variance: _with_variance(f, jnp.square(standard_deviation(f)) + variance)
+)
 
 
 @at_least.register

@@ -42,7 +42,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,15 +56,21 @@ from jaxltl.algos.cce._elites import (
     rows_of,
     select,
 )
-from jaxltl.algos.cce._evaluation import evaluate_all
 from jaxltl.algos.cce.assessment import Assessment, Result, assess, require_run, result
-from jaxltl.algos.cce.problem import Problem, make_problem
-from jaxltl.algos.cce.state import WEIGHTINGS, Hparams, Metrics, State
+from jaxltl.algos.cce.state import (
+    WEIGHTINGS,
+    Hparams,
+    Metrics,
+    Problem,
+    State,
+    evaluate_all,
+    make_problem,
+)
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.schedules import SLACK, Polynomial as Polynomial, at, is_schedule
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import require_key
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Status, require_shape
 from jaxltl.core.validation import Range
 
@@ -91,7 +96,7 @@ __all__ = [
 ]
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """The first distribution, without samples."""
     _check(problem, hparams)
     require_key(key)

@@ -1,25 +1,158 @@
-"""Hyperparameters, state and metrics of the cross-entropy method."""
+"""Constrained search problems, hyperparameters, state and metrics of the cross-entropy method."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from functools import partial
 
 import jax
-from jaxltl.core import struct
+import jax.numpy as jnp
+import numpy as np
 from jax.sharding import NamedSharding
+from numpy.typing import ArrayLike
 
+from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._elites import Sample
 from jaxltl.algos.common.schedules import Polynomial as Polynomial, Schedule
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
+from jaxltl.core import struct, validation
+from jaxltl.core.environments.environment import as_partial
+from jaxltl.core.models.mesh import lanes
+from jaxltl.core.models.protocols import Array, Key, PyTree
+from jaxltl.core.types import require_shape
 from jaxltl.core.validation import Range
+
+
+def per_cost(name: str, value: ArrayLike, num_costs: int) -> np.ndarray:
+    """One number for each cost, broadcast from a scalar."""
+    value = validation.float_array(name, value)
+    if value.ndim:
+        require_shape(name, value, (num_costs,))
+    return np.broadcast_to(value, (num_costs,))
+
+
+def split(value: PyTree) -> tuple[jax.Array, jax.Array]:
+    """The objective and costs ``[C]`` in the result of ``evaluate``."""
+    if isinstance(value, tuple | list):
+        if len(value) != 2:
+            raise ValueError(
+                f"evaluate returned {len(value)} things; return (objective, cost), or the "
+                "objective alone."
+            )
+        objective, cost = map(jnp.asarray, value)
+    else:
+        objective, cost = jnp.asarray(value), jnp.zeros((0,))
+    if objective.shape != ():
+        raise ValueError(
+            f"evaluate returned an objective of shape {objective.shape}; it is called with one "
+            "policy at a time and returns one number, shape ()."
+        )
+    if cost.ndim > 1:
+        raise ValueError(
+            f"evaluate returned a cost of shape {cost.shape}; return a number or one axis of "
+            "costs, [C]."
+        )
+    return objective, jnp.atleast_1d(cost)
+
+
+def evaluate_all(
+    problem: PyTree, hparams: PyTree, samples: jax.Array, key: Key
+) -> tuple[jax.Array, jax.Array]:
+    """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
+    keys = jax.random.split(key, len(samples))
+    samples, keys = lanes.split_axis((samples, keys), hparams.sharding)
+    found = jax.vmap(partial(scores, problem))(samples, keys)
+    # Every device ranks them all, in one order of operations.
+    return lanes.replicate(found, hparams.sharding)
+
+
+def scores(problem: PyTree, parameters: jax.Array, key: Key) -> tuple[jax.Array, jax.Array]:
+    """Objective and costs ``[C]`` of one evaluation."""
+    objective, cost = split(problem.evaluate(parameters, key))
+    require_shape("the cost that evaluate returned", cost, problem.limit.shape)
+    return objective.astype(parameters.dtype), cost.astype(parameters.dtype)
+
+
+@struct.dataclass
+class Problem:
+    """A constrained search problem; made by :func:`make_problem`.
+
+    Attributes:
+      evaluate: ``(float[D], key) -> (objective, cost)``, a pytree.
+      family: the first distribution of policies.
+      limit: ``float[C]``, bounds on the costs.
+      scale: ``float[C]``, divisors of violations, which make constraints comparable.
+    """
+
+    evaluate: Callable[..., PyTree]
+    family: PyTree
+    limit: jax.Array
+    scale: jax.Array
+
+
+def make_problem(
+    evaluate: Callable[..., PyTree],
+    family: PyTree,
+    *,
+    limit: Array | float | None = None,
+    scale: Array | float | None = None,
+) -> Problem:
+    """A checked :class:`Problem`, on the host.
+
+    Args:
+      evaluate: ``(parameters float[D], key) -> (objective, cost)`` of one policy, with a scalar
+        objective and a cost ``float[]`` or ``float[C]``; or only the objective, without constraints.
+        Pass arrays by ``jax.tree_util.Partial(function, *arrays)``: closures are compiled in.
+      family: the first distribution, such as ``diagonal_gaussian(mean, std)``.
+      limit: bound on the cost, a number or ``float[C]``; infinite for none. None: no constraint.
+      scale: divisors of violations, a number or ``float[C]``; default ``|limit|``, or 1 where that is
+        zero or infinite. Without effect for one cost.
+
+    Raises:
+      ValueError: evaluate returns other shapes, or a limit or scale is invalid.
+
+    >>> family = families.diagonal_gaussian(jnp.zeros(2), 1.0)
+    >>> make_problem(lambda x, key: (-jnp.sum(x**2), x[0]), family, limit=0.5).scale.tolist()
+    [0.5]
+    """
+    evaluate = as_partial(evaluate, "evaluate")
+    try:
+        point = families.center(family)
+    except TypeError as problem:
+        raise ValueError(f"family: {problem}") from None
+    shapes = jax.eval_shape(lambda e, x, k: split(e(x, k)), evaluate, point, jax.random.key(0))
+    num_costs = shapes[1].shape[0]
+    if num_costs == 0 and limit is not None:
+        raise ValueError(
+            f"limit={limit}, but evaluate returns no cost; return (objective, cost), or give no "
+            "limit."
+        )
+    if num_costs > 1 and limit is not None and np.ndim(limit) == 0:
+        raise ValueError(
+            f"limit={limit}, but evaluate returns {num_costs} costs; give one limit for each, "
+            f"float[{num_costs}], infinite where there is none."
+        )
+    limits = per_cost("limit", math.inf if limit is None else limit, num_costs)
+    if np.isnan(limits).any() or (limits == -np.inf).any():
+        raise ValueError(
+            f"limit={limits.tolist()}; no cost is at most NaN or minus infinity: give numbers, or "
+            "infinity for no limit."
+        )
+    if scale is None:
+        size = np.abs(limits)
+        scale = np.where((size > 0) & np.isfinite(size), size, 1.0)
+    scales = per_cost("scale", scale, num_costs)
+    if not ((scales > 0) & np.isfinite(scales)).all():
+        raise ValueError(f"scale={scales.tolist()}; it must be positive and finite.")
+    return Problem(
+        evaluate, family, jnp.asarray(limits, point.dtype), jnp.asarray(scales, point.dtype)
+    )
+
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced, None is static.
@@ -69,7 +202,6 @@ class Hparams:
     sharding: NamedSharding | None = struct.field(pytree_node=False, default=None)
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class State:
     """A distribution of policies, and the best samples.
@@ -100,8 +232,7 @@ class State:
     status: jax.Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of a step; scalars unless a shape is given.
 

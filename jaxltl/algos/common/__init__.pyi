@@ -2,7 +2,6 @@ from . import (
     actor_critic as actor_critic,
     checkpoint as checkpoint,
     chunks as chunks,
-    early_stopping as early_stopping,
     learner as learner,
     pac as pac,
     schedules as schedules,

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import jax
 import numpy as np
 
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.array_types import PyTree
 
 Write = Callable[[Path], contextlib.AbstractContextManager[BinaryIO]]
 
@@ -112,8 +112,7 @@ class Parts:
         for first, last, file, name in stored.pieces:
             low, high = np.maximum(begin, first), np.minimum(end, last)
             if (low < high).all():
-                piece = self._piece(file, name)
-                found[_block(low, high, begin)] = piece[_block(low, high, first)]
+                found[_block(low, high, begin)] = self._piece(file, name)[_block(low, high, first)]
         return found
 
     def _piece(self, file: str, name: str) -> np.ndarray:

@@ -7,14 +7,13 @@ it: clipped, or squashed by a hyperbolic tangent.
 
 from __future__ import annotations
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Box, Finite, clipped_action
-from jaxltl.core.models.protocols import PyTree
 
 Actions = Finite | Box
 SQUASHES = ("clip", "tanh")
@@ -24,9 +23,7 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(16)
 _WEIGHTS = _WEIGHTS / np.sqrt(2 * np.pi)
 
 
-def noise(
-    key: chex.PRNGKey, shape: tuple[int, ...], actions: Actions, dtype: DTypeLike
-) -> jax.Array:
+def noise(key: Key, shape: tuple[int, ...], actions: Actions, dtype: DTypeLike) -> jax.Array:
     """Gumbel or normal noise of a batch of actions."""
     if isinstance(actions, Finite):
         return jax.random.gumbel(key, (*shape, actions.num), dtype)
@@ -58,7 +55,7 @@ def as_action(actions: Actions, raw: jax.Array, squash: str | None) -> jax.Array
 
 
 def chosen(
-    key: chex.PRNGKey,
+    key: Key,
     actions: Actions,
     parameters: PyTree,
     allowed: jax.Array | None,

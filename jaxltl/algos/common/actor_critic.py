@@ -1,27 +1,26 @@
 """Actor-critic networks for finitely many actions or a box, with or without memory.
 
-Example:
-  >>> import jax, jax.numpy as jnp
-  >>> import jaxltl as jl
-  >>> from jaxltl.algos.common import actor_critic as networks
-  >>> seen = jax.ShapeDtypeStruct((3,), float)
-  >>> few = networks.default_network(jl.environments.Finite(4))
-  >>> shapes = jax.eval_shape(lambda x: few.init_with_output(jax.random.key(0), x)[0], seen)
-  >>> shapes[0].shape, shapes[1].shape  # logits, and a value
-  ((4,), ())
-  >>> box = networks.ActorCritic(shape=(2,), hidden=(8,))
-  >>> (mean, log_deviation), value = jax.eval_shape(
-  ...     lambda x: box.init_with_output(jax.random.key(0), x)[0], seen)
-  >>> mean.shape, log_deviation.shape
-  ((2,), (2,))
-  >>> recurrent = networks.RecurrentActorCritic(num_actions=4, memory=5)
-  >>> memory = networks.initial_memory(recurrent)
-  >>> memory.shape
-  (5,)
-  >>> parameters = jax.eval_shape(
-  ...     lambda x: networks.fresh_parameters(jax.random.key(0), recurrent, memory, x), seen)
-  >>> "actor" in parameters and "critic" in parameters
-  True
+>>> import jax, jax.numpy as jnp
+>>> import jaxltl as jl
+>>> from jaxltl.algos.common import actor_critic as networks
+>>> seen = jax.ShapeDtypeStruct((3,), float)
+>>> few = networks.default_network(jl.environments.Finite(4))
+>>> shapes = jax.eval_shape(lambda x: few.init_with_output(jax.random.key(0), x)[0], seen)
+>>> shapes[0].shape, shapes[1].shape  # logits, and a value
+((4,), ())
+>>> box = networks.ActorCritic(shape=(2,), hidden=(8,))
+>>> (mean, log_deviation), value = jax.eval_shape(
+...     lambda x: box.init_with_output(jax.random.key(0), x)[0], seen)
+>>> mean.shape, log_deviation.shape
+((2,), (2,))
+>>> recurrent = networks.RecurrentActorCritic(num_actions=4, memory=5)
+>>> memory = networks.initial_memory(recurrent)
+>>> memory.shape
+(5,)
+>>> parameters = jax.eval_shape(
+...     lambda x: networks.fresh_parameters(jax.random.key(0), recurrent, memory, x), seen)
+>>> "actor" in parameters and "critic" in parameters
+True
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -39,8 +37,8 @@ from jax.typing import DTypeLike
 
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Box, Finite, flat_observation
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -82,7 +80,7 @@ def orthogonal(scale: float) -> Callable[..., jax.Array]:
     (3, 2)
     """
 
-    def start(key: chex.PRNGKey, shape: Sequence[int], dtype: DTypeLike | None = None) -> jax.Array:
+    def start(key: Key, shape: Sequence[int], dtype: DTypeLike | None = None) -> jax.Array:
         rows, columns = shape
         most, least = max(rows, columns), min(rows, columns)
         drawn = jax.random.normal(key, (least, most), dtype)
@@ -125,19 +123,6 @@ class _Layers(nn.Module):
         return dense(self.outputs, self.last_scale, "out")(x)
 
 
-def _heads(module: ActorCritic | RecurrentActorCritic, x: jax.Array) -> tuple[PyTree, jax.Array]:
-    """Action parameters and value, by two networks that share nothing."""
-    hidden = tuple(module.hidden)
-    outputs = module.num_actions or int(np.prod(module.shape))
-    scores = _Layers(hidden, outputs, 0.01, module.activation, name="actor")(x)
-    value = _Layers(hidden, 1, 1.0, module.activation, name="critic")(x)[0]
-    if module.num_actions:
-        return scores, value
-    start = nn.initializers.constant(np.log(module.initial_deviation))
-    spread = module.param("log_deviation", start, tuple(module.shape), jnp.result_type(float))
-    return (scores.reshape(module.shape), spread), value
-
-
 class ActorCritic(nn.Module):
     """Two multilayer perceptrons of the flattened observation: an actor and a critic.
 
@@ -158,12 +143,32 @@ class ActorCritic(nn.Module):
     activation: str = "tanh"
     initial_deviation: float = 1.0
 
+    @property
+    def num_outputs(self) -> int:
+        """Number of logits, or of the entries of an action."""
+        return self.num_actions or int(np.prod(self.shape))
+
+    def action_parameters(self, outputs: jax.Array) -> PyTree:
+        """Logits, or mean and log standard deviation; of a compact method."""
+        if self.num_actions:
+            return outputs
+        start = nn.initializers.constant(np.log(self.initial_deviation))
+        spread = self.param("log_deviation", start, tuple(self.shape), jnp.result_type(float))
+        return outputs.reshape(self.shape), spread
+
+    def heads(self, x: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Action parameters and value, by two networks that share nothing; of a compact method."""
+        hidden = tuple(self.hidden)
+        outputs = _Layers(hidden, self.num_outputs, 0.01, self.activation, name="actor")(x)
+        value = _Layers(hidden, 1, 1.0, self.activation, name="critic")(x)[0]
+        return self.action_parameters(outputs), value
+
     @nn.compact
     def __call__(self, observation: PyTree) -> tuple[PyTree, jax.Array]:
-        return _heads(self, flat_observation(observation))
+        return self.heads(flat_observation(observation))
 
 
-class RecurrentActorCritic(nn.Module):
+class RecurrentActorCritic(ActorCritic):
     """A dense layer and a gated recurrent unit, with the heads of :class:`ActorCritic` on its memory.
 
     Attributes:
@@ -171,19 +176,17 @@ class RecurrentActorCritic(nn.Module):
       memory: size of the memory.
     """
 
-    num_actions: int = 0
-    shape: Sequence[int] = ()
     hidden: Sequence[int] = (64,)
     memory: int = 64
-    activation: str = "tanh"
-    initial_deviation: float = 1.0
 
     def initial_memory(self) -> jax.Array:
         """``float[memory]``, zeros."""
         return jnp.zeros(self.memory, jnp.result_type(float))
 
     @nn.compact
-    def __call__(self, memory: jax.Array, observation: PyTree) -> tuple[jax.Array, PyTree]:
+    def __call__(  # type: ignore[override]
+        self, memory: jax.Array, observation: PyTree
+    ) -> tuple[jax.Array, PyTree]:
         x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
         cell = nn.GRUCell(
@@ -193,7 +196,7 @@ class RecurrentActorCritic(nn.Module):
             name="cell",
         )
         memory, x = cell(memory, x)
-        return memory, _heads(self, x)
+        return memory, self.heads(x)
 
 
 def default_network(actions: Finite | Box) -> ActorCritic:
@@ -259,9 +262,7 @@ def evaluated(
     return Output(memory, action, value)
 
 
-def fresh_parameters(
-    key: chex.PRNGKey, network: nn.Module, memory: PyTree, observation: PyTree
-) -> PyTree:
+def fresh_parameters(key: Key, network: nn.Module, memory: PyTree, observation: PyTree) -> PyTree:
     """The random initial parameters of a `network`, of a `key`, a dict of dicts of arrays.
 
     Of the initial `memory`, ``()`` without, and one `observation` only the shapes matter.
@@ -284,9 +285,8 @@ def require_network(
     Raises:
       ValueError: with the shapes returned and expected.
 
-    Example:
-      >>> seen, logits = jax.ShapeDtypeStruct((3,), float), jax.ShapeDtypeStruct((2,), float)
-      >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)
+    >>> seen, logits = jax.ShapeDtypeStruct((3,), float), jax.ShapeDtypeStruct((2,), float)
+    >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)
     """
     recurrent = bool(jax.tree.leaves(memory))
     read = (memory, observation) if recurrent else (observation,)
@@ -311,8 +311,7 @@ def require_network(
     def shapes(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda x: x.shape, tree)
 
-    action = space.shape if finite else (space.shape, space.shape)
-    expected: PyTree = (action, ())
+    expected: PyTree = (space.shape if finite else (space.shape, space.shape), ())
     if recurrent:
         expected = (shapes(memory), expected)
     if shapes(found) != expected:

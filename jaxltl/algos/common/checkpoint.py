@@ -5,16 +5,15 @@ every array, and every static field. A checkpoint of another problem is refused 
 agree. Arrays on the devices of several processes are written in parts, one by each process, and
 read onto any other mesh by any number of processes.
 
-Example:
-  >>> import os, tempfile
-  >>> import numpy as np
-  >>> from jaxltl.algos.common import checkpoint
-  >>> path = os.path.join(tempfile.mkdtemp(), "state.npz")
-  >>> state, given = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
-  >>> checkpoint.save(path, state, given)
-  >>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
-  3
-  >>> checkpoint.remove(path)
+>>> import os, tempfile
+>>> import numpy as np
+>>> from jaxltl.algos.common import checkpoint
+>>> path = os.path.join(tempfile.mkdtemp(), "state.npz")
+>>> state, given = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
+>>> checkpoint.save(path, state, given)
+>>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
+3
+>>> checkpoint.remove(path)
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos.common import _checkpoint_parts as parts
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.protocols import PyTree
 
 _GIVEN = "given"  # the fingerprint's name in the file
 _PARTS = "parts"  # name of the index of arrays in other files
@@ -174,8 +173,7 @@ def _array_of(leaf: PyTree) -> PyTree:
 
 
 def _data(leaf: jax.Array) -> jax.Array:
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
 
 # --- fingerprints ---------------------------------------------------------------------------

@@ -35,14 +35,13 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import checkpoint as files
-from jaxltl.algos.common._run_over_mesh import run_over_mesh
 from jaxltl.algos.common.loops import Progress, Step, Until, block_lengths, run_blocks
 from jaxltl.algos.common.settings import require_hparams
 from jaxltl.algos.common.trees import either, strong
 from jaxltl.core import validation
-from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.array_types import PyTree
+from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.protocols import PyTree
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +112,7 @@ def run_in_chunks(
     """
     lanes, until = validation.boolean("lanes", options.lanes), options.until
     chunk = options.chunk or max(options.max_rows, -(-num_steps // 100))
-    checkpoint, mesh = options.checkpoint, options.mesh
+    checkpoint = options.checkpoint
     num_lanes = len(state.step) if lanes else None
     require_hparams(hparams, batched=lanes)
     hparams = _spread(hparams, state) if lanes else hparams
@@ -129,10 +128,10 @@ def run_in_chunks(
     single = _progress_step(step, options.keep)
     if not lanes:
         advance = partial(run_blocks, single)
-    elif mesh is None:
+    elif options.mesh is None:
         advance = partial(_run_lanes, single)
     else:
-        advance = run_over_mesh(mesh, run_blocks, single)
+        advance = _run_over_mesh(options.mesh, single)
     ended, made = on_host((now.done, now.count))
     while made.max() < num_steps and not ended.all():
         lengths = block_lengths(min(chunk, num_steps - int(made.max())), options.max_rows)
@@ -239,3 +238,19 @@ def _spread(hparams: PyTree, state: PyTree) -> PyTree:
         return np.broadcast_to(x, (size, *x.shape[1:]))
 
     return to_jax(jax.tree.map(one, hparams))
+
+
+def _run_over_mesh(mesh: Mesh, step: Step) -> Callable[..., tuple[PyTree, PyTree]]:
+    """Blocks of steps of lanes over the devices of a mesh, with metrics on the host."""
+    lanes = vmap_over_mesh(_blocks_of(step), mesh, in_axes=(0, None, (0, None), None))
+
+    def advance(*given: PyTree) -> tuple[PyTree, PyTree]:
+        state, rows = lanes(*given)
+        return state, jax.tree.map(lambda x: np.swapaxes(x, 0, 1), on_host(rows))
+
+    return advance
+
+
+@cache  # compiled once for each step, so it must stay the same function
+def _blocks_of(step: Step) -> Callable[..., PyTree]:
+    return partial(run_blocks, step)

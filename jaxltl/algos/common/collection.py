@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
+from jaxltl.core.array_types import Key, Numeric, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, allowed_in
 
 CarryT = TypeVar("CarryT")
 FiguresT = TypeVar("FiguresT")
-Evaluate = Callable[[chex.ArrayTree, chex.ArrayTree], Output]
+Evaluate = Callable[[PyTree, PyTree], Output]
 
 
 class Transition(NamedTuple):
@@ -26,8 +26,8 @@ class Transition(NamedTuple):
     and `last` the observation after it.
     """
 
-    observation: chex.ArrayTree
-    memory: chex.ArrayTree
+    observation: PyTree
+    memory: PyTree
     allowed: jax.Array | None
     raw: jax.Array
     log_density: jax.Array
@@ -36,25 +36,24 @@ class Transition(NamedTuple):
     discount: jax.Array
     terminated: jax.Array
     truncated: jax.Array
-    last: chex.ArrayTree
+    last: PyTree
 
 
 def transition(
     environment: Environment,
     evaluate: Evaluate,
     squash: str | None,
-    before: tuple[chex.ArrayTree, chex.ArrayTree],
+    before: tuple[PyTree, PyTree],
     noise: jax.Array | None,
-    key: chex.PRNGKey,
-) -> tuple[chex.ArrayTree, chex.ArrayTree, Transition]:
+    key: Key,
+) -> tuple[PyTree, PyTree, Transition]:
     """World and memory after one transition of one environment, and its record."""
     world, memory = before
     observation, allowed = environment.observe(world), allowed_in(environment, world)
     output, actions = evaluate(memory, observation), environment.actions
     raw = actions_of.drawn(actions, output.action, allowed, noise)
     density = actions_of.log_density(actions, output.action, allowed, raw)
-    action = actions_of.as_action(actions, raw, squash)
-    after = Timestep(*environment.step(world, action, key))
+    after = Timestep(*environment.step(world, actions_of.as_action(actions, raw, squash), key))
     return (
         after.world,
         output.memory,
@@ -78,9 +77,9 @@ def generalized_advantages(
     reward: jax.Array,
     value: jax.Array,
     following: jax.Array,
-    discount: chex.Numeric,
-    gae_lambda: chex.Numeric,
-    ended: chex.Numeric = False,
+    discount: Numeric,
+    gae_lambda: Numeric,
+    ended: Numeric = False,
 ) -> jax.Array:
     """Generalised advantages (Schulman et al. 2016, equation 16) of consecutive episodes.
 
@@ -102,9 +101,9 @@ def masked_advantages(
     signal: jax.Array,
     value: jax.Array,
     valid: jax.Array,
-    discount: chex.Numeric,
-    gae_lambda: chex.Numeric,
-    last: chex.Numeric = 0.0,
+    discount: Numeric,
+    gae_lambda: Numeric,
+    last: Numeric = 0.0,
 ) -> jax.Array:
     """Generalised advantages, a trajectory for each column; zero where `valid` is false."""
     value = jnp.where(valid, value, 0)
@@ -116,7 +115,7 @@ def masked_advantages(
 
 
 def minibatch_epochs(
-    key: chex.PRNGKey,
+    key: Key,
     update: Callable[[CarryT, jax.Array], tuple[CarryT, FiguresT]],
     carry: CarryT,
     size: int,
@@ -127,7 +126,7 @@ def minibatch_epochs(
     """The carry after epochs of updates on shuffled minibatches of `size` indices, and figures."""
     used = size - size % num_minibatches
 
-    def epoch(carry: CarryT, key: chex.PRNGKey) -> tuple[CarryT, FiguresT]:
+    def epoch(carry: CarryT, key: Key) -> tuple[CarryT, FiguresT]:
         order = jax.random.permutation(key, size)[:used]
         return lax.scan(update, carry, order.reshape(num_minibatches, -1))
 

@@ -49,7 +49,6 @@ import inspect
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -57,7 +56,9 @@ from jax.tree_util import Partial
 from jaxltl.algos.common import loops
 from jaxltl.algos.common.loops import MAX_STEPS, Learned, Until
 from jaxltl.algos.common.settings import HasStatus, flag_invalid, require_hparams
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.algos.common.trees import choose
+from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status
 
@@ -66,7 +67,7 @@ class HasStep(Protocol):
     """A learner's state."""
 
     @property
-    def key(self) -> chex.PRNGKey:
+    def key(self) -> Key:
         """Root key of the run."""
 
     @property
@@ -95,7 +96,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
     A hyperparameter out of range is a ValueError; a traced one gives the status INVALID.
     """
 
-    def init(self, key: chex.PRNGKey, problem: ProblemIn, hparams: HparamsIn) -> StateT:
+    def init(self, key: Key, problem: ProblemIn, hparams: HparamsIn) -> StateT:
         """The state before the first step, of a random key, which it keeps.
 
         Raises:
@@ -143,7 +144,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
 
     def train(
         self,
-        key: chex.PRNGKey,
+        key: Key,
         problem: ProblemIn,
         hparams: HparamsIn,
         *,
@@ -168,7 +169,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         hparams: HparamsIn,
         *,
         until: Until[StateT, MetricsOut],
-        num_steps: chex.Numeric,
+        num_steps: Numeric,
         check_every: int = 1,
         keep: str = "after",
     ) -> Learned:
@@ -195,12 +196,12 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
 
     def train_until(
         self,
-        key: chex.PRNGKey,
+        key: Key,
         problem: ProblemIn,
         hparams: HparamsIn,
         *,
         until: Until[StateT, MetricsOut],
-        num_steps: chex.Numeric,
+        num_steps: Numeric,
         check_every: int = 1,
         keep: str = "after",
     ) -> Learned:
@@ -230,7 +231,7 @@ class Bound(NamedTuple, Generic[ProblemT, HparamsT, StateT, MetricsT]):
       run_until, train_until: the same until a condition holds.
     """
 
-    init: Callable[[chex.PRNGKey, ProblemT, HparamsT], StateT]
+    init: Callable[[Key, ProblemT, HparamsT], StateT]
     step: Callable[[StateT, ProblemT, HparamsT], tuple[StateT, MetricsT]]
     run: Callable[..., tuple[StateT, MetricsT]]
     train: Callable[..., tuple[StateT, MetricsT]]
@@ -239,7 +240,7 @@ class Bound(NamedTuple, Generic[ProblemT, HparamsT, StateT, MetricsT]):
 
 
 def bind(
-    init: Callable[[chex.PRNGKey, ProblemT, HparamsT], StateT],
+    init: Callable[[Key, ProblemT, HparamsT], StateT],
     step: Callable[[StateT, ProblemT, HparamsT], tuple[StateT, MetricsT]],
     *,
     step_if: Callable[..., tuple[StateT, MetricsT]] | None = None,
@@ -265,7 +266,7 @@ def bind(
     checked_step = checked(step)
     early = checked_step if step_if is None else checked(step_if)
 
-    def checked_init(key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT) -> StateT:
+    def checked_init(key: Key, problem: ProblemT, hparams: HparamsT) -> StateT:
         require_hparams(hparams)
         return init(key, problem, hparams)
 
@@ -275,7 +276,7 @@ def bind(
         return loops.run(checked_step, state, problem, hparams, **options)
 
     def train(
-        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: object
+        key: Key, problem: ProblemT, hparams: HparamsT, **options: object
     ) -> tuple[StateT, MetricsT]:
         return run(checked_init(key, problem, hparams), problem, hparams, **options)
 
@@ -285,15 +286,13 @@ def bind(
         hparams: HparamsT,
         *,
         until: Until[StateT, MetricsT],
-        num_steps: chex.Numeric,
+        num_steps: Numeric,
         **options: Any,
     ) -> Learned:
         options = {"keep": keep, "idle": step_if is not None, **options}
         return loops.run_until(early, state, (problem, hparams, until, num_steps), **options)
 
-    def train_until(
-        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
-    ) -> Learned:
+    def train_until(key: Key, problem: ProblemT, hparams: HparamsT, **options: Any) -> Learned:
         return run_until(checked_init(key, problem, hparams), problem, hparams, **options)
 
     functions = Bound(checked_init, checked_step, run, train, run_until, train_until)
@@ -311,7 +310,7 @@ def bind(
 # --- statuses, random keys and counters ---------------------------------------------------------------
 
 
-def completion_status(completed: chex.Array, finite: chex.Array) -> jax.Array:
+def completion_status(completed: Array, finite: Array) -> jax.Array:
     """The status of a step: NONFINITE unless `finite`, else COMPLETED or MAX_STEPS by `completed`.
 
     COMPLETED certifies nothing.
@@ -323,7 +322,7 @@ def completion_status(completed: chex.Array, finite: chex.Array) -> jax.Array:
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 
-def init_key(key: chex.PRNGKey) -> chex.PRNGKey:
+def init_key(key: Key) -> Key:
     """The random key of ``init``: `key` with a number folded in that no step reaches.
 
     >>> init_key(jax.random.key(0)).shape
@@ -332,7 +331,7 @@ def init_key(key: chex.PRNGKey) -> chex.PRNGKey:
     return jax.random.fold_in(key, 0xFFFFFFFF)
 
 
-def step_key(state: HasStep) -> chex.PRNGKey:
+def step_key(state: HasStep) -> Key:
     """The random key of the next step: the root key of `state` with its number of steps folded in.
 
     >>> from types import SimpleNamespace
@@ -342,37 +341,20 @@ def step_key(state: HasStep) -> chex.PRNGKey:
     return jax.random.fold_in(state.key, state.step)
 
 
-def saturating_add(total: jax.Array, increment: chex.Numeric) -> jax.Array:
+def saturating_add(total: jax.Array, increment: Numeric) -> jax.Array:
     """The sum `total` + `increment` of counters ``int32``, at most ``2 ** 31 - 1``.
 
     >>> saturating_add(jnp.int32(5), 3).item()
     8
     """
     increment = jnp.asarray(increment, jnp.int32)
-    saturated = total > MAX_STEPS - increment
-    return jnp.where(saturated, MAX_STEPS, total + increment).astype(jnp.int32)
+    return jnp.where(total > MAX_STEPS - increment, MAX_STEPS, total + increment).astype(jnp.int32)
 
 
 # --- stopping conditions --------------------------------------------------------------------
 
 
-class HasStopped(Protocol):
-    """A state of a learner with early stopping."""
-
-    @property
-    def stopped(self) -> jax.Array:
-        """``bool[]``."""
-
-
-class HasGradientNorm(Protocol):
-    """Metrics of a learner that descends along gradients."""
-
-    @property
-    def gradient_norm(self) -> jax.Array:
-        """``float[]``."""
-
-
-def has_stopped(before: HasStopped, after: HasStopped, metrics: object) -> jax.Array:
+def has_stopped(before: PyTree, after: PyTree, metrics: PyTree) -> jax.Array:
     """The stopping condition of early stopping: ``after.stopped``; `before`, `metrics` are unused.
 
     >>> from types import SimpleNamespace
@@ -382,7 +364,7 @@ def has_stopped(before: HasStopped, after: HasStopped, metrics: object) -> jax.A
     return after.stopped
 
 
-def gradient_vanishes(tolerance: chex.Numeric) -> Until[object, HasGradientNorm]:
+def gradient_vanishes(tolerance: Numeric) -> Until[PyTree, PyTree]:
     """A stopping condition for ``run_until``: the gradient's norm is at most `tolerance`.
 
     >>> from types import SimpleNamespace
@@ -393,6 +375,43 @@ def gradient_vanishes(tolerance: chex.Numeric) -> Until[object, HasGradientNorm]
 
 
 def _gradient_vanishes(
-    tolerance: chex.Numeric, before: object, after: object, metrics: HasGradientNorm
+    tolerance: Numeric, before: PyTree, after: PyTree, metrics: PyTree
 ) -> jax.Array:
     return metrics.gradient_norm <= tolerance
+
+
+@struct.dataclass
+class Best:
+    """The parameters with the best held-out likelihood; without held-out data the newest.
+
+    Attributes:
+      parameters, step: of the network, a pytree, and steps made until then, ``int32[]``.
+      neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
+    """
+
+    parameters: PyTree
+    neg_log_likelihood: jax.Array
+    step: jax.Array
+
+
+def stop_early(
+    state: PyTree, after: PyTree, held_out: jax.Array, judged: jax.Array, patience: Numeric
+) -> tuple[Best, jax.Array]:
+    """The :class:`Best` parameters so far, and ``bool[]``, whether patience has run out.
+
+    Of the `state` before a step, with ``parameters``, ``step``, ``best`` and ``stopped``; the
+    parameters `after` it; their predecessors' negative log-likelihood `held_out`, ``float[]``; `judged`,
+    True with held-out data; and `patience`, in steps.
+
+    >>> from types import SimpleNamespace
+    >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
+    >>> state = SimpleNamespace(
+    ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
+    >>> stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)[1].item()
+    True
+    """
+    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
+    best = choose(better, Best(state.parameters, held_out, state.step), state.best)
+    newest = Best(after, jnp.full_like(held_out, jnp.nan), state.step + 1)
+    stopped = state.stopped | (judged & (state.step - best.step >= patience))
+    return choose(judged, best, newest), stopped

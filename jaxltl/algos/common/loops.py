@@ -7,19 +7,17 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common.settings import require_arrays, require_hparams
 from jaxltl.algos.common.trees import choose
+from jaxltl.core import struct, validation
 from jaxltl.core.models.mesh.cores import over_cores
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.models.protocols import Array, Numeric, PyTree
 from jaxltl.core.types import Status, worst
 
 ProblemT = TypeVar("ProblemT")
@@ -30,7 +28,7 @@ CarryT = TypeVar("CarryT")
 GivenT = TypeVar("GivenT")
 
 Step = Callable[[StateT, ProblemT, HparamsT], tuple[StateT, MetricsT]]
-Until = Callable[[StateT, StateT, MetricsT], chex.Numeric]
+Until = Callable[[StateT, StateT, MetricsT], Numeric]
 
 MAX_STEPS = np.iinfo(np.int32).max  # counters of steps are int32
 
@@ -45,14 +43,8 @@ def run(
     max_rows: int = 1000,
 ) -> tuple[StateT, MetricsT]:
     """:meth:`~jaxltl.algos.common.learner.Learner.run` of a learner with this `step`."""
-    num_steps, max_rows = (
-        x if isinstance(x, int) else validation.integer(name, x, least=1)
-        for name, x in (("num_steps", num_steps), ("max_rows", max_rows))
-    )
-    if num_steps < 1 or max_rows < 1:
-        raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
-    if num_steps > MAX_STEPS:
-        raise ValueError(f"num_steps={num_steps}; it must be at most {MAX_STEPS}.")
+    num_steps = validation.integer("num_steps", num_steps, least=1, most=MAX_STEPS)
+    max_rows = validation.integer("max_rows", max_rows, least=1)
     require_arrays(state=state, problem=problem, hparams=hparams)
     require_hparams(hparams)
     return run_blocks(step, state, problem, hparams, block_lengths(num_steps, max_rows))
@@ -72,7 +64,7 @@ def run_blocks(
     state: StateT,
     problem: ProblemT,
     hparams: HparamsT,
-    lengths: chex.Array,
+    lengths: Array,
 ) -> tuple[StateT, MetricsT]:
     """Blocks of steps as one program; returns the metrics of each block's last step."""
     return over_cores(partial(_blocks, step), state, problem, hparams, lengths)
@@ -101,7 +93,6 @@ def _zero_metrics(step: Callable[..., tuple[PyTree, MetricsT]], *arguments: PyTr
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class Learned:
     """Result of a run with a stopping condition; ``check`` accepts it.
@@ -129,7 +120,7 @@ class Learned:
 def run_until(
     step: Callable[..., tuple[StateT, MetricsT]],
     state: StateT,
-    given: tuple[ProblemT, HparamsT, Until[StateT, MetricsT], chex.Numeric],
+    given: tuple[ProblemT, HparamsT, Until[StateT, MetricsT], Numeric],
     *,
     check_every: int = 1,
     keep: str = "after",
@@ -173,8 +164,7 @@ def _run_until(
     keep: str,
     idle: bool,
 ) -> Learned:
-    loop = partial(_loop, step, check_every, keep, idle)
-    return over_cores(loop, state, given)
+    return over_cores(partial(_loop, step, check_every, keep, idle), state, given)
 
 
 def _loop(

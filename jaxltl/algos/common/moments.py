@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+
 from jaxltl.core import struct
-
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.array_types import PyTree
 
 
-@brief
 @struct.dataclass
 class Moments:
     """Number ``float[]``, mean and sum of squared deviations of a stream of arrays of one shape."""
@@ -52,8 +50,7 @@ def updated_moments(
 def scale_of(moments: Moments) -> jax.Array:
     """The standard deviation; 1 where it is zero."""
     spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
-    noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
-    return jnp.where(spread > noise, spread, 1)
+    return jnp.where(spread > 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean), spread, 1)
 
 
 def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterator
 
-import chex
 import optax
+
+from jaxltl.core.array_types import Numeric, PyTree
 
 _SCALINGS = {"adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity}
 # With their own search, with a random key, deprecated.
@@ -32,7 +33,12 @@ def _names() -> Iterator[str]:
 NAMES = tuple(_names())
 
 
-def optimizer(name: str, learning_rate: chex.Numeric) -> optax.GradientTransformationExtraArgs:
+def optimizer_of(hparams: PyTree) -> optax.GradientTransformationExtraArgs:
+    """The optimizer of hyperparameters ``optimizer`` and ``learning_rate``."""
+    return optimizer(hparams.optimizer, hparams.learning_rate)
+
+
+def optimizer(name: str, learning_rate: Numeric) -> optax.GradientTransformationExtraArgs:
     """An optimizer of optax; ``"lbfgs"`` ignores the rate."""
     if name == "lbfgs":
         return optax.lbfgs()

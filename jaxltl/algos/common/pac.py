@@ -24,19 +24,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.operators import action_max
+from jaxltl.core.models.protocols import Array, Numeric
 from jaxltl.core.types import Solution, require_shape
 
 # --- the constants of algorithm 5 -------------------------------------------------------------
 
 
-def horizon(epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric) -> jax.Array:
+def horizon(epsilon: Numeric, discount: Numeric, reward_bound: Numeric) -> jax.Array:
     """The number N of moves after which all later rewards are worth at most ``epsilon / 6``.
 
     ``N = log(epsilon (1 - g)^2 / (6 R)) / log g`` for the `discount` g and the `reward_bound` R
@@ -52,10 +52,7 @@ def horizon(epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Nu
 
 
 def accuracy(
-    epsilon: chex.Numeric,
-    discount: chex.Numeric,
-    reward_bound: chex.Numeric,
-    num_states: chex.Numeric,
+    epsilon: Numeric, discount: Numeric, reward_bound: Numeric, num_states: Numeric
 ) -> jax.Array:
     """The required accuracy delta of transition probabilities (algorithm 5, line 8).
 
@@ -74,10 +71,7 @@ def accuracy(
 
 
 def hoeffding_visits(
-    deviation: chex.Numeric,
-    failure: chex.Numeric,
-    num_states: chex.Numeric,
-    num_actions: chex.Numeric,
+    deviation: Numeric, failure: Numeric, num_states: Numeric, num_actions: Numeric
 ) -> jax.Array:
     """The visits K after which all estimated probabilities are accurate at once (lemma 11).
 
@@ -97,12 +91,12 @@ def hoeffding_visits(
 
 
 def visits(
-    epsilon: chex.Numeric,
-    failure: chex.Numeric,
-    discount: chex.Numeric,
-    reward_bound: chex.Numeric,
-    num_states: chex.Numeric,
-    num_actions: chex.Numeric,
+    epsilon: Numeric,
+    failure: Numeric,
+    discount: Numeric,
+    reward_bound: Numeric,
+    num_states: Numeric,
+    num_actions: Numeric,
 ) -> jax.Array:
     """The visits K after which a pair with several successors is known (algorithm 5).
 
@@ -115,7 +109,7 @@ def visits(
     return hoeffding_visits(delta, failure / 2, num_states, num_actions)
 
 
-def action_tolerance(epsilon: chex.Numeric, discount: chex.Numeric) -> jax.Array:
+def action_tolerance(epsilon: Numeric, discount: Numeric) -> jax.Array:
     """The tolerance ``eps_1 = epsilon (1 - g) / 12`` of near-optimal actions, g the `discount`.
 
     Algorithm 5, line 8.
@@ -124,9 +118,7 @@ def action_tolerance(epsilon: chex.Numeric, discount: chex.Numeric) -> jax.Array
     return epsilon / 12 * (1 - discount)
 
 
-def exploration(
-    epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric
-) -> jax.Array:
+def exploration(epsilon: Numeric, discount: Numeric, reward_bound: Numeric) -> jax.Array:
     """The probability p of a uniformly drawn allowed action (algorithm 5, line 8).
 
     ``p = epsilon (1 - g)^3 / (12 R)``, at most 1, for the `discount` g and the `reward_bound` R.
@@ -140,10 +132,7 @@ def exploration(
 
 
 def mixing_gap(
-    probability: chex.Numeric,
-    tolerance: chex.Numeric,
-    discount: chex.Numeric,
-    reward_bound: chex.Numeric,
+    probability: Numeric, tolerance: Numeric, discount: Numeric, reward_bound: Numeric
 ) -> jax.Array:
     """The largest loss of a strategy that mixes near-optimal and arbitrary actions (lemma 7).
 
@@ -162,10 +151,7 @@ def mixing_gap(
 
 
 def hat_gap(
-    probability: chex.Numeric,
-    tolerance: chex.Numeric,
-    discount: chex.Numeric,
-    reward_bound: chex.Numeric,
+    probability: Numeric, tolerance: Numeric, discount: Numeric, reward_bound: Numeric
 ) -> jax.Array:
     """The largest loss of hat-game strategies in the optimistic model (lemma 8).
 
@@ -177,11 +163,11 @@ def hat_gap(
 
 
 def approximation_gap(
-    deviation: chex.Numeric,
-    num_states: chex.Numeric,
-    num_steps: chex.Numeric,
-    discount: chex.Numeric,
-    reward_bound: chex.Numeric,
+    deviation: Numeric,
+    num_states: Numeric,
+    num_steps: Numeric,
+    discount: Numeric,
+    reward_bound: Numeric,
 ) -> jax.Array:
     """The largest change of an N-step value by inexact probabilities (lemma 12).
 
@@ -199,7 +185,7 @@ def approximation_gap(
     return deviation * num_steps * num_states * reward_bound / rest / rest
 
 
-def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Numeric) -> jax.Array:
+def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: Numeric) -> jax.Array:
     """The states in which a strategy is certified to be `epsilon`-optimal: ``bool[S]``.
 
     ``value.lower >= optimal.upper - epsilon`` for the certified bounds of the `optimal` value
@@ -217,7 +203,7 @@ def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Num
 # --- the strategy -------------------------------------------------------------------------------
 
 
-def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) -> jax.Array:
+def near_optimal(q: Array, allowed: Array, tolerance: Numeric) -> jax.Array:
     """The `allowed` actions within a `tolerance` of the best one: ``bool[S, A]``.
 
     ``A*(s) = {a : max_b Q(s, b) - Q(s, a) <= tolerance}`` (definition 5) for action values `q`,
@@ -234,7 +220,7 @@ def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) ->
     return allowed & ((best - q <= tolerance) | (q == best))
 
 
-def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeric) -> jax.Array:
+def hat_strategy(near: Array, allowed: Array, exploration: Numeric) -> jax.Array:
     """The mixture of uniform strategies over allowed and near-optimal actions: ``float[S, A]``.
 
     ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near(s))`` with p the `exploration`
@@ -250,7 +236,7 @@ def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeri
     return p * _uniform(allowed) + (1 - p) * _uniform(near)
 
 
-def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
+def hat_game(game: Game, near: Array, exploration: Numeric) -> Game:
     """The hat game, every strategy of which mostly plays near-optimal actions (algorithm 4).
 
     A system state s has one action, number A, which draws a copy of s: with probability p, the
@@ -259,17 +245,13 @@ def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
     take an additional move at each system state of `game`, so discounted values do not carry over,
     but almost-sure winning does (lemma 9).
 
-    Returns:
-      A Game with ``3 S`` states, ``A + 1`` actions and at least two successors.
-
     Raises:
       ValueError: the game's model is not an MDP, or `near` has the wrong shape.
 
-    Example:
-      >>> from jaxltl import from_dense
-      >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
-      >>> hat_game(game, jnp.array([[False, True]]), 0.25).available.tolist()
-      [[False, False, True], [True, True, False], [False, True, False]]
+    >>> from jaxltl import from_dense
+    >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
+    >>> hat_game(game, jnp.array([[False, True]]), 0.25).available.tolist()
+    [[False, False, True], [True, True, False], [False, True, False]]
     """
     mdp = game.mdp
     if not isinstance(mdp, MDP):
@@ -307,7 +289,7 @@ def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
     return Game(mdp, jnp.tile(game.system, 3))
 
 
-def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
+def recover_hat_strategy(hat: Game, strategy: Array) -> jax.Array:
     """The strategy ``float[S, A]`` of the game that a hat-game strategy induces.
 
     ``sigma(s, a) = p hat_sigma(S + s, a) + (1 - p) hat_sigma(2 S + s, a)`` (algorithm 4, line 12)
@@ -317,13 +299,12 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
     Raises:
       ValueError: the strategy has the wrong shape.
 
-    Example:
-      >>> from jaxltl import from_dense
-      >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
-      >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
-      >>> alike = hat.available / hat.available.sum(-1, keepdims=True)
-      >>> [round(x, 3) for x in recover_hat_strategy(hat, alike)[0].tolist()]
-      [0.125, 0.875]
+    >>> from jaxltl import from_dense
+    >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
+    >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
+    >>> alike = hat.available / hat.available.sum(-1, keepdims=True)
+    >>> [round(x, 3) for x in recover_hat_strategy(hat, alike)[0].tolist()]
+    [0.125, 0.875]
     """
     require_shape("strategy", strategy, hat.available.shape)
     num_states, last = hat.num_states // 3, hat.num_actions - 1
@@ -333,11 +314,11 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
     return jnp.where(hat.system[:num_states, None], mixed, own)
 
 
-def _uniform(mask: chex.Array) -> jax.Array:
+def _uniform(mask: Array) -> jax.Array:
     weight = jnp.asarray(mask, jnp.result_type(float))
     return weight / jnp.maximum(weight.sum(axis=-1, keepdims=True), 1)
 
 
-def _floats(*numbers: chex.Numeric) -> list[jax.Array]:
+def _floats(*numbers: Numeric) -> list[jax.Array]:
     """Floats of all arguments: the square of an integer might overflow."""
     return [jnp.asarray(x, jnp.result_type(x, float)) for x in numbers]

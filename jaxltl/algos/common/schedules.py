@@ -1,13 +1,12 @@
 """Schedules of hyperparameters, and the convergence conditions of theorem 1 (chapter 4) on them.
 
-Example:
-  >>> from jaxltl.algos import cce
-  >>> from jaxltl.algos.common import schedules
-  >>> hparams = cce.Hparams(  # those of theorem 1
-  ...     rate=schedules.Polynomial(0.5, -0.7), num_samples=schedules.Polynomial(10, 0.5),
-  ...     weighting="literal")
-  >>> schedules.theorem_conditions(hparams, num_steps=90).holds
-  True
+>>> from jaxltl.algos import cce
+>>> from jaxltl.algos.common import schedules
+>>> hparams = cce.Hparams(  # those of theorem 1
+...     rate=schedules.Polynomial(0.5, -0.7), num_samples=schedules.Polynomial(10, 0.5),
+...     weighting="literal")
+>>> schedules.theorem_conditions(hparams, num_steps=90).holds
+True
 """
 
 from __future__ import annotations
@@ -17,16 +16,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
 
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core import struct
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.pretty_print import brief
 
 # Products such as .07 * 100 round to slightly more than the exact integer.
 SLACK = 1e-9
 
 
-@brief
 @struct.dataclass
 class Polynomial:
     """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
@@ -35,9 +33,8 @@ class Polynomial:
       scale, power: the numbers; a negative power decays.
       offset: added to the step; default 0.
 
-    Example:
-      >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
-      [0.5, 0.25, 0.167]
+    >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
+    [0.5, 0.25, 0.167]
     """
 
     scale: jax.Array | float
@@ -45,7 +42,6 @@ class Polynomial:
     offset: jax.Array | float = 0.0
 
 
-@brief
 @struct.dataclass
 class Linear:
     """Linear interpolation from `first` in the first step to `last` after `num_steps`, then constant.

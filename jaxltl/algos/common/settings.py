@@ -24,10 +24,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 
 from jaxltl.algos.common.schedules import at, is_schedule
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.types import Status, worst
 from jaxltl.core.validation import Range
 
@@ -60,8 +60,7 @@ def traced(valid: Range, *, default: object = dataclasses.MISSING, schedule: boo
 
     A field with `default` None may be None.
     """
-    metadata = {"valid": _Valid(valid, False, schedule)}
-    return struct.field(default=default, metadata=metadata)
+    return struct.field(default=default, metadata={"valid": _Valid(valid, False, schedule)})
 
 
 def static(valid: Range | tuple[str, ...] | type[bool], *, default: object) -> Any:
@@ -82,8 +81,7 @@ def _declared(hparams: object) -> Iterator[tuple[str, Any, _Valid]]:
         return
     for field in dataclasses.fields(hparams):
         value = getattr(hparams, field.name)
-        is_absent = value is None and field.default is None
-        if "valid" in field.metadata and not is_absent:
+        if "valid" in field.metadata and not (value is None and field.default is None):
             yield field.name, value, field.metadata["valid"]
 
 
@@ -107,14 +105,12 @@ def require_hparams(hparams: object, *, batched: bool = False) -> None:
         elif isinstance(valid, tuple):
             validation.choice(name, value, valid)
         elif is_static:
-            several = isinstance(value, tuple | list) and name in tuples
-            for one in value if several else [value]:
+            for one in value if isinstance(value, tuple | list) and name in tuples else [value]:
                 validation.require_in_range(name, one, valid)
         elif may_be_schedule and is_schedule(value):
             continue  # its values are checked step by step
         else:
-            lanes = np.ravel(value) if batched and np.ndim(value) else [value]
-            for one in lanes:
+            for one in np.ravel(value) if batched and np.ndim(value) else [value]:
                 validation.require_in_range(name, one, valid)
 
 
@@ -153,10 +149,9 @@ def require_arrays(**trees: PyTree) -> None:
     Raises:
       ValueError: naming the place in the tree.
 
-    Example:
-      >>> require_arrays(problem={"limit": "high"})
-      Traceback (most recent call last):
-      ValueError: problem['limit'] is 'high'; give a number or an array.
+    >>> require_arrays(problem={"limit": "high"})
+    Traceback (most recent call last):
+    ValueError: problem['limit'] is 'high'; give a number or an array.
     """
     for name, tree in trees.items():
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
@@ -176,17 +171,32 @@ def _is_array(leaf: object) -> bool:
     return isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind in "biufc"
 
 
+def require_output(
+    what: str, network: nn.Module, inputs: PyTree, expected: tuple[int, ...], rows: str
+) -> None:
+    """Validation of the shape that a `network` returns for `inputs`; `what` and `rows` are for the text.
+
+    Raises:
+      ValueError: with the shapes returned and expected.
+
+    >>> require_output("logits have", nn.Dense(2), (np.zeros(3),), (2,), "one a symbol.")
+    """
+    found = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
+    shape = getattr(found, "shape", type(found).__name__)
+    if shape != expected:
+        raise ValueError(f"{what} shape {shape}; expected {expected}, {rows}")
+
+
 def applied(network: nn.Module, parameters: PyTree, *read: PyTree) -> PyTree:
     """The output of a `network` with `parameters` for the inputs `read`.
 
     Raises:
       ValueError: parameters of another network, or inputs of other shapes.
 
-    Example:
-      >>> applied(nn.Dense(2), {"kernel": np.eye(2), "bias": np.zeros(2)}, np.zeros(3))
-      ... # doctest: +IGNORE_EXCEPTION_DETAIL
-      Traceback (most recent call last):
-      ValueError: the parameters are not those of this Dense ...
+    >>> applied(nn.Dense(2), {"kernel": np.eye(2), "bias": np.zeros(2)}, np.zeros(3))
+    ... # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+    ValueError: the parameters are not those of this Dense ...
     """
     if not isinstance(parameters, Mapping):
         raise ValueError(

@@ -12,15 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from jaxltl.core.array_types import Key
+
 Stream = tuple[jax.Array, jax.Array]
 
 
-def streams(key: chex.PRNGKey, shape: Sequence[int] = ()) -> Stream:
+def streams(key: Key, shape: Sequence[int] = ()) -> Stream:
     """Starts and odd increments of independent streams, each ``uint32[*shape]``."""
     words = jax.random.bits(key, (2, *shape), jnp.uint32)
     return words[0], words[1] | 1

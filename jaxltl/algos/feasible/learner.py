@@ -39,14 +39,11 @@ Example: a head of one coin, then a tail of another; their biases are parameters
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
@@ -55,9 +52,9 @@ from jaxltl.algos.common import learner, loops, optimizers, trees
 from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.algos.common.settings import Number, static, traced
 from jaxltl.algos.feasible.problem import Problem, certify, require_problem
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.parametric.parametric import ParametricMDP
-from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
 from jaxltl.core.values.prepared.prepared import (
@@ -70,7 +67,6 @@ from jaxltl.core.values.prepared.prepared import (
 _FINEST = 1e-12  # the width of bounds if those of the requested width contain the threshold
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings of the search.
@@ -110,7 +106,6 @@ class Budget:
         validation.require_in_range("tolerance", self.tolerance)
 
 
-@brief
 @struct.dataclass
 class Best:
     """The best point so far: `parameters`, ``float[D]``, and its `value`; NaN before there is one.
@@ -123,7 +118,6 @@ class Best:
     value: jax.Array
 
 
-@brief
 @struct.dataclass
 class State:
     """A search from one start.
@@ -144,8 +138,7 @@ class State:
     optimizer: optax.OptState
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the point before a step; scalars, of a run ``[T]``.
 
@@ -190,13 +183,13 @@ def _is_chain(prepared: Prepared) -> bool:
     return prepared.num_rows == prepared.num_states
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A point drawn uniformly from the box."""
     share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
     return start_at(problem.low + share * (problem.high - problem.low), key, problem, hparams)
 
 
-def start_at(parameters: jax.Array, key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def start_at(parameters: jax.Array, key: Key, problem: Problem, hparams: Hparams) -> State:
     """A :class:`State` at the point of the problem's box nearest to given `parameters`.
 
     As ``init(key, problem, hparams)``, which draws the point.
@@ -237,8 +230,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         jnp.where(good, slope, 0), state.optimizer, x
     )
     moved = jnp.clip(x + updates * size, problem.low, problem.high)
-    gain = problem.sign * (value - state.best.value)
-    better = good & ~(gain <= 0)  # also if the best is NaN
+    better = good & ~(problem.sign * (value - state.best.value) <= 0)  # also if the best is NaN
     best = trees.choose(better, Best(x, value), state.best)
     after = State(
         key=state.key,
@@ -278,7 +270,6 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 # --- many starts, and certificates ------------------------------------------------------------
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class Feasible:
     """Results of N searches.
@@ -323,7 +314,7 @@ def feasible(
     threshold: float,
     *,
     starts: int | ArrayLike = 100,
-    key: chex.PRNGKey | None = None,
+    key: Key | None = None,
     hparams: Hparams | None = None,
     budget: Budget | None = None,
 ) -> Feasible:

@@ -8,22 +8,20 @@ from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike
 
+from jaxltl.core import struct, validation
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import require_states
+from jaxltl.core.values.engine.state_quantities import safe_ends
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.prepared.prepared import Prepared, prepare
-from jaxltl.core.values.engine.state_quantities import safe_ends
 
 
-@brief
 @struct.dataclass
 class Problem:
     """A threshold question about a parametric model; made by :func:`make_problem`.
@@ -147,10 +145,9 @@ def require_problem(problem: object) -> None:
     Raises:
       ValueError: it is something else.
 
-    Example:
-      >>> require_problem(0.5)
-      Traceback (most recent call last):
-      ValueError: problem is 0.5; give what make_problem returns.
+    >>> require_problem(0.5)
+    Traceback (most recent call last):
+    ValueError: problem is 0.5; give what make_problem returns.
     """
     if not isinstance(problem, Problem):
         raise ValueError(

@@ -120,30 +120,24 @@ class RobustPolicy(NamedTuple):
 
 
 def with_labels(world: MDP, labels: np.ndarray, symbols: Sequence[str]) -> MDP:
-    """The world labelled by a grounding, for :func:`~jaxltl.product` and all solvers.
+    """The world labelled by a grounding with propositions `symbols`, for :func:`~jaxltl.product` and solvers.
 
     Args:
       world: a model with S states.
       labels: ``bool[S, P]``, such as a world's part of ``Posterior.labels``; rows beyond S, of padded
         worlds, are left out.
       symbols: P names.
-
-    Returns:
-      The model with `symbols` as its propositions.
     """
     label = jnp.asarray(np.asarray(labels, bool)[: world.num_states])
     return replace(world, label=label, propositions=tuple(symbols))
 
 
 def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> list[Row]:
-    """The posterior of each symbol: its meaning, alternatives, and the steps that decide it.
+    """A :class:`Row` of the posterior for each symbol: meaning, alternatives, and the steps that decide it.
 
     Args:
       problem, hparams: as for :func:`~jaxltl.algos.grounding.posterior`.
       found: the posterior.
-
-    Returns:
-      A :class:`Row` for each symbol, in the order of ``found.symbols``.
     """
     steps = jax.jit(step_log_likelihood)
     automaton, rows = automaton_of(problem), []
@@ -172,13 +166,10 @@ def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> lis
 
 
 def best_query(found: Posterior) -> Query:
-    """The state with the label that gives most information about the grounding.
+    """The (first) state with the label that gives most information about the grounding, a :class:`Query`.
 
     A grounding determines all labels, so that the mutual information of a state's label and the
     grounding is the entropy of the label under the posterior `found`.
-
-    Returns:
-      :class:`Query`; of several such states the first.
     """
     num_states = found.meaning.shape[2]
     power = 1 << np.arange(len(found.symbols))
@@ -211,7 +202,7 @@ def robust_policy(
     tolerance: float = 1e-4,
     max_points: int = 100,
 ) -> RobustPolicy:
-    """A policy with the largest minimum of its satisfaction probabilities under several groundings.
+    """A :class:`RobustPolicy` with the largest minimum of its probabilities under several groundings.
 
     In the product with the automata of all groundings, weighted sums of the probabilities are
     maximised (Forejt, Kwiatkowska and Parker 2012) until a mixture of their policies attains the
@@ -224,9 +215,6 @@ def robust_policy(
       task: a formula over them, or its automaton.
       tolerance: width of the bounds of the maximin.
       max_points: maximal number of weighted sums.
-
-    Returns:
-      :class:`RobustPolicy`; its bounds hold at any number of points.
 
     Raises:
       ValueError: no grounding, or more than 8.

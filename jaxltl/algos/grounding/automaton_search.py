@@ -116,11 +116,9 @@ def learn_automaton(
     )
     near = _sequences(num_memory, letters, np.random.default_rng(seed))
     tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
-    found = _scores(problem, discount, *tables).max(1)
-    order = np.argsort(-found, kind="stable")[:num_starts]
+    order = np.argsort(-_scores(problem, discount, *tables).max(1), kind="stable")[:num_starts]
     runs = [_climb(problem, discount, *near[i]) for i in order.tolist()]
-    best = max(runs, key=lambda run: run[0])
-    score, moves, event, scale = best
+    score, moves, event, scale = max(runs, key=lambda run: run[0])
     automaton = _as_automaton(moves, event, letters, worlds[0].propositions)
     total = score + _PENALTY * _size(moves, event)
     return LearnedAutomaton(automaton, float(total), scale, np.array([run[0] for run in runs]))
@@ -161,8 +159,7 @@ def _climb(
         near = _neighbours(*best)
         tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
         found = _scores(problem, discount, *tables)
-        sizes = np.array([_size(*n) for n in near])
-        value = found.max(1) - _PENALTY * sizes
+        value = found.max(1) - _PENALTY * np.array([_size(*n) for n in near])
         top = int(value.argmax())
         if value[top] <= score + 1e-6:
             break
@@ -175,8 +172,7 @@ def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, 
     found, (num_memory, width) = [(moves, event)], moves.shape
     for q, letter, to in np.ndindex(num_memory, width, num_memory):
         for rewarded in (False, True):
-            same = moves[q, letter] == to and event[q, letter] == rewarded
-            if same or (rewarded and to == q):
+            if (moves[q, letter] == to and event[q, letter] == rewarded) or (rewarded and to == q):
                 continue
             new, events = moves.copy(), event.copy()
             new[q, letter], events[q, letter] = to, rewarded

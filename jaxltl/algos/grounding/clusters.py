@@ -34,7 +34,7 @@ from scipy.cluster.vq import kmeans2
 from jaxltl.algos.common.settings import applied
 from jaxltl.algos.grounding.learner import State
 from jaxltl.algos.grounding.problem import Problem
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.array_types import PyTree
 
 _STARTS = 20  # of k-means, of which the one with the least distortion is kept
 
@@ -97,9 +97,6 @@ def fit_labels(
       labels: ``bool[W, S, P]``, such as ``Posterior.labels`` of a grounding.
       num_steps: full-batch steps of Adam.
       learning_rate: of Adam.
-
-    Returns:
-      The state with the new parameters of the grounding; all else is unchanged.
 
     Raises:
       ValueError: labels of another shape.

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,10 +38,9 @@ from jaxltl.algos.grounding.learner import State as State
 from jaxltl.algos.grounding.likelihood import NEVER, forward
 from jaxltl.algos.grounding.problem import joined_demonstrations
 from jaxltl.core import struct
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range, require_in_range
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
@@ -50,7 +48,6 @@ from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 _STAY = 3.0  # prior mean of the logit that a mode stays
 
 
-@brief
 @struct.dataclass
 class Problem:
     """A world, demonstrations, and the inputs of the modes' policies.
@@ -73,7 +70,6 @@ class Problem:
     num_modes: int = struct.field(pytree_node=False)
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -91,8 +87,7 @@ class Hparams:
     optimizer: str = static(optimizers.NAMES, default="adam")
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
@@ -124,9 +119,6 @@ def make_problem(
       features: ``float[S, A, F]``, of the rewards; default none.
       evidence: ``float[N, T, A, E]``, of the history, such as ``HistoryTables.left_out`` of the
         demonstrations that were fitted and ``HistoryTables.evidence`` of others; default none.
-
-    Returns:
-      :class:`Problem`.
 
     Raises:
       ValueError: neither features nor evidence, another shape, a number that is not finite, or
@@ -198,7 +190,7 @@ def _log_policy(
     return logits.astype(problem.evidence.dtype), jnp.int32(Status.COMPLETED)
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """Random rewards, and equal weights of the evidence with noise; the key is kept."""
     modes, dtype = problem.num_modes, problem.evidence.dtype
     reward, evidence = jax.random.split(learner.init_key(key))
@@ -210,7 +202,7 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         "move": jnp.zeros((modes, modes), dtype),
         "move_in": jnp.zeros((problem.world.num_states, modes, modes), dtype),
     }
-    optimizer = trees.strong(_optimizer(hparams).init(parameters))
+    optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
     return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
 
 
@@ -219,14 +211,12 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, (_, status)), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams
     )
-    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
+    updates, optimizer = optimizers.optimizer_of(hparams).update(
+        gradient, state.optimizer, state.parameters
+    )
     parameters = optax.apply_updates(state.parameters, updates)
     metrics = Metrics(loss, optax.tree.norm(gradient), status)
     return State(state.key, state.step + 1, parameters, optimizer), metrics
-
-
-def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 # Metrics describe the state before a step.
@@ -234,12 +224,7 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def fit(
-    key: chex.PRNGKey,
-    problem: Problem,
-    hparams: Hparams,
-    *,
-    num_starts: int = 4,
-    num_steps: int = 300,
+    key: Key, problem: Problem, hparams: Hparams, *, num_starts: int = 4, num_steps: int = 300
 ) -> State:
     """The state of least loss of `num_starts` random starts from `key`, trained as a batch.
 
@@ -248,8 +233,7 @@ def fit(
     out of range.
     """
     require_in_range("num_starts", num_starts, Range(1, integer=True))
-    learn = partial(train, num_steps=num_steps, max_rows=1)
-    states, metrics = jax.vmap(learn, (0, None, None))(
+    states, metrics = jax.vmap(partial(train, num_steps=num_steps, max_rows=1), (0, None, None))(
         jax.random.split(key, num_starts), problem, hparams
     )
     best = jnp.nanargmin(metrics.loss[:, -1])
@@ -273,8 +257,7 @@ def mode_probabilities(state: State, problem: Problem, hparams: Hparams) -> jax.
     has no meaning. Arguments as of :func:`log_likelihood`.
     """
     *chains, _ = _chains(state.parameters, problem, hparams)
-    posterior = jax.vmap(jax.grad(forward, 1), (None, 0, 0, 0))
-    return posterior(*chains, problem.length)
+    return jax.vmap(jax.grad(forward, 1), (None, 0, 0, 0))(*chains, problem.length)
 
 
 def mode_moves(state: State) -> jax.Array:

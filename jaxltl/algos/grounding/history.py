@@ -67,15 +67,12 @@ class HistoryTables(NamedTuple):
 def fit_history(
     world: MDP, demonstrations: Trajectories, *, past_states: int = 5, past_actions: int = 8
 ) -> HistoryTables:
-    """Count tables of demonstrations, ``past_states + past_actions + 2`` levels in all.
+    """The :class:`HistoryTables` of demonstrations, ``past_states + past_actions + 2`` levels in all.
 
     Args:
       world: with the demonstrations.
       demonstrations: at least two.
       past_states, past_actions: at least 0, the lengths of the two chains.
-
-    Returns:
-      :class:`HistoryTables`.
 
     Raises:
       ValueError: fewer than two demonstrations, another model's, or a negative length.

@@ -39,7 +39,6 @@ from jaxltl.core import struct
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.models.product import Product
-from jaxltl.core.pretty_print import brief
 
 Score = Callable[[np.ndarray], np.ndarray]
 SCALES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
@@ -49,7 +48,6 @@ _BEAM = 8
 _UNEXPLAINED = np.log(1e4)  # decisive evidence (Jeffreys) for random actions
 
 
-@brief
 @struct.dataclass
 class Posterior:
     """Hard groundings with weights, in decreasing order.
@@ -77,8 +75,7 @@ class Posterior:
 
     def meaning_of(self, index: int) -> dict[str, str]:
         """The grounding of a row: the name of the meaning of each symbol."""
-        row = self.assignment[index]
-        return {p: self.names[m] for p, m in zip(self.symbols, row, strict=True)}
+        return {p: self.names[m] for p, m in zip(self.symbols, self.assignment[index], strict=True)}
 
     def labels(self, index: int) -> np.ndarray:
         """``bool[W, S, P]``, the labels of all worlds by a row."""
@@ -154,35 +151,28 @@ def _weighed(found: Posterior) -> Posterior:
 
 
 def select_demonstrations(found: Posterior, chosen: ArrayLike) -> Posterior:
-    """The posterior of some of the demonstrations, without scoring any grounding again.
+    """The :class:`Posterior` of some of the demonstrations, without scoring any grounding again.
 
     Args:
       found: the posterior of all N demonstrations.
       chosen: ``int[]`` or ``bool[N]``, those that count.
-
-    Returns:
-      :class:`Posterior` of the same groundings, in the order of their new weights.
     """
     return _weighed(replace(found, log_likelihood=found.log_likelihood[..., np.asarray(chosen)]))
 
 
 def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
-    """Rows of the smallest set of groundings with total weight of at least `level`.
+    """The rows ``int[]`` of the smallest set of groundings with total weight of at least `level`.
 
     Args:
       found: the posterior.
       level: the nominal weight, above 0 and below 1.
 
-    Returns:
-      ``int[]``, rows of `found`, in its order.
-
     Raises:
       ValueError: a level outside this range.
 
-    Example:
-      >>> import types
-      >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
-      [0, 1]
+    >>> import types
+    >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
+    [0, 1]
     """
     if not 0 < level < 1:
         raise ValueError(f"level={level}; it must be above 0 and below 1.")
@@ -191,14 +181,11 @@ def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
 
 
 def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
-    """Symbols with several meanings in the credible set, with these meanings.
+    """The symbols with several meanings in the credible set, each with these meanings, likeliest first.
 
     Args:
       found: the posterior.
       level: nominal weight of the set.
-
-    Returns:
-      For each such symbol its meanings, likeliest first; empty if the demonstrations decide all.
     """
     rows = found.assignment[credible_set(found, level)]
     several = {}
@@ -210,18 +197,14 @@ def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[
 
 
 def symbol_symmetries(automaton: Automaton) -> list[tuple[int, ...]]:
-    """Permutations of the symbols that leave the language unchanged, the identity included.
+    """The permutations of the symbols that leave the language unchanged, the identity included.
 
     Args:
       automaton: over P symbols; with more than 5 only the identity is returned.
 
-    Returns:
-      Permutations of ``0 .. P - 1``.
-
-    Example:
-      >>> import jaxltl as jl
-      >>> symbol_symmetries(jl.to_automaton("F a & F b"))
-      [(0, 1), (1, 0)]
+    >>> import jaxltl as jl
+    >>> symbol_symmetries(jl.to_automaton("F a & F b"))
+    [(0, 1), (1, 0)]
     """
     count = len(automaton.propositions)
     if count > 5:  # 720 comparisons and more
@@ -325,16 +308,14 @@ def step_log_likelihood(
         return log_policy[world, state, certain_memory(model, state), action]
 
     found = jax.vmap(demonstration)(problem.world, problem.state, problem.action)
-    inside = jnp.arange(found.shape[1]) < problem.length[:, None]
-    return jnp.where(inside, found, 0)
+    return jnp.where(jnp.arange(found.shape[1]) < problem.length[:, None], found, 0)
 
 
 def _beam(
     score: Score, num_meanings: int, num_symbols: int, symmetries: list[tuple[int, ...]]
 ) -> tuple[list[tuple[int, ...]], np.ndarray]:
     """Assignments that differ in one symbol from the best ones so far, until these have no better."""
-    rng = np.random.default_rng(0)
-    starts = rng.integers(num_meanings, size=(_BEAM, num_symbols)).tolist()
+    starts = np.random.default_rng(0).integers(num_meanings, size=(_BEAM, num_symbols)).tolist()
     frontier = {_canonical(row, symmetries) for row in starts}
     known: dict[tuple[int, ...], np.ndarray] = {}
     expanded: set[tuple[int, ...]] = set()
@@ -366,8 +347,7 @@ def _require_explained(
     table = table[np.isfinite(table).all((1, 2))]
     # The other demonstrations weigh the scales; at a small scale the policy is nearly uniform.
     other = (table.sum(-1, keepdims=True) - table).max(0)
-    weight = other - np.logaddexp.reduce(other, 0)
-    best = np.logaddexp.reduce(weight + table.max(0), 0)
+    best = np.logaddexp.reduce(other - np.logaddexp.reduce(other, 0) + table.max(0), 0)
     lost = uniform.sum(1) - best
     n = int(lost.argmax())
     if lost[n] > _UNEXPLAINED:

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -42,13 +41,11 @@ from jaxltl.algos.grounding.likelihood import (
 )
 from jaxltl.algos.grounding.problem import Hparams, Problem
 from jaxltl.core import struct
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
+from jaxltl.core.array_types import Key, PyTree
+from jaxltl.core.models.product import Product
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 
-@brief
 @struct.dataclass
 class State:
     """Parameters of a run.
@@ -65,8 +62,7 @@ class State:
     optimizer: PyTree
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
@@ -85,7 +81,6 @@ class Metrics:
     status: jax.Array
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
     """Terms of the loss.
@@ -114,15 +109,17 @@ def objective(
     ``hardness`` times the number of demonstrated steps times the mean entropy of the letters.
     Differentiable in the `parameters` of a `problem` with `hparams`, implicitly through the soft value.
     """
-    log_policy, log_moves, letter, status = _each_world(
-        partial(_lane, problem, hparams, parameters), problem
+    log_policy, log_moves, letter, status = trees.each_world(
+        partial(_lane, problem, hparams, parameters),
+        problem.model,
+        problem.observation,
+        problem.features,
     )
     initial = jnp.asarray(problem.model.automaton.initial)[0]
 
     def one(world: jax.Array, state: jax.Array, action: jax.Array, length: jax.Array) -> jax.Array:
         moves = log_moves[world, state]  # [T, Q, Q]
-        emit = log_policy[world, state, :, action]
-        return forward(moves[0, initial], emit, moves[1:], length)
+        return forward(moves[0, initial], log_policy[world, state, :, action], moves[1:], length)
 
     found = jax.vmap(one)(problem.world, problem.state, problem.action, problem.length)
     entropy = -jnp.mean(jnp.sum(jax.scipy.special.xlogy(letter, letter), axis=-1))
@@ -141,21 +138,22 @@ def objective(
 
 
 def _lane(
-    problem: Problem, hparams: Hparams, parameters: PyTree, index: jax.Array
+    problem: Problem,
+    hparams: Hparams,
+    parameters: PyTree,
+    model: Product,
+    observation: jax.Array,
+    features: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """Policy and moves of the memory in log space, letters and the solver's status, in a world."""
-    model = jax.tree.map(lambda x: x[index], problem.model)
     log_letter = letter_log_probability(
-        problem.network,
-        parameters["grounding"],
-        problem.observation[index],
-        model.automaton.letters,
+        problem.network, parameters["grounding"], observation, jnp.asarray(model.automaton.letters)
     )
-    log_moves = memory_log_moves(log_letter, model.automaton.delta)
+    log_moves = memory_log_moves(log_letter, jnp.asarray(model.automaton.delta))
     letter = jnp.exp(log_letter)
     world = soft_product(model.mdp, jnp.exp(log_moves))
     reward = jnp.exp(parameters["log_scale"]) * motive(model.mdp, letter, problem.event)
-    reward += problem.features[index] @ parameters["weights"]
+    reward += features @ parameters["weights"]
     flat = reward.reshape(world.num_states, -1)
     solution = soft_value(world, flat, hparams.discount)
     logits = policy_logits(world, flat, hparams.discount, solution.value)
@@ -163,15 +161,7 @@ def _lane(
     return log_policy.reshape(reward.shape), log_moves, letter, solution.status
 
 
-def _each_world(function: PyTree, problem: Problem) -> tuple[jax.Array, ...]:
-    """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
-    count = len(problem.model.letter)
-    return (
-        tuple(x[None] for x in function(0)) if count == 1 else jax.vmap(function)(jnp.arange(count))
-    )
-
-
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
     drawn = problem.network.init(learner.init_key(key), problem.observation)["params"]
@@ -180,7 +170,7 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         "log_scale": jnp.log(jnp.asarray(hparams.scale, dtype)),
         "weights": jnp.zeros(problem.features.shape[-1], dtype),
     }
-    optimizer = trees.strong(_optimizer(hparams).init(parameters))
+    optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
     return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
 
 
@@ -189,7 +179,9 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams
     )
-    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
+    updates, optimizer = optimizers.optimizer_of(hparams).update(
+        gradient, state.optimizer, state.parameters
+    )
     metrics = Metrics(
         loss=loss,
         neg_log_likelihood=-jnp.sum(parts.log_likelihood),
@@ -199,10 +191,6 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     )
     parameters = optax.apply_updates(state.parameters, updates)
     return State(state.key, state.step + 1, parameters, optimizer), metrics
-
-
-def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 # Metrics describe the state before a step.

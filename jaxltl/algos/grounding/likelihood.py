@@ -14,10 +14,10 @@ from flax import linen as nn
 
 from jaxltl.algos.common.settings import Number, applied
 from jaxltl.algos.grounding.problem import event_reward
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 _TOLERANCE = 1e-3  # of soft values: changes a log-likelihood by as much a step
@@ -76,12 +76,11 @@ def motive_policy(model: Product, scale: Number, discount: Number) -> jax.Array:
     The soft policy of the motive in a `model` with the task: the events of
     :func:`~jaxltl.algos.grounding.problem.event_reward` times `scale`, at a `discount`.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]], label={"g": [1]})
-      >>> policy = motive_policy(jl.product(world, "F g"), 5.0, 0.9)
-      >>> round(policy[0, 0, 0].item(), 2)
-      0.69
+    >>> import jaxltl as jl
+    >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]], label={"g": [1]})
+    >>> policy = motive_policy(jl.product(world, "F g"), 5.0, 0.9)
+    >>> round(policy[0, 0, 0].item(), 2)
+    0.69
     """
     event = jnp.asarray(event_reward(model.automaton), model.dtype)
     return jnp.exp(motive_log_policy(model, event, scale, discount))
@@ -94,8 +93,7 @@ def motive_log_policy(
     letter = jax.nn.one_hot(model.letter, event.shape[1], dtype=model.dtype)
     reward = scale * motive(model.mdp, letter, event)
     solution = soft_value(model, reward, discount, tolerance=_TOLERANCE)
-    logits = policy_logits(model, reward, discount, solution.value)
-    return jax.nn.log_softmax(logits, axis=-1)
+    return jax.nn.log_softmax(policy_logits(model, reward, discount, solution.value), axis=-1)
 
 
 def forward(start: jax.Array, emit: jax.Array, move: jax.Array, length: jax.Array) -> jax.Array:

@@ -12,7 +12,7 @@ from flax import linen as nn
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import optimizers
-from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.common.settings import Number, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.language import is_empty, is_universal
@@ -23,7 +23,6 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import Range
 
 _MAX_SYMBOLS = 10  # 2^P letters
@@ -35,21 +34,18 @@ class LinearGrounding(nn.Module):
     Attributes:
       num_symbols: P.
 
-    Example:
-      >>> network = LinearGrounding(2)
-      >>> jax.eval_shape(network.init_with_output, jax.random.key(0), jnp.zeros((5, 3)))[0].shape
-      (5, 2)
+    >>> network = LinearGrounding(2)
+    >>> jax.eval_shape(network.init_with_output, jax.random.key(0), jnp.zeros((5, 3)))[0].shape
+    (5, 2)
     """
 
     num_symbols: int
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
-        start = nn.initializers.normal(1.0)
-        return nn.Dense(self.num_symbols, kernel_init=start)(observation)
+        return nn.Dense(self.num_symbols, kernel_init=nn.initializers.normal(1.0))(observation)
 
 
-@brief
 @struct.dataclass
 class Problem:
     """Worlds, observations, demonstrations, and a task over symbols without a labelling.
@@ -83,7 +79,6 @@ class Problem:
         return self.model.automaton.propositions
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -129,19 +124,15 @@ def make_problem(
       features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the motive;
         default none.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: a formula that no word or every word satisfies, or that needs parity acceptance;
         observations, features or a network of another shape; demonstrations that do not fit.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[1]]], [[[1.0]], [[1.0]]])
-      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0)]])
-      >>> make_problem(path, jnp.eye(2), shown, "F goal").symbols
-      ('goal',)
+    >>> import jaxltl as jl
+    >>> path = jl.make_mdp([[[1]], [[1]]], [[[1.0]], [[1.0]]])
+    >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0)]])
+    >>> make_problem(path, jnp.eye(2), shown, "F goal").symbols
+    ('goal',)
     """
     worlds = [worlds] if isinstance(worlds, MDP) else list(worlds)
     several = [demonstrations] if isinstance(demonstrations, Trajectories) else demonstrations
@@ -159,7 +150,9 @@ def make_problem(
     world, state, action, length = joined_demonstrations(worlds, several)
     if network is None:
         network = LinearGrounding(len(automaton.propositions))
-    _require_network(network, observation, len(automaton.propositions))
+    logits = (*observation.shape[:-1], len(automaton.propositions))
+    what = "the grounding's logits have"
+    require_output(what, network, (observation,), logits, "one for each symbol.")
     return Problem(
         model=model,
         observation=observation,
@@ -287,13 +280,3 @@ def _features(model: Product, features: ArrayLike | None) -> jax.Array:
     if (wrong := np.argwhere(~np.isfinite(values))).size:
         raise ValueError(f"feature at {tuple(wrong[0].tolist())} is not finite.")
     return jnp.asarray(values, model.dtype)
-
-
-def _require_network(network: nn.Module, observation: jax.Array, num_symbols: int) -> None:
-    found = jax.eval_shape(lambda x: network.init_with_output(jax.random.key(0), x)[0], observation)
-    expected = (*observation.shape[:-1], num_symbols)
-    if getattr(found, "shape", None) != expected:
-        shape = getattr(found, "shape", type(found).__name__)
-        raise ValueError(
-            f"the grounding's logits have shape {shape}; expected {expected}, one for each symbol."
-        )

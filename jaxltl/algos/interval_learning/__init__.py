@@ -1,39 +1,24 @@
 """Robust anytime learning of temporal-logic tasks in MDPs with unknown probabilities."""
 
 from jaxltl.algos.interval_learning.learner import (
-    behavior,
-    bounds_within,
-    guarantee,
-    init,
-    measure,
-    policy,
-    run,
-    run_until,
-    step,
-    train,
-    train_until,
-    wins_almost_surely,
+    behavior as behavior,
+    bounds_within as bounds_within,
+    guarantee as guarantee,
+    init as init,
+    measure as measure,
+    policy as policy,
+    run as run,
+    run_until as run_until,
+    step as step,
+    train as train,
+    train_until as train_until,
+    wins_almost_surely as wins_almost_surely,
 )
-from jaxltl.algos.interval_learning.problem import Problem, make_problem
-from jaxltl.algos.interval_learning.state import INTERVALS, Hparams, Metrics, State
-
-__all__ = [
-    "INTERVALS",
-    "Hparams",
-    "Metrics",
-    "Problem",
-    "State",
-    "behavior",
-    "bounds_within",
-    "guarantee",
-    "init",
-    "make_problem",
-    "measure",
-    "policy",
-    "run",
-    "run_until",
-    "step",
-    "train",
-    "train_until",
-    "wins_almost_surely",
-]
+from jaxltl.algos.interval_learning.problem import (
+    INTERVALS as INTERVALS,
+    Hparams as Hparams,
+    Metrics as Metrics,
+    Problem as Problem,
+    State as State,
+    make_problem as make_problem,
+)

@@ -44,34 +44,28 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.algos.common import learner, loops, pac
-from jaxltl.algos.common.play import take
-from jaxltl.algos.interval_learning._intervals import (
-    confidence_intervals,
-    consistent,
-    linear_intervals,
-)
-from jaxltl.algos.interval_learning._sampling import sampled_counts
-from jaxltl.algos.interval_learning.problem import Problem
-from jaxltl.algos.interval_learning.state import Hparams, Metrics, State
-from jaxltl.core.graphs.end_components import accepting_bottom_components
-from jaxltl.core.graphs.end_components import bottom_components
+from jaxltl.algos.common import learner, loops, pac, splitmix
+from jaxltl.algos.common.play import draw, successor_slot, take
+from jaxltl.algos.interval_learning.problem import Hparams, Metrics, Problem, State
+from jaxltl.core import struct
+from jaxltl.core.array_types import Key, Numeric
+from jaxltl.core.graphs.end_components import accepting_bottom_components, bottom_components
+from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
-from jaxltl.core.models.ops.operators import forall_successor
+from jaxltl.core.models.ops.operators import forall_successor, sample_successor
 from jaxltl.core.types import Status
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
 from jaxltl.core.values.interval.contest import greedy_distributions
 
 
 @jax.jit
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """No samples: every transition may have nearly all of its action's probability."""
     world = problem.model.mdp
     used = world.successor_probability > 0
@@ -130,7 +124,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     )
 
 
-def bounds_within(width: chex.Numeric) -> loops.Until:
+def bounds_within(width: Numeric) -> loops.Until:
     """A condition for ``run_until``: optimistic minus pessimistic value at most `width`, converged."""
     return Partial(_bounds_within, width)
 
@@ -159,8 +153,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     nature = jnp.full(1, -1, state.lower.dtype)
     ends = state.lower[None], state.upper[None]
     moves = _expectations(problem, state.pessimistic[None], *ends, nature)[0]
-    best = _backup(problem, moves)[..., None]
-    out = problem.allowed & ~problem.staying & (moves >= best)
+    out = problem.allowed & ~problem.staying & (moves >= _backup(problem, moves)[..., None])
     used = jnp.where(problem.winning[..., None], problem.allowed, out | problem.staying)
     used = jnp.where(problem.losing[..., None], problem.allowed, used)
     return used / jnp.maximum(used.sum(-1, keepdims=True), 1).astype(moves.dtype)
@@ -219,8 +212,7 @@ def _wins(problem: Problem, policy: jax.Array) -> jax.Array:
 def _value_iteration(state: State, problem: Problem, hparams: Hparams) -> State:
     """Sweeps of both values, and the actions that the last sweep prefers."""
     nature = jnp.asarray([-1, 1, 1], state.lower.dtype)
-    used = problem.model.mdp.successor_probability > 0
-    seen = state.counts.astype(nature.dtype) + used
+    seen = state.counts.astype(nature.dtype) + (problem.model.mdp.successor_probability > 0)
     share = seen / jnp.maximum(jnp.sum(seen, -1, keepdims=True), 1)
     lower = jnp.stack([state.lower, state.lower, share])
     upper = jnp.stack([state.upper, state.upper, share])
@@ -234,8 +226,7 @@ def _value_iteration(state: State, problem: Problem, hparams: Hparams) -> State:
         return jnp.concatenate([bounds, speed[None]]), best, change
 
     # The speed restarts from zero: a value that was too high would decay slowly in end components.
-    first = problem.winning.astype(nature.dtype)
-    values = jnp.stack([state.pessimistic, state.optimistic, first])
+    values = jnp.stack([state.pessimistic, state.optimistic, problem.winning.astype(nature.dtype)])
     values, best, change = lax.fori_loop(
         0, hparams.sweeps, sweep, (values, state.best, state.residual)
     )
@@ -257,8 +248,7 @@ def _expectations(
 
 def _backup(problem: Problem, moves: jax.Array) -> jax.Array:
     """The value of the best action, or of the best exit of an end component."""
-    out = problem.allowed & ~problem.staying
-    best = jnp.max(jnp.where(out, moves, 0), axis=-1).reshape(-1)
+    best = jnp.max(jnp.where(problem.allowed & ~problem.staying, moves, 0), axis=-1).reshape(-1)
     best = jnp.zeros_like(best).at[problem.component].max(best)
     best = jnp.minimum(take(best, problem.component), 1).reshape(problem.winning.shape)
     return _with_decided(problem, best)
@@ -281,3 +271,132 @@ def _soonest(
     best = jnp.where(problem.winning[..., None], problem.allowed, best)
     speed = jnp.asarray(hparams.discount, moves.dtype) * jnp.maximum(most, 0)
     return _with_decided(problem, speed), best
+
+
+# --- intervals ---------------------------------------------------------------------------------
+
+
+def linear_intervals(state: State, new: jax.Array, hparams: Hparams) -> tuple[jax.Array, jax.Array]:
+    """Linearly updating intervals (Suilen et al. 2022, definition 4; Walter and Augustin 2009).
+
+    ``(n P + k) / (n + N)`` for both ends P and N `new` observations, k of them of the transition.
+    The strength n is the larger one if all frequencies ``k / N`` of the action are on the inner
+    side of P, else the smaller one. Strengths grow by N.
+    """
+    dtype = state.lower.dtype
+    before = jnp.sum(state.counts - new, -1, keepdims=True).astype(dtype)
+    weak, strong = before + hparams.strength, before + hparams.most_strength
+    number = jnp.sum(new, -1, keepdims=True).astype(dtype)
+    share = new / jnp.maximum(number, 1)
+
+    def end(prior: jax.Array, agrees: jax.Array) -> jax.Array:
+        n = jnp.where(jnp.all(agrees, -1, keepdims=True), strong, weak)
+        return (n * prior + new) / (n + number)
+
+    lower = end(state.lower, share >= state.lower)
+    return consistent(lower, end(state.upper, share <= state.upper))
+
+
+def confidence_intervals(
+    state: State, num_claims: jax.Array, hparams: Hparams
+) -> tuple[jax.Array, jax.Array]:
+    """Anytime-valid confidence intervals of all probabilities at once, in closed form.
+
+    The set of :func:`~jaxltl.core.statistics.binomial.anytime` is contained in ``n kl(k / n, p) <=
+    log(2 sqrt(n) / failure)``, since Jeffreys' mixture is at least ``1 / (2 sqrt(n))`` of any
+    likelihood (Willems, Shtarkov and Tjalkens 1995). An enclosure follows from ``kl(a, b) >= 2 (a -
+    b)^2`` and ``kl(a, b) >= (a - b)^2 / (2 max(a, b))``, for a probability and for its complement.
+    All these sets hold simultaneously, hence so does their intersection over time.
+    """
+    dtype = state.lower.dtype
+    used = state.upper > 0
+    failure = (1 - jnp.asarray(hparams.confidence, dtype)) / num_claims.astype(dtype)
+    n = jnp.maximum(jnp.sum(state.counts, -1, keepdims=True).astype(dtype), 1)
+    share, c = state.counts / n, (jnp.log(2 * jnp.sqrt(n)) - jnp.log(failure)) / n
+    lower, upper = kl_lower_end(share, c), 1 - kl_lower_end(1 - share, c)
+    floor = jnp.minimum(jnp.asarray(hparams.least, dtype), upper)
+    lower = jnp.where(used, jnp.maximum(jnp.maximum(lower, floor), state.lower), 0)
+    upper = jnp.where(used, jnp.minimum(upper, state.upper), 0)
+    return consistent(lower, upper)
+
+
+def kl_lower_end(a: jax.Array, c: jax.Array) -> jax.Array:
+    """A lower bound of all b with ``kl(a, b) <= c``."""
+    a = jnp.clip(a, 0, 1)  # rounding may leave [0, 1]
+    other = 1 - a
+    below = jnp.minimum(jnp.sqrt(c / 2), jnp.sqrt(2 * c * a))
+    return jnp.maximum(a - jnp.minimum(below, c + jnp.sqrt(c * c + 2 * c * other)), 0)
+
+
+def consistent(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The ends, widened or scaled so that they contain a distribution in spite of rounding."""
+    lower = lower / jnp.maximum(jnp.sum(lower, -1, keepdims=True), 1)
+    upper = jnp.maximum(upper, lower)
+    total = jnp.sum(upper, -1, keepdims=True)
+    short = (total > 0) & (total < 1)
+    return lower, jnp.minimum(jnp.where(short, upper / jnp.where(short, total, 1), upper), 1)
+
+
+# --- episodes ----------------------------------------------------------------------------------
+
+
+_States = tuple[jax.Array, jax.Array]  # states and memory states of all episodes
+
+
+@struct.dataclass
+class _Rules:
+    """Constants of a step."""
+
+    problem: Problem
+    best: jax.Array
+    explore: jax.Array
+    restart: jax.Array
+    start: jax.Array
+    next_memory: jax.Array
+
+
+def sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """Transition counts of a step's episodes, ``int32[S, A, K]``."""
+    model = problem.model
+    dtype, num_runs = model.dtype, hparams.num_runs
+    key = learner.step_key(state)
+    stream = splitmix.streams(jax.random.fold_in(key, 0), (num_runs,))
+    rules = _Rules(
+        problem=problem,
+        best=state.best,
+        explore=jnp.asarray(hparams.exploration, dtype),
+        restart=jnp.asarray(hparams.restart, dtype),
+        start=jnp.asarray(model.automaton.initial, jnp.int32),
+        next_memory=model.next_memory,
+    )
+    first = draw(problem.start_table, splitmix.words(stream, jnp.uint32(0)))
+    states = first, jnp.broadcast_to(rules.start, (num_runs,))
+    keys = jax.random.split(jax.random.fold_in(key, 1), hparams.length)
+
+    def move(states: _States, x: tuple[jax.Array, jax.Array]) -> tuple[_States, tuple]:
+        number, key = x
+        words = [splitmix.words(stream, 4 * number + i) for i in range(1, 5)]
+        return _move(rules, states, words, jax.random.split(key, num_runs))
+
+    number = jnp.arange(hparams.length, dtype=jnp.uint32)
+    _, (s, a, k) = lax.scan(move, states, (number, keys))
+    return jnp.zeros(state.counts.shape, jnp.int32).at[s, a, k].add(1)
+
+
+def _move(
+    rules: _Rules, states: _States, words: list[jax.Array], keys: jax.Array
+) -> tuple[_States, tuple[jax.Array, jax.Array, jax.Array]]:
+    """One move of each episode: the next states, and the indices of the transitions."""
+    problem, (s, q) = rules.problem, states
+    world, dtype = problem.model.mdp, problem.model.dtype
+    ends = splitmix.uniform(words[0], dtype) < rules.restart
+    restarts = take(problem.losing, (s, q)) | (take(problem.winning, (s, q)) & ends)
+    s = jnp.where(restarts, draw(problem.start_table, words[1]), s)
+    q = jnp.where(restarts, rules.start, q)
+    explore = splitmix.uniform(words[2], dtype) < rules.explore
+    moves = jnp.where(explore[:, None], take(problem.allowed, (s, q)), take(rules.best, (s, q)))
+    total = jnp.cumsum(moves.astype(dtype), axis=-1)
+    drawn = splitmix.uniform(words[3], dtype)[:, None] * total[:, -1:]
+    a = jnp.argmax(total > drawn, axis=-1).astype(jnp.int32)
+    t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
+    return (t, take(rules.next_memory, (s, q))), (s, a, successor_slot(as_game(world), s, a, t))

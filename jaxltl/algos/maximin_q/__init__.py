@@ -1,38 +1,23 @@
 """Generalized and maximin Q-learning in two-player games."""
 
 from jaxltl.algos.maximin_q.learner import (
-    Hparams,
-    Metrics,
-    State,
-    init,
-    measure,
-    policy,
-    run,
-    run_until,
-    step,
-    train,
-    train_until,
-    value,
-    value_is_stable,
+    Hparams as Hparams,
+    Metrics as Metrics,
+    State as State,
+    init as init,
+    measure as measure,
+    policy as policy,
+    run as run,
+    run_until as run_until,
+    step as step,
+    train as train,
+    train_until as train_until,
+    value as value,
+    value_is_stable as value_is_stable,
 )
-from jaxltl.algos.maximin_q.problem import Problem, make_problem, recurrent_states, with_exact_value
-
-__all__ = [
-    "Hparams",
-    "Metrics",
-    "Problem",
-    "State",
-    "init",
-    "make_problem",
-    "measure",
-    "policy",
-    "recurrent_states",
-    "run",
-    "run_until",
-    "step",
-    "train",
-    "train_until",
-    "value",
-    "value_is_stable",
-    "with_exact_value",
-]
+from jaxltl.algos.maximin_q.problem import (
+    Problem as Problem,
+    make_problem as make_problem,
+    recurrent_states as recurrent_states,
+    with_exact_value as with_exact_value,
+)

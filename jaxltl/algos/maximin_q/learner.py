@@ -40,33 +40,27 @@ Example: in one state the system may stay or move to the other state, where it i
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
 from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, splitmix
-from jaxltl.algos.common.play import draw, observed_reward, take
+from jaxltl.algos.common.play import draw, draw_alias, observed_reward, take
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.algos.maximin_q._alias import draw_alias
 from jaxltl.algos.maximin_q.problem import Problem
+from jaxltl.core import struct
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
-from jaxltl.core.models.protocols import Array
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
+from jaxltl.core.models.protocols import Array, Key, Numeric
 from jaxltl.core.validation import Range
 
 MOST_VISITS = 2**30  # counted; a step adds at most as many again
 _UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced, None is static.
@@ -100,7 +94,6 @@ class Hparams:
     moves_per_step: int = static(COUNT, default=64)
 
 
-@brief
 @struct.dataclass
 class State:
     """The table, and the chains that update it.
@@ -132,8 +125,7 @@ class State:
     pending_reward: Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures after a step; scalars, of a run ``[T]``.
 
@@ -158,7 +150,7 @@ class Metrics:
 
 
 @jax.jit
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A table of ``hparams.initial_value``, and chains at initial states."""
     _check(problem, hparams)
     dtype, is_system, num_chains = problem.game.dtype, problem.game.system, hparams.num_chains
@@ -240,7 +232,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     )
 
 
-def value_is_stable(tolerance: chex.Numeric) -> loops.Until:
+def value_is_stable(tolerance: Numeric) -> loops.Until:
     """A condition for ``run_until``: no value changed by more than `tolerance`, no entry is new.
 
     Evidence of convergence, not a proof; a longer window ``check_every`` gives better evidence.
@@ -249,7 +241,7 @@ def value_is_stable(tolerance: chex.Numeric) -> loops.Until:
 
 
 def _value_is_stable(
-    tolerance: chex.Numeric, before: State, after: State, metrics: Metrics
+    tolerance: Numeric, before: State, after: State, metrics: Metrics
 ) -> jax.Array:
     change = jnp.max(jnp.abs(after.value - before.value))
     new = jnp.any((before.visits == 0) & (after.visits > 0))
@@ -299,8 +291,7 @@ def _move(
     game, source = problem.game, state.position
     action = _choose(chains, i, problem, sampling)
     pair = source * game.num_actions + action
-    key = jax.random.fold_in(sampling.successor_key, i)
-    target = _sample(game, key, source, action)
+    target = _sample(game, jax.random.fold_in(sampling.successor_key, i), source, action)
     reward = observed_reward(game, problem.reward, source, action, target)
     discount = jnp.asarray(hparams.discount, state.q.dtype)
     environment_discount = discount if hparams.per == "move" else jnp.ones_like(discount)
@@ -455,8 +446,7 @@ def _answers(problem: Problem) -> jax.Array:
     mdp = problem.game.mdp
     k = jnp.argmax(mdp.probability, axis=-1)[..., None]
     between = jnp.take_along_axis(mdp.successor, k, axis=-1)[..., 0]
-    mine = problem.allowed & problem.game.system[:, None]
-    return mine[..., None] & problem.allowed[between]
+    return (problem.allowed & problem.game.system[:, None])[..., None] & problem.allowed[between]
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:

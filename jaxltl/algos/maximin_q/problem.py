@@ -8,10 +8,11 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common.play import (
+    MOST_ACTIONS,
+    alias_table,
     check_reward,
     cumulative,
     environment_policy,
@@ -19,16 +20,14 @@ from jaxltl.algos.common.play import (
     start_distribution,
     uniform_rows,
 )
-from jaxltl.algos.maximin_q._alias import MOST_ACTIONS, alias_table
+from jaxltl.core import struct
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
 
-@brief
 @struct.dataclass
 class Problem:
     """A game with rewards that the learner observes only along its transitions.

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common import trees
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core import struct
+from jaxltl.core.array_types import PyTree
 
 _MOST = 16  # evaluations for one step
 _DECREASE, _CURVATURE = 1e-4, 0.9  # Wolfe's constants
@@ -59,9 +59,7 @@ def _directions() -> optax.GradientTransformation:
 def start(parameters: PyTree, point: Point) -> Search:
     """The state before the first evaluation; `point` gives the shapes."""
     zero = optax.tree.zeros_like(parameters)
-    # optax starts from weakly typed zeros, which a second run would compile anew for.
-    memory = trees.strong(_directions().init(parameters))
-    return Search(point, zero, memory, jnp.bool_(False))
+    return Search(point, zero, trees.strong(_directions().init(parameters)), jnp.bool_(False))
 
 
 def step(evaluate: Callable[[PyTree, Point], Point], search: Search) -> tuple[Search, Point]:

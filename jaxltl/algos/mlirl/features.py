@@ -272,11 +272,9 @@ def progress_states(model: Product) -> tuple[int, ...]:
     """
     automaton = jax.tree.map(np.asarray, model.automaton)
     delta = automaton.delta[:, np.unique(np.asarray(model.letter))]
-    final = automaton.final
-    distance = np.where(final, 0.0, np.inf)
+    distance = np.where(automaton.final, 0.0, np.inf)
     for _ in range(len(delta)):
         distance = np.minimum(distance, 1 + distance[delta].min(axis=1))
     starts = np.asarray(model.initial_memory)[np.asarray(model.mdp.initial) > 0]
-    finite = distance[starts][np.isfinite(distance[starts])]
-    farthest = finite.max(initial=0)
+    farthest = distance[starts][np.isfinite(distance[starts])].max(initial=0)
     return tuple(int(q) for q in np.flatnonzero((distance > 0) & (distance < farthest)))

@@ -33,14 +33,11 @@ Example: two demonstrations that reach the goal, and two features.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxltl.core import struct
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner, optimizers, trees
@@ -53,14 +50,14 @@ from jaxltl.algos.mlirl.features import (
     task_features as task_features,
     world_features as world_features,
 )
+from jaxltl.core import struct
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.construct.lifting import allowed_steps, lift_trajectories
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.validation import Range
 from jaxltl.core.values.discounted.boltzmann import boltzmann_value
@@ -104,7 +101,6 @@ def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
     return features @ weights
 
 
-@brief
 @struct.dataclass
 class Problem:
     """A model, features, demonstrations, and a class of rewards.
@@ -126,7 +122,6 @@ class Problem:
     reward: Reward = struct.field(pytree_node=False, default=linear_reward)
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -153,7 +148,6 @@ class Hparams:
     optimizer: str = static(("lbfgs", *optimizers.NAMES), default="lbfgs")
 
 
-@brief
 @struct.dataclass
 class State:
     """Parameters, and the initial value of the next solve.
@@ -172,8 +166,7 @@ class State:
     optimizer: PyTree
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
@@ -192,7 +185,6 @@ class Metrics:
     status: jax.Array
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
     """Terms of the loss.
@@ -312,8 +304,7 @@ def objective(
     solution = _solve(reward, problem, hparams, initial)
     logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
     log_policy = jax.nn.log_softmax(logits, axis=-1)
-    seen = problem.counts > 0
-    log_likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
+    log_likelihood = jnp.sum(problem.counts * jnp.where(problem.counts > 0, log_policy, 0))
     flat, _ = ravel_pytree(parameters)
     loss = -log_likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
     satisfaction, status = jnp.full((), jnp.nan, loss.dtype), solution.status
@@ -337,7 +328,7 @@ def objective(
     return loss, parts
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
     flat, unravel = ravel_pytree(problem.start)
     noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
@@ -353,7 +344,7 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
             parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
         )
     else:
-        optimizer = trees.strong(_optimizer(hparams).init(parameters))
+        optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
     return State(key, jnp.int32(0), parameters, value, optimizer)
 
 
@@ -383,7 +374,7 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
         parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
     else:
         before = _evaluate(state.parameters, problem, hparams, state.value)
-        updates, optimizer = _optimizer(hparams).update(
+        updates, optimizer = optimizers.optimizer_of(hparams).update(
             before.gradient, state.optimizer, state.parameters
         )
         parameters, value = optax.apply_updates(state.parameters, updates), _usable(before.parts)
@@ -401,10 +392,6 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
 def _usable(parts: Objective) -> jax.Array:
     """The value, or zero if its solve failed, as the initial value of the next solve."""
     return jnp.where(parts.status < Status.NONFINITE, parts.value, 0)
-
-
-def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 # Metrics, and so their gradient, describe the state before a step.

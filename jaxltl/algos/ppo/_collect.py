@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -18,9 +17,9 @@ from jaxltl.algos.common.actor_critic import Output, evaluated
 from jaxltl.algos.common.collection import Transition, generalized_advantages, transition
 from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
 from jaxltl.algos.ppo.state import Hparams, Problem, State, Walkers
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment
 from jaxltl.core.models.mesh import lanes
-from jaxltl.core.models.protocols import PyTree
 
 
 class Rows(NamedTuple):
@@ -52,7 +51,7 @@ class _Record(NamedTuple):
 
 
 def collected(
-    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams
+    key: Key, state: State, problem: Problem, hparams: Hparams
 ) -> tuple[State, PyTree, Rows, dict[str, jax.Array]]:
     """T transitions of N environments: the next state, initial memories, transitions, and figures."""
     walkers, record = _walked(key, state, problem, hparams)
@@ -85,8 +84,7 @@ def collected(
     rows = Rows(seen, record.start, path.allowed, path.raw, path.log_density, value, found)
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
-    target = found + value
-    spread = jnp.var(target)
+    spread = jnp.var(found + value)
     figures = {
         "reward": path.reward.astype(dtype).mean(),
         "cost": path.cost.astype(dtype).mean(),
@@ -117,9 +115,7 @@ def _discounted_sums(
     return sums, replace(walkers, discounted=last)
 
 
-def _walked(
-    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams
-) -> tuple[Walkers, _Record]:
+def _walked(key: Key, state: State, problem: Problem, hparams: Hparams) -> tuple[Walkers, _Record]:
     environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
     noise_key, move_key, reset_key = jax.random.split(key, 3)
     dtype = state.walkers.discounted.dtype
@@ -148,10 +144,10 @@ def _walk(
     parameters, moments, problem, hparams, pool = given
     environment = problem.environment
 
-    def evaluate(memory: chex.ArrayTree, observation: chex.ArrayTree) -> Output:
+    def evaluate(memory: PyTree, observation: PyTree) -> Output:
         return evaluated(problem, parameters, memory, normalized(moments, observation))
 
-    def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> tuple[Walkers, _Record]:
+    def one(walker: Walkers, noise: jax.Array, key: Key) -> tuple[Walkers, _Record]:
         before = (walker.world, walker.memory)
         world, memory, made = transition(environment, evaluate, hparams.squash, before, noise, key)
         total, length = walker.episode_return + made.reward, walker.episode_length + 1
@@ -190,7 +186,7 @@ def _walk(
     return walkers, path
 
 
-def _starts(key: chex.PRNGKey, environment: Environment, hparams: Hparams) -> tuple[PyTree, PyTree]:
+def _starts(key: Key, environment: Environment, hparams: Hparams) -> tuple[PyTree, PyTree]:
     """Initial states or keys ``[T, N]`` of the episodes that begin, or a pool of initial states."""
     size, number = (hparams.num_steps, hparams.num_envs), hparams.num_resets
     if number:

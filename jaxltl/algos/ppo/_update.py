@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -14,12 +13,11 @@ from jax import lax
 from jaxltl.algos.common import action_distributions as actions_of, trees
 from jaxltl.algos.common.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.common.collection import minibatch_epochs
-from jaxltl.algos.common.schedules import Schedule, at
+from jaxltl.algos.common.schedules import at
 from jaxltl.algos.ppo._collect import Rows
 from jaxltl.algos.ppo.state import Hparams, Problem, State
+from jaxltl.core.array_types import Key, Numeric, PyTree
 from jaxltl.core.models.mesh import lanes
-from jaxltl.core.models.protocols import PyTree
-
 
 Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, or means
 
@@ -27,8 +25,8 @@ Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, 
 class Limits(NamedTuple):
     """Values of schedules in this step."""
 
-    clip: chex.Numeric
-    value_clip: chex.Numeric | None
+    clip: Numeric
+    value_clip: Numeric | None
 
 
 def descent(hparams: Hparams) -> optax.GradientTransformation:
@@ -96,64 +94,52 @@ def _said(parameters: PyTree, rows: Rows, begun: PyTree, problem: Problem) -> Ou
     return lax.scan(on, begun, (rows.start, rows.observation))[1]
 
 
-class _Going(NamedTuple):
-    parameters: PyTree
-    optimizer: PyTree
-    stopped: jax.Array
-
-
 def improved(
-    key: chex.PRNGKey, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
+    key: Key, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
 ) -> tuple[PyTree, PyTree, Figures]:
     """Parameters and optimiser state after the epochs, up to `target_kl`, and mean figures."""
-    limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
+    limits = Limits(at(hparams.clip, state.step), at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)
     recurrent, over = has_memory(problem), hparams.sharding
     rows, begun = lanes.replicate((rows, begun), over)  # a minibatch may contain any of them
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
 
-    def update(going: _Going, chosen: jax.Array) -> tuple[_Going, PyTree]:
+    def update(carry: PyTree, chosen: jax.Array) -> tuple[PyTree, PyTree]:
+        *before, stopped = carry
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
         some, memory = lanes.split_axis(some, over, int(recurrent)), lanes.split_axis(memory, over)
         (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
-            going.parameters, some, memory, problem, hparams, limits
+            before[0], some, memory, problem, hparams, limits
         )
         slope, told = lanes.replicate((slope, told), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
         told = told | {"gradient_norm": norm}
-        stopped = going.stopped
         if hparams.target_kl is not None:
             stopped |= told["kl"] > hparams.target_kl
         finite = jnp.isfinite(norm)
         if hparams.max_gradient_norm is not None:
             shorter = jnp.minimum(1, hparams.max_gradient_norm / jnp.maximum(norm, 1e-38))
             slope = jax.tree.map(lambda x: x * shorter.astype(x.dtype), slope)
-        change, optimizer = descent(hparams).update(slope, going.optimizer)
-        parameters = jax.tree.map(
-            lambda x, u: x - (rate * u).astype(x.dtype), going.parameters, change
-        )
+        change, optimizer = descent(hparams).update(slope, before[1])
+        parameters = jax.tree.map(lambda x, u: x - (rate * u).astype(x.dtype), before[0], change)
         made = finite & ~stopped
-        new = trees.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
-        return _Going(new[0], new[1], stopped), (told, made, ~finite & ~stopped)
+        new = trees.choose(made, (parameters, optimizer), tuple(before))
+        return (*new, stopped), (told, made, ~finite & ~stopped)
 
-    going, (told, made, lost) = minibatch_epochs(
+    (parameters, optimizer, _), (told, made, lost) = minibatch_epochs(
         key,
         update,
-        _Going(state.parameters, state.optimizer, jnp.bool_(False)),
+        (state.parameters, state.optimizer, jnp.bool_(False)),
         hparams.num_envs if recurrent else len(rows.value),
         num_epochs=hparams.num_epochs,
         num_minibatches=hparams.num_minibatches,
     )
-    number, lost = made.sum(), lost.sum()
+    number = made.sum()
     figures = {
         name: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan)
         for name, x in told.items()
     }
-    figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.astype(jnp.int32)}
-    return going.parameters, going.optimizer, figures
-
-
-def _at(schedule: Schedule | None, step: jax.Array) -> chex.Numeric | None:
-    return None if schedule is None else at(schedule, step)
+    figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.sum().astype(jnp.int32)}
+    return parameters, optimizer, figures

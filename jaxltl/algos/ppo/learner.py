@@ -48,7 +48,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -71,6 +70,7 @@ from jaxltl.algos.ppo._collect import collected
 from jaxltl.algos.ppo._update import descent, improved
 from jaxltl.algos.ppo.state import Hparams, Metrics, Problem, State, Walkers
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
@@ -80,7 +80,6 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.models.mesh import lanes
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Status
 
 __all__ = [
@@ -188,13 +187,13 @@ def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> A
 
 
 @cache  # the same function each time, so that what runs an agent is compiled once
-def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, chex.ArrayTree]]:
+def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, PyTree]]:
     def act(
         run: tuple[Problem, PyTree, PyTree],
         memory: PyTree,
         observation: PyTree,
         allowed: jax.Array | None,
-        key: chex.PRNGKey,
+        key: Key,
     ) -> tuple[jax.Array, PyTree]:
         problem, parameters, moments = run
         output = evaluated(problem, parameters, memory, normalized(moments, observation))
@@ -208,14 +207,14 @@ def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, chex.Ar
 # --- learning -------------------------------------------------------------------------------------
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """Random parameters, and N environments at initial states."""
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
 
 @jax.jit
-def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
     network_key, world_key = jax.random.split(learner.init_key(key))
     size = hparams.num_envs
     worlds = jax.vmap(problem.environment.reset)(jax.random.split(world_key, size))

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import flax.linen as nn
 import jax
-from jaxltl.core import struct
 from jax.sharding import NamedSharding
 
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.moments import Moments
 from jaxltl.algos.common.schedules import Schedule
 from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.core import struct
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.environments.environment import Environment
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
 
 
-@brief
 @struct.dataclass
 class Problem:
     """An environment and a network; made by :func:`make_problem`.
@@ -36,7 +31,6 @@ class Problem:
     network: nn.Module = struct.field(pytree_node=False)
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced, None is static.
@@ -97,7 +91,6 @@ class Hparams:
     sharding: NamedSharding | None = struct.field(pytree_node=False, default=None)
 
 
-@brief
 @struct.dataclass
 class Walkers:
     """N parallel environments: states, memories, and figures of their current episodes, ``[N, ...]``."""
@@ -109,7 +102,6 @@ class Walkers:
     discounted: jax.Array
 
 
-@brief
 @struct.dataclass
 class State:
     """A policy, its optimiser, and the environments.
@@ -134,8 +126,7 @@ class State:
     transitions: jax.Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of a step; scalars. Those of episodes are of the policy before it.
 

@@ -1,47 +1,29 @@
 """R-max in the almost-sure winning region of a stochastic game."""
 
 from jaxltl.algos.rmax.evidence import (
-    DataEvidence,
-    Evidence,
-    data_evidence,
-    evidence,
-    wins_almost_surely,
+    DataEvidence as DataEvidence,
+    Evidence as Evidence,
+    data_evidence as data_evidence,
+    evidence as evidence,
+    wins_almost_surely as wins_almost_surely,
 )
 from jaxltl.algos.rmax.learner import (
-    init,
-    measure,
-    observe,
-    policy,
-    run,
-    run_until,
-    step,
-    strategy_is_stable,
-    train,
-    train_until,
+    init as init,
+    measure as measure,
+    observe as observe,
+    policy as policy,
+    run as run,
+    run_until as run_until,
+    step as step,
+    strategy_is_stable as strategy_is_stable,
+    train as train,
+    train_until as train_until,
 )
-from jaxltl.algos.rmax.problem import Problem, make_problem
-from jaxltl.algos.rmax.state import UPDATES, Hparams, Metrics, State
-
-__all__ = [
-    "UPDATES",
-    "DataEvidence",
-    "Evidence",
-    "Hparams",
-    "Metrics",
-    "Problem",
-    "State",
-    "data_evidence",
-    "evidence",
-    "init",
-    "make_problem",
-    "measure",
-    "observe",
-    "policy",
-    "run",
-    "run_until",
-    "step",
-    "strategy_is_stable",
-    "train",
-    "train_until",
-    "wins_almost_surely",
-]
+from jaxltl.algos.rmax.problem import (
+    UPDATES as UPDATES,
+    Hparams as Hparams,
+    Metrics as Metrics,
+    Problem as Problem,
+    State as State,
+    make_problem as make_problem,
+)

@@ -7,20 +7,18 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common import pac
 from jaxltl.algos.rmax.learner import policy
-from jaxltl.algos.rmax.problem import Problem
-from jaxltl.algos.rmax.state import Hparams, State, reward_error
+from jaxltl.algos.rmax.problem import Hparams, Problem, State, reward_error
+from jaxltl.core import struct
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Rewards
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.types import Solution
@@ -29,7 +27,6 @@ from jaxltl.core.values.interval.robust import robust_discounted_value
 from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
 
-@brief
 @struct.dataclass
 class DataEvidence:
     """Bounds that hold simultaneously with a confidence; NaN outside of the region.
@@ -47,7 +44,6 @@ class DataEvidence:
     num_samples: int = struct.field(pytree_node=False)
 
 
-@brief
 @struct.dataclass
 class Evidence:
     """Certificates of a strategy in the true game; made by :func:`evidence`.

@@ -45,7 +45,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,28 +52,26 @@ from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, pac, splitmix
 from jaxltl.algos.common.play import draw
-from jaxltl.algos.rmax._optimistic_model import (
-    exploration,
-    required_visits,
-    solver_tolerance,
-    unknown_reward,
-    update_model,
-)
 from jaxltl.algos.rmax._rollout import (
     Rules,
     Transition,
+    exploration,
     move,
     pair_flags,
     record,
     record_last,
+    required_visits,
+    solver_tolerance,
     start_rollout,
+    unknown_reward,
+    update_model,
 )
-from jaxltl.algos.rmax.problem import Problem
-from jaxltl.algos.rmax.state import Hparams, Metrics, State, reward_error
+from jaxltl.algos.rmax.problem import Hparams, Metrics, Problem, State, reward_error
+from jaxltl.core.array_types import Key, Numeric
 
 
 @jax.jit
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """No pair known: each is assumed to pay ``R_max / (1 - discount)`` for ever."""
     game, shape = problem.game, problem.game.mdp.probability.shape
     listed = game.mdp.probability > 0
@@ -145,7 +142,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     )
 
 
-def strategy_is_stable(moves: chex.Numeric) -> loops.Until:
+def strategy_is_stable(moves: Numeric) -> loops.Until:
     """A condition for ``run_until``: the strategy has not changed for a number of `moves`."""
     return Partial(_strategy_is_stable, moves)
 

@@ -35,12 +35,9 @@ Example: a reward of the state, and the policy that it gives in another world.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -48,22 +45,18 @@ from flax import linen as nn
 from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
-from jaxltl.algos.common.early_stopping import Best, stop_early
+from jaxltl.algos.common.learner import Best, stop_early
 from jaxltl.algos.todirl.planning import backward_induction, reward, soft_plan
 from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 from jaxltl.core import struct
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.ops.successor_tables import PredecessorTable
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
-_ResultT = TypeVar("_ResultT")
 
-
-@brief
 @struct.dataclass
 class State:
     """Parameters; once `stopped`, only the step counter changes.
@@ -73,7 +66,7 @@ class State:
       parameters: of the network, a pytree.
       value: ``float[W, S, Q]``, the soft value that the next solve starts from.
       optimizer: optax's state.
-      best: the best held-out parameters, :class:`~jaxltl.algos.common.early_stopping.Best`.
+      best: the best held-out parameters, :class:`~jaxltl.algos.common.learner.Best`.
       stopped: ``bool[]``, whether patience is exhausted.
     """
 
@@ -86,8 +79,7 @@ class State:
     stopped: jax.Array
 
 
-@brief(facts=partial(history, codes={"status": Status}))
-@struct.dataclass
+@struct.metrics
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
@@ -125,15 +117,7 @@ def solve(
         rewards = reward(problem.network, parameters, model, observation)
         return soft_plan(rewards, model, hparams, initial)
 
-    return _each_world(world, problem.model, problem.observation, _initial(problem, initial))
-
-
-def _each_world(function: Callable[..., _ResultT], *arguments: PyTree) -> _ResultT:
-    """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
-    if jax.tree.leaves(arguments)[0].shape[0] == 1:
-        one = function(*(jax.tree.map(lambda x: x[0], y) for y in arguments))
-        return jax.tree.map(lambda x: x[None], one)
-    return jax.vmap(function)(*arguments)
+    return trees.each_world(world, problem.model, problem.observation, _initial(problem, initial))
 
 
 def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
@@ -145,7 +129,6 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
 # --- learning -------------------------------------------------------------------------------------
 
 
-@brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
     """Terms of the loss, and the soft values.
@@ -197,7 +180,7 @@ def objective(
         by_time = hparams.horizon is not None
         return (_time_dependent if by_time else _stationary)(rewards, data, hparams)
 
-    found = _each_world(
+    found = trees.each_world(
         likelihood,
         _World(
             model=problem.model,
@@ -211,8 +194,7 @@ def objective(
     weight = problem.weight
     pairs, other_pairs = (weight @ jnp.sum(x, axis=(1, 2, 3)) for x in _flat(counts, held_out))
     neg = -weight @ found.demonstrated
-    squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
-    loss = neg + hparams.l2 / 2 * squares
+    loss = neg + hparams.l2 / 2 * sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
     score = lax.stop_gradient(-(weight @ found.held_out) / other_pairs)
     parts = Objective(
         neg_log_likelihood=neg,
@@ -316,7 +298,7 @@ def _flat(*counts: jax.Array) -> list[jax.Array]:
     return [x.reshape(x.shape[0], -1, *x.shape[-2:]) for x in counts]
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
     inputs = network_inputs(problem.model, problem.observation[0])
@@ -327,17 +309,14 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         step=jnp.int32(0),
         parameters=parameters,
         value=_initial(problem, None),
-        # optax starts from weakly typed zeros, which a second run would compile anew for.
-        optimizer=jax.tree.map(
-            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
-        ),
+        optimizer=trees.strong(optimizers.optimizer_of(hparams).init(parameters)),
         best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
 
 
 @partial(jax.jit, static_argnums=0)
-def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) -> PyTree:
+def _draw(network: nn.Module, key: Key, inputs: tuple[jax.Array, ...]) -> PyTree:
     return network.init(key, *inputs)
 
 
@@ -350,7 +329,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams, state.value
     )
-    updates, optimizer = _optimizer(hparams).update(
+    updates, optimizer = optimizers.optimizer_of(hparams).update(
         gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
     )
     metrics = Metrics(
@@ -374,10 +353,6 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     )
     after = trees.choose(stopped, replace(state, best=best, stopped=stopped), after)
     return replace(after, step=state.step + 1), metrics
-
-
-def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -8,9 +8,9 @@ from flax import linen as nn
 from jax import lax
 
 from jaxltl.algos.todirl.problem import Hparams, network_inputs
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 
 from jaxltl.algos.common import optimizers
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.algos.todirl.networks import RewardNetwork
+from jaxltl.algos.common.settings import COUNT, Number, require_output, static, traced
 from jaxltl.core import struct
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
     stack_models,
@@ -21,13 +22,63 @@ from jaxltl.core.models.construct.batch import (
 )
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import Range
 
 
-@brief
+class RewardNetwork(nn.Module):
+    """A multilayer perceptron with ReLU on (observation, memory, action).
+
+    Maps ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, to
+    ``float[...]``. The first layer is a sum of three, so that no input is repeated for each
+    combination with the others.
+
+    Attributes:
+      hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
+    """
+
+    hidden: Sequence[int] = (80, 80)
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        widths = (*self.hidden, 1)
+        inputs = (observation, memory, action)
+        sizes = [x.shape[-1] for x in inputs]
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
+        bias = self.param("bias", nn.initializers.zeros_init(), (widths[0],))
+        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
+        x = terms[0] + (terms[1] + terms[2] + bias)
+        rows = x.shape[:-1]
+        x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
+        for width in widths[1:]:
+            x = nn.Dense(width)(nn.relu(x))
+        return x.reshape(rows)
+
+
+class Concatenated(nn.Module):
+    """A reward network from one of concatenated inputs, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``.
+
+    Attributes:
+      network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
+
+    >>> import jax
+    >>> read = jnp.zeros((5, 3)), jnp.zeros((5, 2)), jnp.zeros((5, 4))
+    >>> jax.eval_shape(Concatenated(nn.Dense(1)).init_with_output, jax.random.key(0), *read)[0].shape
+    (5,)
+    """
+
+    network: nn.Module
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        inputs = (observation, memory, action)
+        rows = jnp.broadcast_shapes(*(x.shape[:-1] for x in inputs))
+        wide = [jnp.broadcast_to(x, (*rows, x.shape[-1])) for x in inputs]
+        result = self.network(jnp.concatenate(wide, axis=-1))
+        return result[..., 0] if result.shape == (*rows, 1) else result
+
+
 @struct.dataclass
 class Problem:
     """Products of worlds with the task, observations, and demonstrations.
@@ -58,7 +109,6 @@ class Problem:
         return self.counts.shape[1] if self.counts.ndim == 5 else None
 
 
-@brief
 @struct.dataclass
 class Hparams:
     """Settings; numbers are traced.
@@ -100,7 +150,7 @@ def make_problem(
     horizon: int | None = None,
     allowed: PyTree = None,
 ) -> Problem:
-    """A checked :class:`Problem`, on the host.
+    """A checked :class:`Problem` with arrays stacked over W worlds, on the host.
 
     Args:
       worlds: a product, several, or products stacked along a first axis of W worlds.
@@ -113,9 +163,6 @@ def make_problem(
       horizon: count pairs by time, for ``Hparams.horizon``.
       allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies; default all.
         Demonstrated steps outside of it do not count.
-
-    Returns:
-      :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
       ValueError: arguments of different or wrong shapes, demonstrations that do not fit their world or
@@ -131,7 +178,15 @@ def make_problem(
     if weight.shape != (num_worlds,):
         raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")
     network = RewardNetwork() if network is None else network
-    _require_reward(network, model, observation)
+    inputs = network_inputs(model, observation[0])
+    require_output(
+        "the network's reward has",
+        network,
+        inputs,
+        (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:])),
+        "one number for each state, memory and action. A module on one vector is wrapped as "
+        "Concatenated(module).",
+    )
     return Problem(
         model=model,
         observation=observation,
@@ -141,18 +196,6 @@ def make_problem(
         predecessors=predecessor_table([lane(model, w) for w in range(num_worlds)]),
         network=network,
     )
-
-
-def _require_reward(network: nn.Module, model: Product, observation: jax.Array) -> None:
-    inputs = network_inputs(model, observation[0])
-    found = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
-    expected = (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:]))
-    if getattr(found, "shape", None) != expected:
-        what = getattr(found, "shape", type(found).__name__)
-        raise ValueError(
-            f"the network's reward has shape {what}; expected {expected}, one number for each "
-            "state, memory and action. A module on one vector is wrapped as Concatenated(module)."
-        )
 
 
 def network_inputs(

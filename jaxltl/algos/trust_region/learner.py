@@ -53,25 +53,27 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from jaxltl.algos.common import learner
+from jaxltl.algos.common import learner, trees
 from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import no_moments, updated_moments
 from jaxltl.algos.trust_region._policy_networks import (
+    fitted,
     gaussian,
     inputs_at,
     kl_divergence,
     mean_network,
     normalized,
+    positive,
     refolded,
     value_inputs,
     value_network,
     values_at,
+    weighted_variance,
 )
 from jaxltl.algos.trust_region._step import (
     Surrogate,
@@ -80,7 +82,6 @@ from jaxltl.algos.trust_region._step import (
     line_search,
     surrogate,
 )
-from jaxltl.algos.trust_region._value_fit import fitted, positive, weighted_variance
 from jaxltl.algos.trust_region.policies import (
     Batch,
     act,
@@ -90,10 +91,18 @@ from jaxltl.algos.trust_region.policies import (
     require_state,
     rollout,
 )
-from jaxltl.algos.trust_region.problem import Problem, action_size, make_problem, observed_vector
-from jaxltl.algos.trust_region.state import METHODS, Hparams, Metrics, State
+from jaxltl.algos.trust_region.state import (
+    METHODS,
+    Hparams,
+    Metrics,
+    Problem,
+    State,
+    action_size,
+    make_problem,
+    observed_vector,
+)
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import require_key
-from jaxltl.core.models.protocols import PyTree
 
 __all__ = [
     "METHODS",
@@ -127,14 +136,14 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
 
 
-def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """Random networks; moments of observations from a first batch if observations are normalised."""
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
 
 @jax.jit
-def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
     seen = jax.eval_shape(lambda k: observed_vector(problem, problem.environment.reset(k)), key)
     num_actions = action_size(problem)
     dtype, (size,), num_values = seen.dtype, seen.shape, 1 + (hparams.method == "cpo")
@@ -151,11 +160,7 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         parameters={"mean": mean["params"], "log_deviation": log_deviation},
         values=values,
         value_moments=jnp.stack([jnp.zeros(num_values, dtype), jnp.ones(num_values, dtype)]),
-        # optax starts from weakly typed zeros, which a second run would compile anew for.
-        optimizer=jax.tree.map(
-            lambda x: jnp.asarray(x, jnp.result_type(x)),
-            optax.adam(hparams.value_rate).init(values),
-        ),
+        optimizer=trees.strong(optax.adam(hparams.value_rate).init(values)),
         moments=no_moments((size,), dtype),
         trajectories=jnp.int32(0),
     )

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -16,12 +15,11 @@ from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
 from jaxltl.algos.common.collection import Transition, transition
 from jaxltl.algos.trust_region._policy_networks import gaussian, normalized
-from jaxltl.algos.trust_region.problem import Problem, as_action, observed_vector
-from jaxltl.algos.trust_region.state import Hparams, State
+from jaxltl.algos.trust_region.state import Hparams, Problem, State, as_action, observed_vector
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import flat_observation, require_key, some_action
 from jaxltl.core.environments.episodes import Agent
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -97,7 +95,7 @@ def _agent(
 
 
 def _sampled_action(
-    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: chex.PRNGKey
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
 ) -> tuple[jax.Array, PyTree]:
     state, problem, hparams = run
     mean, deviation = act(state, hparams, flat_observation(observation))
@@ -106,7 +104,7 @@ def _sampled_action(
 
 
 def _mean_action(
-    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: chex.PRNGKey
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
 ) -> tuple[jax.Array, PyTree]:
     state, problem, hparams = run
     return as_action(problem, act(state, hparams, flat_observation(observation))[0]), memory
@@ -125,7 +123,7 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
 
 
 def rollout(
-    key: chex.PRNGKey,
+    key: Key,
     state: State,
     problem: Problem,
     hparams: Hparams,
@@ -148,24 +146,19 @@ def rollout(
 
 @partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
 def _rollout(
-    key: chex.PRNGKey,
-    state: State,
-    problem: Problem,
-    hparams: Hparams,
-    num_trajectories: int,
-    sampled: bool,
+    key: Key, state: State, problem: Problem, hparams: Hparams, num_trajectories: int, sampled: bool
 ) -> Batch:
     environment, size = problem.environment, (problem.horizon, num_trajectories)
     start, noise_key, step_key = jax.random.split(key, 3)
     worlds = jax.vmap(environment.reset)(jax.random.split(start, num_trajectories))
 
-    def evaluate(memory: chex.ArrayTree, observation: chex.ArrayTree) -> Output:
+    def evaluate(memory: PyTree, observation: PyTree) -> Output:
         mean, deviation = act(state, hparams, flat_observation(observation))
         shape = some_action(environment.actions).shape
         action = (mean.reshape(shape), jnp.log(deviation).reshape(shape))
         return Output(memory, action, jnp.zeros((), mean.dtype))
 
-    def one(world: chex.ArrayTree, *chance: jax.Array) -> tuple[chex.ArrayTree, Transition]:
+    def one(world: PyTree, *chance: jax.Array) -> tuple[PyTree, Transition]:
         after, _, record = transition(environment, evaluate, None, (world, ()), *chance)
         return after, record
 

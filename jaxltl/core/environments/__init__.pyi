@@ -9,19 +9,18 @@ from .environment import (
 from .episodes import (
     Agent as Agent,
     Episode as Episode,
+    auto_reset_step as auto_reset_step,
     make_agent as make_agent,
     run_episode as run_episode,
-    auto_reset_step as auto_reset_step,
 )
-from .finite_task import (
+from .model_environment import model_environment as model_environment
+from .monitor import (
     FiniteTask as FiniteTask,
+    Monitor as Monitor,
+    Verdict as Verdict,
     VerdictFrequencies as VerdictFrequencies,
     finite_verdict_frequencies as finite_verdict_frequencies,
     make_finite_task as make_finite_task,
-)
-from .monitor import (
-    Monitor as Monitor,
-    Verdict as Verdict,
     make_monitor as make_monitor,
     monitor_step as monitor_step,
     monitor_verdict as monitor_verdict,
@@ -35,14 +34,13 @@ from .sequence_task import (
     sequence_environment as sequence_environment,
     sequence_sampler as sequence_sampler,
 )
-from .model_environment import model_environment as model_environment
 from .tabulate import Table as Table, tabulate as tabulate
 from .task_environment import (
     TaskObservation as TaskObservation,
     TaskTables as TaskTables,
     TaskWorld as TaskWorld,
+    residual_formula as residual_formula,
     stack_tasks as stack_tasks,
     task_environment as task_environment,
-    residual_formula as residual_formula,
 )
 from .time_limit import with_time_limit as with_time_limit

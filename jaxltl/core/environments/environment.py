@@ -22,31 +22,27 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypedDict, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
+from jax.extend.core import ClosedJaxpr, Jaxpr
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike, DTypeLike
-from jax.extend.core import ClosedJaxpr
 
+from jaxltl.core import struct, validation
+from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief, count, nested_repr, propositions_text, value_range
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import require_shape
-
 
 ENDINGS = ("repeat", "violated", "undecided")
 
 
-@brief
 @struct.dataclass
 class Finite:
     """The finite action space of the actions 0 to `num` - 1; `num` is static.
 
-    Example:
-      >>> Finite(4).num
-      4
+    >>> Finite(4).num
+    4
     """
 
     num: int = struct.field(pytree_node=False)
@@ -67,14 +63,13 @@ class Box:
       low, high: arrays that broadcast to the shape, infinite where unbounded.
       shape, dtype: the shape and the name of the dtype; static.
 
-    Example:
-      >>> space = make_box([-1.0, 0.0], 1.0)
-      >>> space.shape, space.low.tolist()
-      ((2,), [-1.0, 0.0])
+    >>> space = make_box([-1.0, 0.0], 1.0)
+    >>> space.shape, space.low.tolist()
+    ((2,), [-1.0, 0.0])
     """
 
-    low: chex.Array
-    high: chex.Array
+    low: Array
+    high: Array
     shape: tuple[int, ...] = struct.field(pytree_node=False)
     dtype: str = struct.field(pytree_node=False, default="float32")
 
@@ -98,9 +93,8 @@ def make_box(
     Raises:
       ValueError: bounds that cross, are not numbers, or do not fit the shape.
 
-    Example:
-      >>> make_box(-1.0, [1.0, 2.0]).shape
-      (2,)
+    >>> make_box(-1.0, [1.0, 2.0]).shape
+    (2,)
     """
     bounds = {"low": as_array(low), "high": as_array(high)}
     for name, bound in bounds.items():
@@ -160,18 +154,17 @@ class Timestep(NamedTuple):
       terminated, truncated: True in an absorbing state, and where only the simulation ends.
       discount: the discount of later rewards, a factor on the learner's own.
 
-    Example:
-      >>> made = Timestep(world=3, reward=1.0, terminated=True)
-      >>> made.world, made.truncated, made.discount
-      (3, False, 1.0)
+    >>> made = Timestep(world=3, reward=1.0, terminated=True)
+    >>> made.world, made.truncated, made.discount
+    (3, False, 1.0)
     """
 
     world: PyTree
-    reward: chex.Numeric
-    terminated: chex.Numeric
-    truncated: chex.Numeric = False
-    cost: chex.Numeric = 0.0
-    discount: chex.Numeric = 1.0
+    reward: Numeric
+    terminated: Numeric
+    truncated: Numeric = False
+    cost: Numeric = 0.0
+    discount: Numeric = 1.0
 
 
 def _spaces(tree: PyTree) -> str:
@@ -212,12 +205,11 @@ class Environment:
       horizon: an upper bound on the length of episodes, or None; static.
       ending: the default of the option `ending` of tasks, the verdict of terminal states; static.
 
-    Example:
-      >>> coin = make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2)
-      >>> coin.actions.num, coin.propositions, coin.horizon
-      (2, (), None)
+    >>> coin = make_environment(
+    ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
+    ...     lambda world: world[None], actions=2)
+    >>> coin.actions.num, coin.propositions, coin.horizon
+    (2, (), None)
     """
 
     reset: Callable[..., PyTree]
@@ -279,17 +271,16 @@ def make_environment(
       ValueError: a function with a result of another shape, a function that is not pure, or a
         repeated name.
 
-    Example:
-      >>> def reset(key):
-      ...     return jnp.int32(0)
-      >>> def step(place, action, key):
-      ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
-      ...     return Timestep(place, reward=0.0, terminated=place == 4)
-      >>> corridor = make_environment(
-      ...     reset, step, lambda place: place[None] / 4, actions=2,
-      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
-      >>> corridor.actions.num, corridor.observations.shape
-      (2, (1,))
+    >>> def reset(key):
+    ...     return jnp.int32(0)
+    >>> def step(place, action, key):
+    ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
+    ...     return Timestep(place, reward=0.0, terminated=place == 4)
+    >>> corridor = make_environment(
+    ...     reset, step, lambda place: place[None] / 4, actions=2,
+    ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+    >>> corridor.actions.num, corridor.observations.shape
+    (2, (1,))
     """
     validation.keywords("make_environment", options, EnvironmentOptions)
     names = validation.distinct_names("propositions", options.get("propositions", ()))
@@ -335,21 +326,23 @@ def make_environment(
 
 def as_partial(function: Callable[..., PyTree], name: str = "function") -> Partial:
     """A function as a pytree, which compiled functions accept as an argument."""
-    return (
-        function if isinstance(function, Partial) else Partial(validation.function(name, function))
-    )
+    if isinstance(function, Partial):
+        return function
+    return Partial(validation.function(name, function))
 
 
 def require_environment(environment: object) -> Environment:
     """An :class:`Environment`, or that of an object with the property `environment`; else ValueError."""
-    environment = getattr(environment, "environment", environment)
     found: Environment = validation.instance(
-        "environment", environment, Environment, "one of make_environment"
+        "environment",
+        getattr(environment, "environment", environment),
+        Environment,
+        "one of make_environment",
     )
     return found
 
 
-def require_key(key: chex.PRNGKey) -> chex.PRNGKey:
+def require_key(key: Key) -> Key:
     """Raises ValueError for anything but a single random key."""
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
@@ -371,9 +364,7 @@ def some_action(actions: Finite | Box) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype))
 
 
-def random_action(
-    key: chex.PRNGKey, actions: Finite | Box, allowed: chex.Array | None = None
-) -> jax.Array:
+def random_action(key: Key, actions: Finite | Box, allowed: Array | None = None) -> jax.Array:
     """A uniform random available action; normal in unbounded directions of a box."""
     if isinstance(actions, Finite):
         weight = jnp.zeros(actions.num) if allowed is None else jnp.where(allowed, 0, -jnp.inf)
@@ -387,7 +378,7 @@ def random_action(
     return jnp.where(bounded, inside, jnp.clip(normal, low, high))
 
 
-def clipped_action(actions: Box, action: chex.Array) -> jax.Array:
+def clipped_action(actions: Box, action: Array) -> jax.Array:
     """The projection of an action onto a box."""
     return jnp.clip(action, actions.low, actions.high)
 
@@ -398,6 +389,16 @@ def flat_observation(observation: PyTree) -> jax.Array:
     floats = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
     kind = jnp.result_type(*floats) if floats else jnp.result_type(float)
     return jnp.concatenate([jnp.ravel(x).astype(kind) for x in leaves])
+
+
+def optional(function: Callable[..., PyTree], *arguments: PyTree) -> Partial | None:
+    """``Partial(function, *arguments)``; None if the last argument is None."""
+    return None if arguments[-1] is None else Partial(function, *arguments)
+
+
+def of_world(function: Callable[..., PyTree], state: PyTree) -> PyTree:
+    """A function of the state ``state.world`` of an inner environment."""
+    return function(state.world)
 
 
 def allowed_in(environment: Environment, world: PyTree) -> jax.Array | None:
@@ -487,7 +488,7 @@ def _described(tree: PyTree) -> PyTree:
     )
 
 
-# --- purity ---------------------------------------------------------------------------------------
+# --- purity, and dependence on arguments -----------------------------------------------------------
 
 
 def traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
@@ -552,3 +553,25 @@ def _same(first: ClosedJaxpr, again: ClosedJaxpr) -> bool:
             and not jnp.issubdtype(getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key)
         )
     )
+
+
+def reads_key(function: Callable[..., PyTree], *arguments: PyTree) -> bool:
+    """True if a result may depend on the last argument; False is a proof, by the jaxpr."""
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    count = len(jax.tree.leaves(arguments[-1]))
+    return any(marked_results(program, [False] * (len(program.invars) - count) + [True] * count))
+
+
+def marked_results(program: Jaxpr, given: list[bool]) -> list[bool]:
+    """The results that may depend on marked arguments."""
+    marks = {id(x) for x, mark in zip(program.invars, given, strict=True) if mark}
+    for line in program.eqns:
+        reads = [id(x) in marks for x in line.invars]
+        if not any(reads):
+            continue
+        written = [True] * len(line.outvars)
+        part = line.params.get("jaxpr") if line.primitive.name in ("pjit", "jit") else None
+        if part is not None:
+            written = marked_results(part.jaxpr, reads)
+        marks |= {id(x) for x, mark in zip(line.outvars, written, strict=True) if mark}
+    return [id(x) in marks for x in program.outvars]

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core import struct, validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
@@ -36,7 +35,6 @@ def require_agent(agent: object) -> Agent:
     return found
 
 
-@brief
 @struct.dataclass
 class Agent:
     """An agent: a policy on observations, with memory.
@@ -46,10 +44,9 @@ class Agent:
         None where all actions are available.
       memory: the initial memory, a tree of arrays; ``()`` for none.
 
-    Example:
-      >>> first = Agent(lambda memory, observation, allowed, key: (allowed.argmax(), memory))
-      >>> int(first.act((), None, jnp.array([False, True]), None)[0])
-      1
+    >>> first = Agent(lambda memory, observation, allowed, key: (allowed.argmax(), memory))
+    >>> int(first.act((), None, jnp.array([False, True]), None)[0])
+    1
     """
 
     act: Callable[..., tuple[PyTree, PyTree]]
@@ -65,20 +62,15 @@ def make_agent(function: Callable[..., PyTree]) -> Agent:
     Returns:
       :class:`Agent`.
 
-    Example:
-      >>> still = make_agent(lambda observation, key: 0)
-      >>> still.act((), None, None, None)
-      (0, ())
+    >>> still = make_agent(lambda observation, key: 0)
+    >>> still.act((), None, None, None)
+    (0, ())
     """
     return Agent(Partial(_without_memory, as_partial(function)))
 
 
 def _without_memory(
-    function: Callable[..., PyTree],
-    memory: PyTree,
-    observation: PyTree,
-    allowed: object,
-    key: chex.PRNGKey,
+    function: Callable[..., PyTree], memory: PyTree, observation: PyTree, allowed: object, key: Key
 ) -> tuple[PyTree, PyTree]:
     del allowed
     return function(observation, key), memory
@@ -116,12 +108,11 @@ class Episode(NamedTuple):
       terminated, truncated: ``bool[]``; both False if T steps did not reach the end.
       discount: ``float[T]`` of the steps; one after the end.
 
-    Example:
-      >>> seen = Episode(world=[0, 1], observation=[0], action=[1], reward=[1.0], cost=[0.0],
-      ...                label=[[False], [True]], valid=[True], terminated=True, truncated=False,
-      ...                discount=[1.0])
-      >>> seen.world[-1], sum(seen.reward)
-      (1, 1.0)
+    >>> seen = Episode(world=[0, 1], observation=[0], action=[1], reward=[1.0], cost=[0.0],
+    ...                label=[[False], [True]], valid=[True], terminated=True, truncated=False,
+    ...                discount=[1.0])
+    >>> seen.world[-1], sum(seen.reward)
+    (1, 1.0)
     """
 
     world: PyTree
@@ -136,9 +127,7 @@ class Episode(NamedTuple):
     discount: jax.Array
 
 
-def run_episode(
-    key: chex.PRNGKey, environment: Environment, agent: Agent, *, num_steps: int
-) -> Episode:
+def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: int) -> Episode:
     """One episode of an agent, from ``reset`` to its end or for `num_steps` steps.
 
     Runs under ``jit`` and ``vmap``; the compiler drops fields that the caller does not use.
@@ -153,13 +142,12 @@ def run_episode(
     Raises:
       ValueError: `num_steps` below 1.
 
-    Example:
-      >>> from jaxltl import environments, gridworld
-      >>> world = environments.model_environment(gridworld("a . b", initial="a"), reward=[0, 0, 1])
-      >>> right = make_agent(lambda seen, key: 3)
-      >>> run = jax.jit(lambda key: run_episode(key, world, right, num_steps=3))
-      >>> run(jax.random.key(0)).reward.tolist()
-      [0.0, 1.0, 1.0]
+    >>> from jaxltl import environments, gridworld
+    >>> world = environments.model_environment(gridworld("a . b", initial="a"), reward=[0, 0, 1])
+    >>> right = make_agent(lambda seen, key: 3)
+    >>> run = jax.jit(lambda key: run_episode(key, world, right, num_steps=3))
+    >>> run(jax.random.key(0)).reward.tolist()
+    [0.0, 1.0, 1.0]
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)
@@ -211,9 +199,7 @@ class Move(NamedTuple):
     discount: jax.Array
 
 
-def begin_episode(
-    key: chex.PRNGKey, environment: Environment, agent: Agent
-) -> tuple[Underway, chex.PRNGKey]:
+def begin_episode(key: Key, environment: Environment, agent: Agent) -> tuple[Underway, Key]:
     """The initial state of an episode, and the key into which step numbers are folded."""
     start, path = jax.random.split(key)
     no = jnp.bool_(False)
@@ -221,7 +207,7 @@ def begin_episode(
 
 
 def continue_episode(
-    now: Underway, environment: Environment, agent: Agent, key: chex.PRNGKey
+    now: Underway, environment: Environment, agent: Agent, key: Key
 ) -> tuple[Underway, Move]:
     """One step of an episode; the identity after its end."""
     world, active = now.world, ~(now.terminated | now.truncated)
@@ -236,14 +222,13 @@ def continue_episode(
         t | (active & jnp.asarray(f, bool))
         for t, f in ((now.terminated, found.terminated), (now.truncated, found.truncated))
     )
-    label = environment.labels(world)
     return Underway(after, memory, terminated, truncated), Move(
-        world, observation, action, reward, cost, label, active, discount
+        world, observation, action, reward, cost, environment.labels(world), active, discount
     )
 
 
 def auto_reset_step(
-    environment: Environment, world: PyTree, action: PyTree, key: chex.PRNGKey
+    environment: Environment, world: PyTree, action: PyTree, key: Key
 ) -> tuple[PyTree, Timestep]:
     """A step that resets the environment where an episode ends.
 
@@ -254,15 +239,14 @@ def auto_reset_step(
       The next state, after a reset if the episode ended, and the :class:`Timestep` with the state
       before the reset.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0),
-      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
-      ...     lambda world: world[None], actions=2)
-      >>> onward, made = auto_reset_step(coin, jnp.int32(0), jnp.int32(1), jax.random.key(0))
-      >>> int(onward), int(made.world)
-      (0, 1)
+    >>> import jaxltl as jl
+    >>> coin = jl.environments.make_environment(
+    ...     lambda key: jnp.int32(0),
+    ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
+    ...     lambda world: world[None], actions=2)
+    >>> onward, made = auto_reset_step(coin, jnp.int32(0), jnp.int32(1), jax.random.key(0))
+    >>> int(onward), int(made.world)
+    (0, 1)
     """
     step_key, reset_key = jax.random.split(key)
     found = Timestep(*environment.step(world, action, step_key))

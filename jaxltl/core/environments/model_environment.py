@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +9,12 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.operators import sample_successor
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import SparseMDP
 
 
@@ -45,12 +43,11 @@ def model_environment(
       ValueError: rewards or an opponent of another shape, an opponent without a game, or a product
         (use ``task_environment`` on its model).
 
-    Example:
-      >>> from jaxltl import from_dense
-      >>> coin = model_environment(from_dense(
-      ...     [[[.5, .5]], [[0, 1]]], label=[[0], [1]], propositions=["heads"]))
-      >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
-      (1, (2,), [True])
+    >>> from jaxltl import from_dense
+    >>> coin = model_environment(from_dense(
+    ...     [[[.5, .5]], [[0, 1]]], label=[[0], [1]], propositions=["heads"]))
+    >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
+    (1, (2,), [True])
     """
     owner = model.system if isinstance(model, Game) else None
     model = model.mdp if isinstance(model, Game) else model
@@ -76,16 +73,15 @@ def model_environment(
         outcomes = Partial(_outcomes_of_two, other, owner, outcomes)
     elif opponent is not None:
         raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
-    spaces = make_box(0, 1, (size,)) if observe is None else None
     return make_environment(
         Partial(_reset, model.initial),
         step,
         Partial(_one_hot, model.initial) if observe is None else observe,
         actions=num_actions,
-        labels=Partial(_labels, model.label),
+        labels=Partial(_row, model.label),
         propositions=model.propositions,
-        allowed=Partial(_available, model.available),
-        observations=spaces,
+        allowed=Partial(_row, model.available),
+        observations=make_box(0, 1, (size,)) if observe is None else None,
         starts=Partial(_starts, model.initial),
         outcomes=outcomes,
     )
@@ -95,12 +91,12 @@ def _starts(initial: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.arange(len(initial), dtype=jnp.int32), jnp.asarray(initial)
 
 
-def _reset(initial: jax.Array, key: chex.PRNGKey) -> jax.Array:
+def _reset(initial: jax.Array, key: Key) -> jax.Array:
     return jax.random.choice(key, len(initial), p=jnp.asarray(initial)).astype(jnp.int32)
 
 
 def _step(
-    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array, key: chex.PRNGKey
+    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array, key: Key
 ) -> Timestep:
     after = sample_successor(model, key, state, action).astype(jnp.int32)
     return Timestep(after, _earned(reward, state, action, after), terminated=jnp.bool_(False))
@@ -151,7 +147,7 @@ def _step_of_two(
     step: PyTree,
     state: jax.Array,
     action: jax.Array,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> Timestep:
     key, other = jax.random.split(key)
     reply = jax.random.categorical(other, jnp.asarray(opponent)[state])
@@ -164,8 +160,7 @@ def _outcomes_of_two(
     opponent: jax.Array, system: jax.Array, outcomes: PyTree, state: jax.Array, action: jax.Array
 ) -> tuple[Timestep, jax.Array]:
     weight = jax.nn.softmax(jnp.asarray(opponent)[state])
-    mine = jnp.arange(len(weight)) == action
-    weight = jnp.where(jnp.asarray(system)[state], mine, weight)
+    weight = jnp.where(jnp.asarray(system)[state], jnp.arange(len(weight)) == action, weight)
     found, probability = jax.vmap(lambda a: outcomes(state, a))(jnp.arange(len(weight)))
     found = Timestep(found.world.ravel(), found.reward.ravel(), terminated=jnp.bool_(False))
     return found, (weight[:, None] * probability).ravel()
@@ -175,9 +170,5 @@ def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:
     return jax.nn.one_hot(state, len(initial))
 
 
-def _labels(label: jax.Array, state: jax.Array) -> jax.Array:
-    return jnp.asarray(label)[state]
-
-
-def _available(available: jax.Array, state: jax.Array) -> jax.Array:
-    return jnp.asarray(available)[state]
+def _row(table: jax.Array, state: jax.Array) -> jax.Array:
+    return jnp.asarray(table)[state]

@@ -7,14 +7,14 @@ verification for LTL and TLTL"). The letter of a terminal state repeats for ever
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
 
+from jaxltl.core import struct, validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import (
     Verdict as Verdict,
@@ -22,6 +22,10 @@ from jaxltl.core.automata.runs import (
     verdict as verdict,
     verdicts as verdicts,
 )
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.labels import require_known
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import batch_text, brief, count, enum_counts
 
 
@@ -43,11 +47,10 @@ class Monitor:
       initial: ``int32``, the state before the first letter.
       verdict: ``int32[Q]``, the :class:`Verdict` in each state.
 
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> monitor = make_monitor(to_automaton("F a"))
-      >>> monitor.delta.tolist(), monitor.verdict.tolist()
-      ([[0, 1], [1, 1]], [0, 1])
+    >>> from jaxltl import to_automaton
+    >>> monitor = make_monitor(to_automaton("F a"))
+    >>> monitor.delta.tolist(), monitor.verdict.tolist()
+    ([[0, 1], [1, 1]], [0, 1])
     """
 
     delta: jax.Array
@@ -64,10 +67,9 @@ def make_monitor(automaton: Automaton) -> Monitor:
     Returns:
       :class:`Monitor`, for :func:`monitor_step`.
 
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> make_monitor(to_automaton("G a")).verdict.tolist()
-      [0, 2]
+    >>> from jaxltl import to_automaton
+    >>> make_monitor(to_automaton("G a")).verdict.tolist()
+    [0, 2]
     """
     return Monitor(
         delta=jnp.asarray(automaton.delta, jnp.int32),
@@ -76,7 +78,7 @@ def make_monitor(automaton: Automaton) -> Monitor:
     )
 
 
-def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax.Array:
+def monitor_step(monitor: Monitor, state: Array, letter: Array) -> jax.Array:
     """The state after reading one letter, for ``jit``, ``vmap`` and ``scan``.
 
     Args:
@@ -90,17 +92,16 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
     Raises:
       TypeError: letters that are not integers, such as a row of booleans.
 
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> monitor = make_monitor(to_automaton("F a"))
-      >>> monitor_step(monitor, monitor.initial, jnp.array([0, 1])).tolist()
-      [0, 1]
+    >>> from jaxltl import to_automaton
+    >>> monitor = make_monitor(to_automaton("F a"))
+    >>> monitor_step(monitor, monitor.initial, jnp.array([0, 1])).tolist()
+    [0, 1]
     """
     _check_integers(letter, "monitor_step: letter")
     return monitor.delta[state, letter]
 
 
-def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
+def monitor_verdict(monitor: Monitor, state: Array) -> jax.Array:
     """The verdict in given states of a monitor, for ``jit``, ``vmap`` and ``scan``.
 
     Args:
@@ -109,17 +110,14 @@ def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
     Returns:
       ``int32[...]``, of :class:`Verdict`. Integers: there is no derivative.
 
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> Verdict(int(monitor_verdict(make_monitor(to_automaton("true")), 0))).name
-      'SATISFIED'
+    >>> from jaxltl import to_automaton
+    >>> Verdict(int(monitor_verdict(make_monitor(to_automaton("true")), 0))).name
+    'SATISFIED'
     """
     return monitor.verdict[state]
 
 
-def trace_verdicts(
-    monitor: Monitor, letters: chex.Array, length: chex.Array | None = None
-) -> jax.Array:
+def trace_verdicts(monitor: Monitor, letters: Array, length: Array | None = None) -> jax.Array:
     """The verdict after each prefix of traces, the empty one first.
 
     A decided verdict never changes, and padding after `length` letters is not read.
@@ -136,10 +134,9 @@ def trace_verdicts(
       TypeError: letters or lengths that are not integers.
       ValueError: a concrete letter or length out of range.
 
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> trace_verdicts(make_monitor(to_automaton("F a")), [[0, 1, 0], [0, 1, 1]], [3, 1]).tolist()
-      [[0, 0, 1, 1], [0, 0, 0, 0]]
+    >>> from jaxltl import to_automaton
+    >>> trace_verdicts(make_monitor(to_automaton("F a")), [[0, 1, 0], [0, 1, 1]], [3, 1]).tolist()
+    [[0, 0, 1, 1], [0, 0, 0, 0]]
     """
     letters = jnp.asarray(letters)
     if letters.ndim == 0:
@@ -150,7 +147,11 @@ def trace_verdicts(
     length = jnp.asarray(steps if length is None else length)
     _check_integers(letters, "trace_verdicts: letters")
     _check_integers(length, "trace_verdicts: length")
-    _check_shape(letters, length)
+    if length.shape not in ((), letters.shape[:-1]):
+        raise ValueError(
+            f"trace_verdicts: length has shape {length.shape} for letters of shape "
+            f"{letters.shape}. Pass one number, or shape {letters.shape[:-1]}."
+        )
     counts = jnp.broadcast_to(jnp.arange(steps) < length[..., None], letters.shape)
     _check_range(monitor, letters, length, counts)
     found: jax.Array = _scan(monitor, letters, counts)
@@ -165,26 +166,17 @@ def _scan(monitor: Monitor, letters: jax.Array, counts: jax.Array) -> jax.Array:
         return state, monitor_verdict(monitor, state)
 
     start = jnp.broadcast_to(monitor.initial, letters.shape[:-1])
-    reads = (jnp.moveaxis(letters, -1, 0), jnp.moveaxis(counts, -1, 0))
-    _, rest = jax.lax.scan(step, start, reads)
+    _, rest = jax.lax.scan(step, start, (jnp.moveaxis(letters, -1, 0), jnp.moveaxis(counts, -1, 0)))
     first = monitor_verdict(monitor, start)[..., None]
     return jnp.concatenate([first, jnp.moveaxis(rest, 0, -1)], axis=-1)
 
 
-def _check_integers(array: chex.Array, place: str) -> None:
+def _check_integers(array: Array, place: str) -> None:
     dtype = jnp.asarray(array).dtype
     if not jnp.issubdtype(dtype, jnp.integer):
         raise TypeError(
             f"{place} has type {dtype}. Pass integers; letters are indices into the automaton's "
             "letters (letter_index gives one, Product.letter those of a world)."
-        )
-
-
-def _check_shape(letters: jax.Array, length: jax.Array) -> None:
-    if length.shape not in ((), letters.shape[:-1]):
-        raise ValueError(
-            f"trace_verdicts: length has shape {length.shape} for letters of shape "
-            f"{letters.shape}. Pass one number, or shape {letters.shape[:-1]}."
         )
 
 
@@ -202,9 +194,135 @@ def _check_range(
             f"trace_verdicts: length {wrong} with {steps} letters. Pass one of 0..{steps}."
         )
     read = np.asarray(letters)
-    bad = ((read < 0) | (read >= width)) & np.asarray(counts)
-    for place in np.argwhere(bad)[:1].tolist():
+    for place in np.argwhere(((read < 0) | (read >= width)) & np.asarray(counts))[:1].tolist():
         raise ValueError(
             f"trace_verdicts: letters{place} = {read[tuple(place)]} is no letter. "
             f"The automaton has the letters 0..{width - 1}."
         )
+
+
+# --- finite trajectories -----------------------------------------------------------------------
+
+
+@struct.dataclass
+class FiniteTask:
+    """A formula over the columns of a label matrix; see :func:`make_finite_task`.
+
+    Attributes:
+      monitor: the runtime monitor of the formula.
+      letter: ``int32[2^n]``, the monitor's letter for each subset of the formula's propositions, as a
+        binary number; bit i is the i-th of `columns`.
+      columns: the columns of the formula's n propositions; static.
+      num_columns: P, the number of columns; static.
+
+    >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
+    >>> task.num_columns, task.letter.tolist()
+    (2, [0, 1, 2, 3])
+    """
+
+    monitor: Monitor
+    letter: jax.Array
+    columns: tuple[int, ...] = struct.field(pytree_node=False)
+    num_columns: int = struct.field(pytree_node=False)
+
+
+@brief
+class VerdictFrequencies(NamedTuple):
+    """Frequencies of the verdicts among trajectories; their sum is 1.
+
+    Attributes:
+      satisfied, violated, undecided: ``float[...]``.
+
+    >>> found = VerdictFrequencies(satisfied=0.5, violated=0.25, undecided=0.25)
+    >>> found.satisfied + found.undecided  # an upper bound on eventual satisfaction
+    0.75
+    """
+
+    satisfied: jax.Array
+    violated: jax.Array
+    undecided: jax.Array
+
+
+def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[str]) -> FiniteTask:
+    """A formula over the columns of a label matrix; computed on the host.
+
+    Args:
+      formula: a formula, its text, or an automaton that reads every subset of its propositions.
+      propositions: the names of the P columns, in order; the formula need not use all.
+
+    Returns:
+      :class:`FiniteTask`.
+
+    Raises:
+      ValueError: a proposition without a column, a name twice, or an automaton that does not read
+        every subset.
+
+    >>> make_finite_task("!wet U dry", ["wet", "dry"]).columns
+    (1, 0)
+    """
+    names = validation.distinct_names("propositions", propositions)
+    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    text = "the automaton" if isinstance(formula, Automaton) else f"the formula {str(formula)!r}"
+    require_known(automaton.propositions, names, text)
+    count = len(automaton.propositions)
+    code = np.asarray(automaton.letters) @ (1 << np.arange(count))
+    missing = np.setdiff1d(np.arange(1 << count), code)
+    if missing.size:
+        holds = [p for i, p in enumerate(automaton.propositions) if missing[0] >> i & 1]
+        raise ValueError(
+            f"{text} does not read the letter {{{', '.join(holds)}}}. Trajectories may have any "
+            "labels: make it with all letters, as to_automaton does by default."
+        )
+    letter = np.empty(1 << count, np.int32)
+    letter[code] = np.arange(len(code))
+    columns = tuple(names.index(p) for p in automaton.propositions)
+    return FiniteTask(make_monitor(automaton), jnp.asarray(letter), columns, len(names))
+
+
+def finite_verdicts(task: FiniteTask, label: Array, length: Array | None = None) -> jax.Array:
+    """The verdict of each trajectory at its end."""
+    label = jnp.asarray(label)
+    if label.dtype != bool or label.ndim < 2 or label.shape[-1] != task.num_columns:
+        raise ValueError(
+            f"labels have shape {list(label.shape)} and type {label.dtype}; give booleans "
+            f"[..., T, {task.num_columns}], a column for each proposition of the task."
+        )
+    code = jnp.zeros(label.shape[:-1], jnp.int32)
+    for i, column in enumerate(task.columns):
+        code |= label[..., column].astype(jnp.int32) << i
+    return trace_verdicts(task.monitor, task.letter[code], length)[..., -1]
+
+
+def verdict_frequencies(
+    verdict: Array, axis: int | tuple[int, ...] | None = -1
+) -> VerdictFrequencies:
+    """Frequencies of the three verdicts among trajectories, along an axis."""
+    verdict = jnp.asarray(verdict)
+    order = (Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNDECIDED)
+    return VerdictFrequencies(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
+
+
+def finite_verdict_frequencies(
+    task: FiniteTask, label: Array, length: Array | None = None
+) -> VerdictFrequencies:
+    """:func:`verdict_frequencies` of the M trajectories of a batch.
+
+    Args:
+      task, label, length: as for :func:`finite_verdicts`, with ``bool[..., M, T, P]``.
+
+    Returns:
+      Arrays ``float[...]``.
+
+    Raises:
+      ValueError: as :func:`finite_verdicts`, or labels without an axis of trajectories.
+
+    >>> task = make_finite_task("F dry", ["wet", "dry"])
+    >>> float(finite_verdict_frequencies(task, jnp.array([[[0, 1]], [[1, 0]]], bool)).satisfied)
+    0.5
+    """
+    if jnp.ndim(label) < 3:
+        raise ValueError(
+            f"labels have shape {list(jnp.shape(label))}; give [..., M, T, P], with an axis of "
+            "trajectories."
+        )
+    return verdict_frequencies(finite_verdicts(task, label, length))

@@ -6,28 +6,29 @@ to acceptance (``core/automata/sequences.py``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence as Ordered
+from collections.abc import Sequence as Ordered
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
     as_array,
     make_box,
+    of_world,
+    optional,
     require_environment,
 )
 from jaxltl.core.environments.monitor import Verdict
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -40,7 +41,6 @@ class Sequence(NamedTuple):
     length: jax.Array
 
 
-@brief
 @struct.dataclass
 class SequenceSampler:
     """A distribution of sequences, with traced weights; see :func:`sequence_sampler`.
@@ -51,19 +51,18 @@ class SequenceSampler:
       avoid: ``float[N]``, weights of 0 to N - 1 sets to avoid.
       sets: ``bool[G, E]``, the sets of events.
 
-    Example:
-      >>> from jaxltl import environments
-      >>> events = environments.make_events(["a", "b"])
-      >>> sets = environments.proposition_sets(events)
-      >>> sampler = environments.sequence_sampler([1, 1], [1], [1, 1], sets)
-      >>> sampler.sets.shape, sampler.length.tolist()
-      ((2, 3), [1.0, 1.0])
+    >>> from jaxltl import environments
+    >>> events = environments.make_events(["a", "b"])
+    >>> sets = environments.proposition_sets(events)
+    >>> sampler = environments.sequence_sampler([1, 1], [1], [1, 1], sets)
+    >>> sampler.sets.shape, sampler.length.tolist()
+    ((2, 3), [1.0, 1.0])
     """
 
-    length: chex.Array
-    reach: chex.Array
-    avoid: chex.Array
-    sets: chex.Array
+    length: Array
+    reach: Array
+    avoid: Array
+    sets: Array
 
 
 @brief(codes={"verdict": Verdict})
@@ -96,9 +95,8 @@ def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
     Raises:
       ValueError: a repeated name, or a negative number.
 
-    Example:
-      >>> make_events(["a", "b"]).astype(int).tolist()
-      [[0, 0], [1, 0], [0, 1]]
+    >>> make_events(["a", "b"]).astype(int).tolist()
+    [[0, 0], [1, 0], [0, 1]]
     """
     width = len(validation.distinct_names("propositions", propositions))
     at_most = min(validation.integer("at_most", at_most), width)
@@ -109,7 +107,7 @@ def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
     return events
 
 
-def nearest_event(events: chex.Array, label: chex.Array) -> jax.Array:
+def nearest_event(events: Array, label: Array) -> jax.Array:
     """``int32[]``: the event with the least Hamming distance to a label."""
     return jnp.argmin((events != label).sum(-1)).astype(jnp.int32)
 
@@ -123,9 +121,8 @@ def proposition_sets(events: ArrayLike) -> np.ndarray:
     Returns:
       ``bool[P, E]``, NumPy's.
 
-    Example:
-      >>> proposition_sets(make_events(["a", "b"], at_most=2)).astype(int).tolist()
-      [[0, 1, 0, 1], [0, 0, 1, 1]]
+    >>> proposition_sets(make_events(["a", "b"], at_most=2)).astype(int).tolist()
+    [[0, 1, 0, 1], [0, 0, 1, 1]]
     """
     return np.asarray(events, bool).T
 
@@ -145,11 +142,10 @@ def sequence_sampler(
     Raises:
       ValueError: negative or zero weights, an empty set, or more sets in a step than there are.
 
-    Example:
-      >>> sampler = sequence_sampler([1, 1], [1], [1, 1], [False, True, True, True])
-      >>> drawn = jax.jit(draw_sequence)(jax.random.key(0), sampler)
-      >>> drawn.reach.shape, bool((drawn.reach & drawn.avoid).any())
-      ((2, 4), False)
+    >>> sampler = sequence_sampler([1, 1], [1], [1, 1], [False, True, True, True])
+    >>> drawn = jax.jit(draw_sequence)(jax.random.key(0), sampler)
+    >>> drawn.reach.shape, bool((drawn.reach & drawn.avoid).any())
+    ((2, 4), False)
     """
     rows = {"length": length, "reach": reach, "avoid": avoid}
     found = {name: validation.float_array(name, row) for name, row in rows.items()}
@@ -178,13 +174,13 @@ def sequence_sampler(
     return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
 
 
-def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
+def draw_sequence(key: Key, sampler: SequenceSampler) -> Sequence:
     """A random sequence of disjoint sets to reach and to avoid in each step."""
     keys = jax.random.split(key, 4)
     depth, count = sampler.length.shape[0], sampler.sets.shape[0]
     sets = jnp.asarray(sampler.sets)
 
-    def size(key: chex.PRNGKey, weight: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    def size(key: Key, weight: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         return jax.random.categorical(key, jnp.log(jnp.asarray(weight)), shape=shape)
 
     length = 1 + size(keys[0], sampler.length, ()).astype(jnp.int32)
@@ -225,15 +221,14 @@ def sequence_environment(
     Raises:
       ValueError: events or a sampler of another shape.
 
-    Example:
-      >>> from jaxltl import environments, from_dense
-      >>> walk = environments.model_environment(from_dense(
-      ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
-      >>> events = make_events(["a"])
-      >>> sampler = sequence_sampler([1], [1], [1], proposition_sets(events))
-      >>> drawn = sequence_environment(walk, events, sampler)
-      >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
-      (1, 2)
+    >>> from jaxltl import environments, from_dense
+    >>> walk = environments.model_environment(from_dense(
+    ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
+    >>> events = make_events(["a"])
+    >>> sampler = sequence_sampler([1], [1], [1], proposition_sets(events))
+    >>> drawn = sequence_environment(walk, events, sampler)
+    >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
+    (1, 2)
     """
     rows, inner = as_array(events), require_environment(environment)
     validation.instance("sampler", sampler, SequenceSampler, "one of sequence_sampler")
@@ -253,26 +248,22 @@ def sequence_environment(
     shape = (len(sampler.length), len(rows))
     marks, steps = make_box(0, 1, shape, bool), make_box(0, np.inf, (), np.int32)
     spaces: PyTree = Sequence(marks, marks, steps)  # type: ignore[arg-type]
-    numbers = np.array(
-        [
-            validation.finite_number("violation", violation),
-            validation.finite_number("progress", progress),
-        ]
-    )
+    rewards = {"violation": violation, "progress": progress}
+    numbers = np.array([validation.finite_number(*reward) for reward in rewards.items()])
     return replace(
         inner,
         reset=Partial(_reset, inner, rows, sampler),
         step=Partial(_step, inner, rows, numbers),
         observe=Partial(_observe, inner),
-        labels=Partial(_of_world, inner.labels),
-        allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
+        labels=Partial(of_world, inner.labels),
+        allowed=optional(of_world, inner.allowed),
         observations=SequenceObservation(inner.observations, spaces),
         starts=None,
         outcomes=None,
     )  # there are too many sequences for `starts`
 
 
-def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
+def remaining(sequence: Sequence, index: Numeric) -> Sequence:
     """The sequence after `index` completed steps."""
     depth = sequence.reach.shape[-2]
     row = jnp.arange(depth) + index
@@ -287,20 +278,16 @@ def _read(
     event = nearest_event(events, inner.labels(world))
     wanted, shunned = sequence.reach[index, event], sequence.avoid[index, event]
     after = index + wanted
-    verdict = jnp.where(
-        shunned,
-        Verdict.VIOLATED,
-        jnp.where(after == sequence.length, Verdict.SATISFIED, Verdict.UNDECIDED),
-    )
+    open_ = jnp.where(after == sequence.length, Verdict.SATISFIED, Verdict.UNDECIDED)
+    verdict = jnp.where(shunned, Verdict.VIOLATED, open_)
     return SequenceWorld(world, sequence, after.astype(jnp.int32), verdict.astype(jnp.int32))
 
 
 def _reset(
-    inner: Environment, events: jax.Array, sampler: SequenceSampler, key: chex.PRNGKey
+    inner: Environment, events: jax.Array, sampler: SequenceSampler, key: Key
 ) -> SequenceWorld:
     world_key, key = jax.random.split(key)
-    drawn = draw_sequence(key, sampler)
-    found = _read(inner, events, inner.reset(world_key), drawn, jnp.int32(0))
+    found = _read(inner, events, inner.reset(world_key), draw_sequence(key, sampler), jnp.int32(0))
     # A sequence that the first event decides starts again, since an episode has at least one step.
     over = found.verdict != Verdict.UNDECIDED
     return found._replace(
@@ -315,7 +302,7 @@ def _step(
     numbers: jax.Array,
     state: SequenceWorld,
     action: PyTree,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> Timestep:
     found = Timestep(*inner.step(state.world, action, key))
     after = _read(inner, events, found.world, state.sequence, state.stage)
@@ -338,7 +325,3 @@ def _step(
 
 def _observe(inner: Environment, state: SequenceWorld) -> SequenceObservation:
     return SequenceObservation(inner.observe(state.world), remaining(state.sequence, state.stage))
-
-
-def _of_world(function: Callable[..., jax.Array], state: SequenceWorld) -> jax.Array:
-    return function(state.world)

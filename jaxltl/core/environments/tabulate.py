@@ -6,26 +6,26 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxltl.core import struct, validation
 
-from jaxltl.core.environments.dependence import marked_results, reads_key
+from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import (
     Environment,
     Finite,
     Timestep,
     allowed_in,
     as_partial,
+    marked_results,
+    reads_key,
     require_key,
 )
 from jaxltl.core.environments.time_limit import without_time_limit
-from jaxltl.core.pretty_print import brief, count, nested_repr, value_range
-from jaxltl.core.models.protocols import Array, PyTree
+from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.pretty_print import brief, count, nested_repr, value_range
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 _BATCH = 1024  # states of a batch, at most
@@ -63,12 +63,11 @@ class Table:
         ``"keys"``: all sampled keys gave the same result; ``"distinct"``: the caller's `distinct`,
         which the program does not imply.
 
-    Example:
-      >>> over = Table(
-      ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
-      ...     terminated=np.array([True]), truncated=np.array([False]), evidence="told")
-      >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
-      (1, [7], None)
+    >>> over = Table(
+    ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
+    ...     terminated=np.array([True]), truncated=np.array([False]), evidence="told")
+    >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
+    (1, [7], None)
     """
 
     model: SparseMDP
@@ -86,7 +85,7 @@ def tabulate(
     worlds: PyTree = None,
     max_states: int = 100_000,
     num_keys: int = 4,
-    key: chex.PRNGKey | None = None,
+    key: Key | None = None,
     distinct: Callable[[PyTree], PyTree] | None = None,
 ) -> Table:
     """The reachable states of an environment and their transition probabilities, as a model.
@@ -112,13 +111,12 @@ def tabulate(
       ValueError: a box of actions, an undeclared random reset or step, distributions that disagree with
         samples, more than `max_states` states, or a state without an available action.
 
-    Example:
-      >>> from jaxltl import environments, from_dense
-      >>> walk = environments.model_environment(
-      ...     from_dense([[[0, 1]], [[0, 1]]], initial=[1, 0]))
-      >>> table = tabulate(walk)
-      >>> table.world.tolist(), table.model.num_rows, table.evidence
-      ([0, 1], 2, 'told')
+    >>> from jaxltl import environments, from_dense
+    >>> walk = environments.model_environment(
+    ...     from_dense([[[0, 1]], [[0, 1]]], initial=[1, 0]))
+    >>> table = tabulate(walk)
+    >>> table.world.tolist(), table.model.num_rows, table.evidence
+    ([0, 1], 2, 'told')
     """
     inner, limit = without_time_limit(environment)
     max_states = validation.integer("max_states", max_states, least=1)
@@ -140,8 +138,7 @@ def tabulate(
     initial = np.zeros(len(listed.ended))
     np.add.at(initial, listed.start, probability)
     world = _joined(listed.world)
-    label = _labels(kind, world, listed.ended.size)
-    model = _model(kind, listed, initial, label)
+    model = _model(kind, listed, initial, _labels(kind, world, listed.ended.size))
     return Table(
         model,
         _typed(kind, world),
@@ -312,7 +309,7 @@ def _left_out_is_idle(kind: _Kind) -> bool:
     """True proves that no result depends on the parts that `distinct` leaves out."""
     environment = kind.environment
 
-    def listed(world: PyTree, action: PyTree, key: chex.PRNGKey) -> PyTree:
+    def listed(world: PyTree, action: PyTree, key: Key) -> PyTree:
         found = Timestep(*environment.step(world, action, key))
         told = None
         if environment.outcomes is not None:
@@ -370,7 +367,7 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
         return jnp.append(_seen(kind, found.world), _ended(found))
 
     def drawn(action: PyTree) -> Timestep:
-        def one(key: chex.PRNGKey) -> Timestep:
+        def one(key: Key) -> Timestep:
             found = Timestep(*environment.step(world, action, key))
             return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
 
@@ -516,15 +513,13 @@ def _check(found: _Followers, base: int, told: bool) -> None:
             )
         seen = _rows(found.seen)
         known = (drawn[..., None] == seen[:, :, None]) & (found.probability > 0)[:, :, None]
-        fails = ~known.any(axis=-1).all(axis=-1) & found.allowed
-        for b, a in np.argwhere(fails)[:1]:
+        for b, a in np.argwhere(~known.any(axis=-1).all(axis=-1) & found.allowed)[:1]:
             raise ValueError(
                 f"outcomes: action {a} in world {base + b} leads to a world that they do not tell; "
                 "give every world to which the step may lead, with how the episode ends there."
             )
         return
-    differ = (drawn != drawn[..., :1]).any(axis=-1) & found.allowed
-    for b, a in np.argwhere(differ)[:1]:
+    for b, a in np.argwhere((drawn != drawn[..., :1]).any(axis=-1) & found.allowed)[:1]:
         raise ValueError(
             f"tabulate: step is random: action {a} in world {base + b} leads to "
             f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "
@@ -567,8 +562,7 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
     owner = np.concatenate([live[state], over])
     order = np.argsort(owner, kind="stable")
     width = successor.shape[1]
-    loop = np.tile(over[:, None], (1, width))
-    successor = np.concatenate([successor, loop])[order].ravel()
+    successor = np.concatenate([successor, np.tile(over[:, None], (1, width))])[order].ravel()
     single = np.tile(np.arange(width) == 0, (len(over), 1)).astype(float)
     probability, reward, cost = (
         np.concatenate([x, y])[order].ravel()

@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, TypeVar, Unpack, cast
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,16 +31,17 @@ from jaxltl.core.environments.environment import (
     Timestep,
     make_box,
     make_environment,
+    of_world,
+    optional,
     require_environment,
 )
-from jaxltl.core.environments.finite_task import make_finite_task
-from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
+from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, make_finite_task, verdicts
 from jaxltl.core.environments.task_reward import RewardOptions, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.struct import register_annotated_pytree
-from jaxltl.core.models.protocols import Array, PyTree
+from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.struct import register_annotated_pytree
 
 _Tree = TypeVar("_Tree")
 
@@ -59,9 +59,8 @@ class TaskWorld(NamedTuple):
         priority, or for a co-safe or safety task into a final state.
       visits: ``int32[]``, the number of accepting transitions so far, the first label included.
 
-    Example:
-      >>> TaskWorld(world=7, memory=1, verdict=0, accepted=False, visits=0).memory
-      1
+    >>> TaskWorld(world=7, memory=1, verdict=0, accepted=False, visits=0).memory
+    1
     """
 
     world: PyTree
@@ -79,9 +78,8 @@ class TaskObservation(NamedTuple):
       world: the observation of the environment.
       memory: ``float[Q]``, the automaton state one-hot, or its row of an embedding.
 
-    Example:
-      >>> TaskObservation(world=[0.5], memory=[0.0, 1.0]).memory  # in state 1 of 2
-      [0.0, 1.0]
+    >>> TaskObservation(world=[0.5], memory=[0.0, 1.0]).memory  # in state 1 of 2
+    [0.0, 1.0]
     """
 
     world: PyTree
@@ -106,10 +104,9 @@ class TaskTables:
       embedding: ``float[Q, ...]``, observations of the states, or None: one-hot.
       state_names: the residual formulas of the states, or empty; not part of the tree.
 
-    Example:
-      >>> tables = make_task_tables("F goal", ["wall", "goal"])
-      >>> tables.delta.tolist(), tables.verdict.tolist(), tables.decided.tolist()
-      ([[0, 1], [1, 1]], [0, 1], [0.0, 1.0, 0.0])
+    >>> tables = make_task_tables("F goal", ["wall", "goal"])
+    >>> tables.delta.tolist(), tables.verdict.tolist(), tables.decided.tolist()
+    ([[0, 1], [1, 1]], [0, 1], [0.0, 1.0, 0.0])
     """
 
     weight: Array
@@ -177,13 +174,17 @@ def make_task_tables(
             f"[{len(decisions)}, ...], a row for each state of the automaton."
         )
     number = jnp.result_type(float)
+    last = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
+    repeated = np.full(np.shape(automaton.delta), last, np.int32)
+    if ending == "repeat":
+        repeated = lasso_verdicts(automaton)
     return TaskTables(
         weight=weight,
         letter=np.asarray(reading.letter),
         delta=np.asarray(automaton.delta, np.int32),
         initial=np.int32(automaton.initial),
         verdict=decisions,
-        repeated=_at_the_end(automaton, ending),
+        repeated=repeated,
         accepting=pay.accepting,
         reward=pay.reward.astype(number),
         discount=pay.discount.astype(number),
@@ -198,14 +199,11 @@ def make_task_tables(
 def _require_open(formula: str, verdict: int) -> None:
     """Raises ValueError for a formula that is valid or unsatisfiable."""
     if verdict != Verdict.UNDECIDED:
-        kind, words = (
-            ("valid", "every sequence of labels satisfies it")
-            if verdict == Verdict.SATISFIED
-            else ("unsatisfiable", "no sequence of labels satisfies it")
-        )
+        kind, some = ("valid", "every") if verdict == Verdict.SATISFIED else ("unsatisfiable", "no")
         raise ValueError(
-            f"the formula {formula!r} is {kind}: {words}, so that every episode ends at its first "
-            "step; give another, or, to keep it, its automaton to_automaton(formula)."
+            f"the formula {formula!r} is {kind}: {some} sequence of labels satisfies it, so that every "
+            "episode ends at its first step; give another, or, to keep it, its automaton "
+            "to_automaton(formula)."
         )
 
 
@@ -240,34 +238,30 @@ def task_environment(
         unsatisfiable (an automaton may be), a reward that does not fit the
         task, a discount out of range, or a potential or an embedding of another shape.
 
-    Example:
-      >>> from jaxltl import environments, gridworld
-      >>> corridor = environments.model_environment(gridworld("home . goal", initial="home"))
-      >>> task = task_environment(corridor, "F (goal & F home)")
-      >>> world = task.reset(jax.random.key(0))
-      >>> for action in (3, 3, 2, 2):  # right, left
-      ...     print(residual_formula(task, world.memory))
-      ...     found = task.step(world, action, jax.random.key(0))
-      ...     world = found.world
-      F (goal & F home)
-      F (goal & F home)
-      F home | F (goal & F home)
-      F home | F (goal & F home)
-      >>> float(found.reward), bool(found.terminated), Verdict(int(world.verdict)).name
-      (1.0, True, 'SATISFIED')
+    >>> from jaxltl import environments, gridworld
+    >>> corridor = environments.model_environment(gridworld("home . goal", initial="home"))
+    >>> task = task_environment(corridor, "F (goal & F home)")
+    >>> world = task.reset(jax.random.key(0))
+    >>> for action in (3, 3, 2, 2):  # right, left
+    ...     print(residual_formula(task, world.memory))
+    ...     found = task.step(world, action, jax.random.key(0))
+    ...     world = found.world
+    F (goal & F home)
+    F (goal & F home)
+    F home | F (goal & F home)
+    F home | F (goal & F home)
+    >>> float(found.reward), bool(found.terminated), Verdict(int(world.verdict)).name
+    (1.0, True, 'SATISFIED')
     """
     environment = require_environment(environment)
     names = environment.propositions if propositions is None else propositions
-    kept = ("allowed", "observations", "horizon", "starts", "outcomes")
+    kept = ("reset", "step", "observe", "actions", "allowed", "observations", "horizon", "starts")
     others: dict[str, PyTree] = {name: getattr(environment, name) for name in kept}
     inner = make_environment(
-        environment.reset,
-        environment.step,
-        environment.observe,
-        actions=environment.actions,
+        **others,
+        outcomes=environment.outcomes,
         labels=environment.labels if labels is None else labels,
         propositions=names,
-        **others,
     )
     if not isinstance(formula, TaskTables):
         options = {"ending": environment.ending, **options}
@@ -331,13 +325,12 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
     Raises:
       ValueError: no environment, or environments of different structure.
 
-    Example:
-      >>> from jaxltl import environments, from_dense
-      >>> walk = environments.model_environment(from_dense(
-      ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
-      >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])
-      >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
-      (2,)
+    >>> from jaxltl import environments, from_dense
+    >>> walk = environments.model_environment(from_dense(
+    ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
+    >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])
+    >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
+    (2,)
     """
     environments = validation.sequence("environments", environments)
     if not environments:
@@ -369,9 +362,8 @@ def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree)
     Raises:
       ValueError: an unknown state.
 
-    Example:
-      >>> residual_formula(to_automaton("F (a & X b)"), 0)
-      'F (a & X b)'
+    >>> residual_formula(to_automaton("F (a & X b)"), 0)
+    'F (a & X b)'
     """
     if isinstance(task, Automaton):
         names, count = task.state_names, len(task.delta)
@@ -398,29 +390,21 @@ def _beside(inner: Environment, tables: TaskTables) -> Environment:
         reset=Partial(_reset, tables, inner.labels, inner.reset),
         step=Partial(_step, tables, inner.labels, inner.step),
         observe=Partial(_observe, tables, inner.observe),
-        labels=Partial(_of_world, inner.labels),
-        allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
-        starts=None
-        if inner.starts is None
-        else Partial(_starts, tables, inner.labels, inner.starts),
-        outcomes=None
-        if inner.outcomes is None
-        else Partial(_outcomes, tables, inner.labels, inner.outcomes),
+        labels=Partial(of_world, inner.labels),
+        allowed=optional(of_world, inner.allowed),
+        starts=optional(_starts, tables, inner.labels, inner.starts),
+        outcomes=optional(_outcomes, tables, inner.labels, inner.outcomes),
         observations=spaces,
     )
 
 
 def _read(tables: TaskTables, label: jax.Array) -> jax.Array:
     """The letter of a label."""
-    code = jnp.sum(jnp.where(label, tables.weight, 0), dtype=jnp.int32)
-    return jnp.asarray(tables.letter)[code]
+    return jnp.asarray(tables.letter)[jnp.sum(jnp.where(label, tables.weight, 0), dtype=jnp.int32)]
 
 
 def _reset(
-    tables: TaskTables,
-    labels: Callable[..., PyTree],
-    reset: Callable[..., PyTree],
-    key: chex.PRNGKey,
+    tables: TaskTables, labels: Callable[..., PyTree], reset: Callable[..., PyTree], key: Key
 ) -> TaskWorld:
     return _begin(tables, labels, reset(key))
 
@@ -447,7 +431,7 @@ def _step(
     step: Callable[..., Timestep],
     before: TaskWorld,
     action: PyTree,
-    key: chex.PRNGKey,
+    key: Key,
 ) -> Timestep:
     return _read_on(tables, labels, before, Timestep(*step(before.world, action, key)))
 
@@ -502,19 +486,7 @@ def _observe(
     return TaskObservation(observe(joint.world), memory)
 
 
-def _of_world(function: Callable[..., PyTree], joint: TaskWorld) -> PyTree:
-    return function(joint.world)
-
-
 # --- tables ---------------------------------------------------------------------------------------
-
-
-def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
-    """``int32[Q, L]``: the verdict of a terminal state by automaton state and letter."""
-    if ending == "repeat":
-        return lasso_verdicts(automaton)
-    verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
-    return np.full(np.shape(automaton.delta), verdict, np.int32)
 
 
 def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:

@@ -154,8 +154,7 @@ def _ranks(automaton: Automaton) -> np.ndarray:
     if automaton.has_final_states:  # known as soon as the state is entered
         return (~automaton.final[np.asarray(automaton.delta)]).astype(int)
     values, place = np.unique(automaton.priority, return_inverse=True)
-    rank = np.cumsum(np.diff(values % 2, prepend=0) != 0)
-    return rank[place].reshape(automaton.priority.shape)
+    return np.cumsum(np.diff(values % 2, prepend=0) != 0)[place].reshape(automaton.priority.shape)
 
 
 def _stopping(

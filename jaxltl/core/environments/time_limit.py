@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.core import validation
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.environments.environment import Environment, Timestep, require_environment
+from jaxltl.core.array_types import Key, PyTree
+from jaxltl.core.environments.environment import (
+    Environment,
+    Timestep,
+    optional,
+    require_environment,
+)
 
 
 def with_time_limit(environment: Environment, num_steps: int) -> Environment:
@@ -30,25 +34,19 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     Raises:
       ValueError: a limit below 1.
 
-    Example:
-      >>> from jaxltl import environments, gridworld
-      >>> with_time_limit(environments.model_environment(gridworld("a b")), 10).horizon
-      10
+    >>> from jaxltl import environments, gridworld
+    >>> with_time_limit(environments.model_environment(gridworld("a b")), 10).horizon
+    10
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
-    inner = require_environment(environment)
+    inner, limit = require_environment(environment), np.int32(num_steps)
+    parts: dict[str, PyTree] = {n: optional(f, getattr(inner, n)) for n, f in _TIMED.items()}
     return replace(
         inner,
-        reset=Partial(_reset_clock, inner.reset),
-        step=Partial(_step_clock, inner.step, np.int32(num_steps)),
-        observe=Partial(_of_first, inner.observe),
-        labels=Partial(_of_first, inner.labels),
-        allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
+        step=Partial(_step_clock, limit, inner.step),
+        outcomes=optional(_clocked, limit, inner.outcomes),
         horizon=min(num_steps, inner.horizon or num_steps),
-        starts=None if inner.starts is None else Partial(_start_clock, inner.starts),
-        outcomes=None
-        if inner.outcomes is None
-        else Partial(_clocked, inner.outcomes, np.int32(num_steps)),
+        **parts,
     )
 
 
@@ -58,23 +56,19 @@ def without_time_limit(environment: Environment) -> tuple[Environment, int | Non
     if timed.step.func is not _step_clock:
         return environment, None
     parts = {
-        name: part and part.args[0]
-        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
+        name: part and part.args[-1]
+        for name in ("step", "outcomes", *_TIMED)
         for part in [getattr(timed, name)]
     }
-    return replace(environment, horizon=None, **parts), int(timed.step.args[1])
+    return replace(environment, horizon=None, **parts), int(timed.step.args[0])
 
 
-def _reset_clock(reset: Callable[..., PyTree], key: chex.PRNGKey) -> PyTree:
+def _reset_clock(reset: Callable[..., PyTree], key: Key) -> PyTree:
     return reset(key), jnp.int32(0)
 
 
 def _step_clock(
-    step: Callable[..., Timestep],
-    limit: jax.Array,
-    timed: PyTree,
-    action: PyTree,
-    key: chex.PRNGKey,
+    limit: jax.Array, step: Callable[..., Timestep], timed: PyTree, action: PyTree, key: Key
 ) -> Timestep:
     found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
     return found._replace(
@@ -88,7 +82,7 @@ def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
 
 
 def _clocked(
-    outcomes: Callable[..., PyTree], limit: jax.Array, timed: PyTree, action: PyTree
+    limit: jax.Array, outcomes: Callable[..., PyTree], timed: PyTree, action: PyTree
 ) -> tuple[Timestep, jax.Array]:
     found, probability = outcomes(timed[0], action)
     found, time = Timestep(*found), timed[1] + 1
@@ -100,3 +94,10 @@ def _clocked(
 
 def _of_first(function: Callable[..., PyTree], timed: PyTree) -> PyTree:
     return function(timed[0])
+
+
+_TIMED: dict[str, Callable[..., PyTree]] = {
+    "reset": _reset_clock,
+    "starts": _start_clock,
+    **dict.fromkeys(("observe", "labels", "allowed"), _of_first),
+}

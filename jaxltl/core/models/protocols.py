@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from jaxltl.core.array_types import PyTree as PyTree
+from jaxltl.core.array_types import Key as Key, Numeric as Numeric, PyTree as PyTree
 
 Array: TypeAlias = Any  # a NumPy array or a JAX array, which share their operators
 

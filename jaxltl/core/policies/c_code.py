@@ -65,13 +65,12 @@ def write_c_policy(
     Raises:
       ValueError: a name that is not an identifier, or a policy with a horizon.
 
-    Example:
-      >>> import tempfile
-      >>> still = FiniteMemoryPolicy(np.array([[0]]), np.zeros(1, int), np.zeros((1, 1), int))
-      >>> write_c_policy(path := tempfile.mkdtemp() + "/still.h", still, name="still")
-      >>> import pathlib
-      >>> "static inline int still_act(int state, int memory" in pathlib.Path(path).read_text()
-      True
+    >>> import tempfile
+    >>> still = FiniteMemoryPolicy(np.array([[0]]), np.zeros(1, int), np.zeros((1, 1), int))
+    >>> write_c_policy(path := tempfile.mkdtemp() + "/still.h", still, name="still")
+    >>> import pathlib
+    >>> "static inline int still_act(int state, int memory" in pathlib.Path(path).read_text()
+    True
     """
     if not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII):
         raise ValueError(f"name={name!r}; give a C identifier, such as 'policy'.")
@@ -82,11 +81,8 @@ def write_c_policy(
         )
     step, action = np.asarray(policy.next_memory), np.asarray(policy.action)
     delta, letter = np.unique(step, axis=0, return_inverse=True)
-    tables = {
-        "initial_memory": np.asarray(policy.initial_memory),
-        "letter": letter.ravel(),
-        "delta": delta,
-    }
+    first = np.asarray(policy.initial_memory)
+    tables = {"initial_memory": first, "letter": letter.ravel(), "delta": delta}
     if policy.is_random:
         rows, place = np.unique(_first_numbers(action), axis=0, return_inverse=True)
         tables |= {"row": place.reshape(step.shape), "first": rows}
@@ -136,5 +132,4 @@ def _braces(values: list[int] | int) -> str:
     if isinstance(values, int):
         return str(values)
     inside = [_braces(x) for x in values]
-    between = ",\n  " if inside and inside[0].startswith("{") else ", "
-    return "{" + between.join(inside) + "}"
+    return "{" + (",\n  " if inside and inside[0].startswith("{") else ", ").join(inside) + "}"

@@ -13,8 +13,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Array
 from jaxltl.core.automata.runs import Verdict
 from jaxltl.core.pretty_print import brief, count, number
-from jaxltl.core.statistics.binomial import anytime, clopper_pearson
-from jaxltl.core.statistics.empirical_bernstein import bounded_mean
+from jaxltl.core.statistics.binomial import anytime, bounded_mean, clopper_pearson
 from jaxltl.core.status import Status
 
 
@@ -49,10 +48,9 @@ class EpisodeTotals(NamedTuple):
       visits: ``int32``, accepting readings, that of the first label included; None without.
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
 
-    Example:
-      >>> zero = np.zeros(4)
-      >>> EpisodeTotals(zero, zero, zero, zero + 3, zero, zero, None, None, None).length.tolist()
-      [3.0, 3.0, 3.0, 3.0]
+    >>> zero = np.zeros(4)
+    >>> EpisodeTotals(zero, zero, zero, zero + 3, zero, zero, None, None, None).length.tolist()
+    [3.0, 3.0, 3.0, 3.0]
     """
 
     reward: Array
@@ -77,10 +75,9 @@ class Estimate:
       error: the standard error of the mean.
       method: the statistical method of the interval.
 
-    Example:
-      >>> found = share_estimate(8, 10, 0.05)
-      >>> found.mean, round(found.lower, 3), round(found.upper, 3)
-      (0.8, 0.444, 0.975)
+    >>> found = share_estimate(8, 10, 0.05)
+    >>> found.mean, round(found.lower, 3), round(found.upper, 3)
+    (0.8, 0.444, 0.975)
     """
 
     mean: float
@@ -109,13 +106,12 @@ class Evaluation:
         if undecided or without a threshold.
       status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not finite.
 
-    Example:
-      >>> reward, codes = np.array([0.0, 1.0, 1.0]), np.array([2, 1, 1])  # violated, satisfied
-      >>> ended = np.ones(3, bool)
-      >>> totals = EpisodeTotals(reward, reward, 0 * reward, ended * 4, ended, ~ended, codes, None, None)
-      >>> found = evaluation_of(totals, num_steps=9, confidence=0.9)
-      >>> round(found.success.lower, 3), found.success.method, found.terminated, found.status.name
-      (0.135, 'Clopper-Pearson', 3, 'CONVERGED')
+    >>> reward, codes = np.array([0.0, 1.0, 1.0]), np.array([2, 1, 1])  # violated, satisfied
+    >>> ended = np.ones(3, bool)
+    >>> totals = EpisodeTotals(reward, reward, 0 * reward, ended * 4, ended, ~ended, codes, None, None)
+    >>> found = evaluation_of(totals, num_steps=9, confidence=0.9)
+    >>> round(found.success.lower, 3), found.success.method, found.terminated, found.status.name
+    (0.135, 'Clopper-Pearson', 3, 'CONVERGED')
     """
 
     success: Estimate | None
@@ -165,22 +161,13 @@ class Evaluation:
         return "\n".join(lines)
 
 
-ESTIMATES = (
-    "success",
-    "violation",
-    "undecided",
-    "reward",
-    "discounted_reward",
-    "cost",
-    "length",
-    "visits",
-    "discounted_visits",
-)
 _SHARES = {
     "success": Verdict.SATISFIED,
     "violation": Verdict.VIOLATED,
     "undecided": Verdict.UNDECIDED,
 }
+_MEANS = ("reward", "discounted_reward", "cost", "length", "visits", "discounted_visits")
+ESTIMATES = (*_SHARES, *_MEANS)
 
 
 def evaluation_of(
@@ -269,8 +256,7 @@ def _bounded_estimate(
     size = high - low
     if not size:
         return Estimate(mean, low, high, error, "there is no other")
-    numbers = (np.asarray(x, np.float64) - low) / size
-    lower, upper = bounded_mean(numbers, failure, planned=planned)
+    lower, upper = bounded_mean((np.asarray(x, np.float64) - low) / size, failure, planned=planned)
     method = "empirical Bernstein" + (", at any time" if planned is None else "")
     return Estimate(mean, low + size * lower, low + size * upper, error, method)
 

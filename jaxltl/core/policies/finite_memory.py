@@ -25,9 +25,8 @@ class Progress(NamedTuple):
     Attributes:
       state, memory, step: state or observation of the world, automaton state, and time.
 
-    Example:
-      >>> Progress(state=3, memory=0, step=0).memory
-      0
+    >>> Progress(state=3, memory=0, step=0).memory
+    0
     """
 
     state: PyTree
@@ -64,13 +63,12 @@ class FiniteMemoryPolicy:
       letter: ``int32[S]``, the automaton's letter of each state; or None.
       actions, states: names, or empty.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1], [0]], [[1], [0]]], [[[1.0], [1.0]]] * 2, label={"a": [1]})
-      >>> policy = jl.project_policy(jl.product(path, "F a"), np.array([[0, 1], [0, 1]]))
-      >>> at = policy.start(0)
-      >>> policy.act(None, at).item(), policy.act(None, policy.update(at, 1)).item()
-      (0, 1)
+    >>> import jaxltl as jl
+    >>> path = jl.make_mdp([[[1], [0]], [[1], [0]]], [[[1.0], [1.0]]] * 2, label={"a": [1]})
+    >>> policy = jl.project_policy(jl.product(path, "F a"), np.array([[0, 1], [0, 1]]))
+    >>> at = policy.start(0)
+    >>> policy.act(None, at).item(), policy.act(None, policy.update(at, 1)).item()
+    (0, 1)
     """
 
     action: Array
@@ -137,8 +135,7 @@ class FiniteMemoryPolicy:
             )
         if not isinstance(key, np.random.Generator):
             jax = sys.modules["jax"]  # the key is its own
-            weight = jax.numpy.log(row)
-            return jax.random.categorical(key, weight, axis=-1).astype(np.int32)
+            return jax.random.categorical(key, jax.numpy.log(row), axis=-1).astype(np.int32)
         total = np.asarray(row, np.float64).cumsum(-1)
         point = key.random(total.shape[:-1])[..., None] * total[..., -1:]
         # Rounding may give the total itself, which is the last action of positive weight.
@@ -210,9 +207,8 @@ def _at(table: Array, *index: Array | int) -> Array:
 class Policy(Protocol):
     """Pure functions of a policy with memory, of finite memory or an exported network.
 
-    Example:
-      >>> hasattr(FiniteMemoryPolicy, "start") and hasattr(FiniteMemoryPolicy, "update")
-      True
+    >>> hasattr(FiniteMemoryPolicy, "start") and hasattr(FiniteMemoryPolicy, "update")
+    True
     """
 
     def start(self, state: PyTree, label: Collection[str] | None = None) -> PyTree:
@@ -232,11 +228,10 @@ class Controller:
       policy: the policy.
       seed: of the actions that it draws.
 
-    Example:
-      >>> moves = FiniteMemoryPolicy(np.array([[0, 1]]), np.zeros(1, int), np.array([[1, 0]]))
-      >>> robot = Controller(moves)
-      >>> robot.start(0), robot.act(), robot.update(0), robot.act()
-      (None, 0, None, 1)
+    >>> moves = FiniteMemoryPolicy(np.array([[0, 1]]), np.zeros(1, int), np.array([[1, 0]]))
+    >>> robot = Controller(moves)
+    >>> robot.start(0), robot.act(), robot.update(0), robot.act()
+    (None, 0, None, 1)
     """
 
     def __init__(self, policy: Policy, seed: int = 0) -> None:

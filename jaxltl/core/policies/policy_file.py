@@ -43,12 +43,11 @@ def save_policy(
     Raises:
       ValueError: the file cannot be written, or `more` has the name of an array of the policy.
 
-    Example:
-      >>> import tempfile
-      >>> still = FiniteMemoryPolicy(np.array([[0]]), np.zeros(1, int), np.zeros((1, 1), int))
-      >>> save_policy(path := tempfile.mkdtemp() + "/policy.npz", still, {"satisfaction": [1.0]})
-      >>> load_table(path).action.tolist()
-      [[0]]
+    >>> import tempfile
+    >>> still = FiniteMemoryPolicy(np.array([[0]]), np.zeros(1, int), np.zeros((1, 1), int))
+    >>> save_policy(path := tempfile.mkdtemp() + "/policy.npz", still, {"satisfaction": [1.0]})
+    >>> load_table(path).action.tolist()
+    [[0]]
     """
     parts = {name: getattr(policy, name) for name in _TABLE}
     kept = {name: x for name, x in parts.items() if x is not None and len(x)}

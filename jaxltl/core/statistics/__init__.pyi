@@ -1,5 +1,5 @@
-from .graph_assumption import LeastProbability as LeastProbability
 from .confidence_sets import (
     ConfidenceSets as ConfidenceSets,
+    LeastProbability as LeastProbability,
     intervals_from_counts as intervals_from_counts,
 )

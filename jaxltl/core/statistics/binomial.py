@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Floats, Integers
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -150,3 +151,40 @@ def _climbed(
         if not active.size:
             break
     return found
+
+
+# --- means of bounded numbers ------------------------------------------------------------------
+
+
+_MOST = 0.5  # of a weight; more gains little where the variance is small, and loses much else
+
+
+def bounded_mean(
+    numbers: Floats, failure: float, *, planned: int | None = None
+) -> tuple[float, float]:
+    """Confidence interval of the mean of numbers in [0, 1]."""
+    x = np.atleast_1d(validation.float_array("numbers", numbers))
+    failure = validation.fraction("failure", failure, ends=(False, False))
+    if planned is not None:
+        planned = validation.integer("planned", planned, least=1)
+    if x.ndim != 1 or np.isnan(x).any():
+        raise ValueError(
+            f"numbers is {validation.shorten(numbers)}; give one axis of them, none NaN."
+        )
+    x = np.clip(x, 0, 1)
+    count = np.arange(1, x.size + 1)
+    mean = (0.5 + np.cumsum(x)) / (count + 1)
+    variance = (0.25 + np.cumsum((x - mean) ** 2)) / (count + 1)
+    # Guesses from what came before each number.
+    guess, old = np.append(0.5, mean)[:-1], np.append(0.25, variance)[:-1]
+    many = count * np.log1p(count) if planned is None else planned
+    weight = np.minimum(np.sqrt(2 * np.log(2 / failure) / (many * old)), _MOST)
+    spread = (x - guess) ** 2 @ (-np.log1p(-weight) - weight)
+    total = weight.sum()
+    if not total:
+        return 0.0, 1.0
+    # Sums of n numbers are off by less than n roundings each.
+    rounding = 8 * float(np.finfo(np.float64).eps) * (x.size + 8)
+    deviation = (np.log(2 / failure) + spread) / total * (1 + rounding) + rounding
+    lower, upper = around(np.array(weight @ x / total), np.array(deviation))
+    return float(lower), float(upper)

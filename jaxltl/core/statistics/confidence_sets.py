@@ -6,13 +6,15 @@ its samples. A union bound makes all of them hold together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief, count, readable, value_range
 from jaxltl.core.statistics.binomial import (
@@ -23,7 +25,7 @@ from jaxltl.core.statistics.binomial import (
     frequency,
     hoeffding,
 )
-from jaxltl.core import validation
+from jaxltl.core.validation import Range
 
 Method = Literal["clopper-pearson", "hoeffding", "weissman", "anytime"]
 
@@ -63,11 +65,10 @@ class ConfidenceSets:
       num_claims: M, the number of claims that share the failure probability ``1 - confidence``.
       confidence, method: the arguments.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> found = jl.statistics.intervals_from_counts([[90, 10]], confidence=0.95)
-      >>> found.num_samples.tolist(), bool((found.lower[0] < [0.9, 0.1]).all())
-      ([100], True)
+    >>> import jaxltl as jl
+    >>> found = jl.statistics.intervals_from_counts([[90, 10]], confidence=0.95)
+    >>> found.num_samples.tolist(), bool((found.lower[0] < [0.9, 0.1]).all())
+    ([100], True)
     """
 
     lower: Floats
@@ -122,11 +123,10 @@ def intervals_from_counts(
         are not nonnegative integers at successors, shapes do not fit, or a row lists more than
         `num_outcomes`.
 
-    Example:
-      >>> sets = intervals_from_counts([[8, 2, 0], [5, 5, 0]], 0.9,
-      ...                              used=[[True, True, True], [True, True, False]])
-      >>> sets.num_claims, sets.lower.round(3).tolist(), sets.upper.round(3).tolist()
-      (4, [[0.401, 0.017, 0.0], [0.159, 0.159, 0.0]], [[0.983, 0.599, 0.355], [0.841, 0.841, 0.0]])
+    >>> sets = intervals_from_counts([[8, 2, 0], [5, 5, 0]], 0.9,
+    ...                              used=[[True, True, True], [True, True, False]])
+    >>> sets.num_claims, sets.lower.round(3).tolist(), sets.upper.round(3).tolist()
+    (4, [[0.401, 0.017, 0.0], [0.159, 0.159, 0.0]], [[0.983, 0.599, 0.355], [0.841, 0.841, 0.0]])
     """
     _check_method(method)
     check_confidence(confidence)
@@ -339,3 +339,62 @@ def _as_given(entries: Floats, is_entry: Booleans) -> Floats:
     found = np.zeros(is_entry.shape)
     found[is_entry] = entries
     return found
+
+
+# --- assumptions on the graph ------------------------------------------------------------------
+
+
+@brief
+@dataclass(frozen=True)
+class LeastProbability:
+    """The assumption that no possible transition is less likely than a given probability.
+
+    At most ``1 / value`` transitions leave a choice. Each of them is unobserved in n samples with
+    probability at most ``(1 - value) ** n``, so that with enough samples all are observed, except
+    with probability `failure` for all choices together.
+
+    Attributes:
+      value: the least probability of a possible transition, in (0, 1].
+      failure: the probability that the graph is wrong in spite of the assumption.
+
+    >>> LeastProbability(0.05, failure=0.01).sufficient_samples(num_choices=10)
+    195
+    """
+
+    value: float
+    failure: float = 0.005
+
+    def __post_init__(self) -> None:
+        validation.require_in_range("value", self.value, Range(0, 1, open_below=True))
+        validation.require_in_range(
+            "failure", self.failure, Range(0, 1, open_below=True, open_above=True)
+        )
+
+    def sufficient_samples(self, num_choices: int) -> int:
+        """Number of samples of a choice by which all its transitions have been observed."""
+        if self.value > 0.5:  # at most one transition
+            return 1
+        share = self.failure * self.value / max(num_choices, 1)
+        return math.ceil(math.log(share) / math.log1p(-self.value)) + 1
+
+
+Graph: TypeAlias = Literal["given", "seen", "complete"] | LeastProbability
+_STATES = "there are no states but those that the log names"
+_DESCRIPTION = {
+    "given": "only transitions of the given model are possible",
+    "seen": "only transitions that the log contains are possible",
+    "complete": _STATES,
+}
+
+
+def require_graph(graph: object, known: tuple[str, ...] = ("given", "seen", "complete")) -> None:
+    """Raises ValueError unless `graph` is a :class:`LeastProbability` or one of some words."""
+    if not isinstance(graph, LeastProbability):
+        validation.choice("graph", graph, known)
+
+
+def describe_graph(graph: Graph) -> str:
+    """The assumption in words, to be printed with every guarantee."""
+    if isinstance(graph, LeastProbability):
+        return f"no possible transition is less likely than {graph.value:g}, and {_STATES}"
+    return _DESCRIPTION[graph]

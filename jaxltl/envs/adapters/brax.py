@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
-    arrays,
     copied,
     own_errors,
     package,
     refuse_wrappers,
     require_environment,
+    reset_to_arrays,
     timestep,
 )
 
@@ -48,27 +47,25 @@ def from_brax(
       ValueError: not a Brax environment, or an auto-reset or batch wrapper.
       ImportError: brax is not installed.
 
-    Example:
-      >>> import brax.envs
-      >>> world = from_brax(brax.envs.get_environment("inverted_pendulum"))
-      >>> world.actions.shape, world.observations.shape
-      ((1,), (4,))
+    >>> import brax.envs
+    >>> world = from_brax(brax.envs.get_environment("inverted_pendulum"))
+    >>> world.actions.shape, world.observations.shape
+    ((1,), (4,))
     """
-    envs, training = package("brax.envs"), package("brax.envs.wrappers.training")
-    make = "give brax.envs.get_environment(name), and limit its episodes by with_time_limit"
-    require_environment("brax", env, envs.Env, "brax.envs.get_environment(name)")
+    training = package("brax.envs.wrappers.training")
+    require_environment("brax", env, package("brax.envs").Env, "brax.envs.get_environment(name)")
     refuse_wrappers(
         "brax",
         env,
         "env",
         (training.AutoResetWrapper, training.VmapWrapper, training.DomainRandomizationVmapWrapper),
-        make,
+        "give brax.envs.get_environment(name), and limit its episodes by with_time_limit",
     )
     held, size = Held(env), int(env.action_size)
     length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
     with own_errors("brax", env):
         return make_environment(
-            Partial(_reset, held),
+            Partial(reset_to_arrays, held),
             Partial(_step, held),
             Partial(_observe),
             actions=make_box(-1.0, 1.0, (size,), np.float32),
@@ -78,11 +75,7 @@ def from_brax(
         )
 
 
-def _reset(held: Held, key: chex.PRNGKey) -> PyTree:
-    return arrays(held.it.reset(key))
-
-
-def _step(held: Held, world: PyTree, action: PyTree, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
     del key
     found = held.it.step(copied(world), action)
     done = found.done > 0

@@ -19,7 +19,6 @@ from jaxltl.core.environments.environment import Timestep, as_partial
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 
-
 Foreign: TypeAlias = Any  # an object, a type or a module of a package that may be missing
 
 
@@ -117,6 +116,11 @@ def layers(env: Foreign, attribute: str) -> Iterator[Foreign]:
 def copied(tree: PyTree) -> PyTree:
     """A copy of the containers of a tree, since some packages modify their arguments."""
     return jax.tree.map(lambda x: x, tree)
+
+
+def reset_to_arrays(held: Held, *arguments: PyTree) -> PyTree:
+    """The initial state of a package whose `reset` returns it alone."""
+    return arrays(held.it.reset(*arguments))
 
 
 def arrays(tree: PyTree, like: PyTree = None) -> PyTree:

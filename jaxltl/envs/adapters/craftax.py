@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
@@ -48,11 +47,10 @@ def from_craftax(
       ValueError: not a Craftax environment, or one with auto-reset.
       ImportError: craftax is not installed.
 
-    Example:
-      >>> from craftax.craftax_env import make_craftax_env_from_name
-      >>> own = make_craftax_env_from_name("Craftax-Classic-Symbolic-v1", auto_reset=False)
-      >>> from_craftax(own).actions.num
-      17
+    >>> from craftax.craftax_env import make_craftax_env_from_name
+    >>> own = make_craftax_env_from_name("Craftax-Classic-Symbolic-v1", auto_reset=False)
+    >>> from_craftax(own).actions.num
+    17
     """
     bases = package("craftax.environment_base.environment_bases")
     make = "craftax_env.make_craftax_env_from_name(name, auto_reset=False)"
@@ -74,14 +72,12 @@ def from_craftax(
     )
 
 
-def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> PyTree:
+def _reset(held: Held, params: Foreign, key: Key) -> PyTree:
     _, state = held.it.reset_env(key, params)
     return arrays(state)
 
 
-def _step(
-    held: Held, params: Foreign, world: PyTree, action: PyTree, key: chex.PRNGKey
-) -> Timestep:
+def _step(held: Held, params: Foreign, world: PyTree, action: PyTree, key: Key) -> Timestep:
     env = held.it
     _, state, reward, _, _ = env.step_env(key, copied(world), action, params)
     endless = params.replace(max_timesteps=jnp.iinfo(jnp.int32).max)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
@@ -16,7 +16,6 @@ from jaxltl.core.environments.environment import (
     make_box,
     make_environment,
 )
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
@@ -56,12 +55,11 @@ def from_gymnax(
       ValueError: not a gymnax environment, a wrapper, or actions that are neither finite nor in a box.
       ImportError: gymnax is not installed.
 
-    Example:
-      >>> import gymnax
-      >>> world = from_gymnax(*gymnax.make("CartPole-v1"), propositions=["near"],
-      ...                     labels=lambda state: abs(state.x)[None] < 0.4)
-      >>> world.actions.num, world.horizon, world.propositions
-      (2, 500, ('near',))
+    >>> import gymnax
+    >>> world = from_gymnax(*gymnax.make("CartPole-v1"), propositions=["near"],
+    ...                     labels=lambda state: abs(state.x)[None] < 0.4)
+    >>> world.actions.num, world.horizon, world.propositions
+    (2, 500, ('near',))
     """
     module = package("gymnax.environments.environment")
     require_environment(
@@ -93,12 +91,12 @@ def space_of_actions(root: str, space: Foreign) -> Finite | Box:
     raise ValueError(f"from_{root}: actions are {space!r}; they must be finite or in a box.")
 
 
-def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> Seen:
+def _reset(held: Held, params: Foreign, key: Key) -> Seen:
     observation, state = held.it.reset(key, params)
     return arrays(Seen(state, observation))
 
 
-def _step(held: Held, params: Foreign, world: Seen, action: PyTree, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, params: Foreign, world: Seen, action: PyTree, key: Key) -> Timestep:
     env = held.it
     observation, state, reward, terminated, _ = env.step_env(
         key, copied(world.state), action, params

@@ -10,16 +10,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.environments.environment import Environment, Timestep, make_environment
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.array_types import Key, PyTree
+from jaxltl.core.environments.environment import (
+    Environment,
+    Timestep,
+    make_environment,
+    of_world,
+    optional,
+)
 from jaxltl.core.pretty_print import brief
-from jaxltl.envs.adapters.common import Held
+from jaxltl.envs.adapters.common import Held, timestep
 
 
 @brief
@@ -61,7 +66,7 @@ def in_turn(
         Partial(_choose, held, inner.step),
         Partial(_seen, held, inner.observe),
         actions=max(counts),
-        labels=None if inner.labels is None else Partial(_labels, inner.labels),
+        labels=optional(of_world, inner.labels),
         propositions=propositions,
         allowed=Partial(_allowed, held, inner.mask),
         horizon=None if horizon is None else horizon * len(counts),
@@ -72,28 +77,18 @@ def _nothing(counts: Held, world: PyTree) -> PartWorld:
     return PartWorld(world, jnp.zeros(len(counts.it), jnp.int32), jnp.int32(0))
 
 
-def _begin(counts: Held, reset: Callable[..., PyTree], key: chex.PRNGKey) -> PartWorld:
+def _begin(counts: Held, reset: Callable[..., PyTree], key: Key) -> PartWorld:
     return _nothing(counts, reset(key))
 
 
 def _choose(
-    counts: Held,
-    step: Callable[..., Timestep],
-    now: PartWorld,
-    action: jax.Array,
-    key: chex.PRNGKey,
+    counts: Held, step: Callable[..., Timestep], now: PartWorld, action: jax.Array, key: Key
 ) -> Timestep:
     last = now.turn == len(counts.it) - 1
     parts = now.parts.at[now.turn].set(action)
 
     def wait() -> Timestep:
-        return Timestep(
-            now.world,
-            jnp.zeros((), jnp.result_type(float)),
-            jnp.bool_(False),
-            jnp.bool_(False),
-            jnp.zeros(()),
-        )
+        return timestep(now.world, now.world, 0.0, False, False)
 
     found = lax.cond(last, lambda: step(now.world, parts, key), wait)
     fresh, going = _nothing(counts, found.world), PartWorld(found.world, parts, now.turn + 1)
@@ -106,10 +101,6 @@ def _seen(counts: Held, observe: Callable[..., PyTree], now: PartWorld) -> PartO
     return PartObservation(
         observe(now.world), chosen & (number < now.turn)[:, None], number == now.turn
     )
-
-
-def _labels(labels: Callable[..., jax.Array], now: PartWorld) -> jax.Array:
-    return labels(now.world)
 
 
 def _allowed(counts: Held, mask: Callable[..., jax.Array] | None, now: PartWorld) -> jax.Array:

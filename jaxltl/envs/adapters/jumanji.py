@@ -6,13 +6,13 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.core import validation
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
@@ -21,7 +21,6 @@ from jaxltl.core.environments.environment import (
     make_box,
     make_environment,
 )
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
@@ -71,11 +70,10 @@ def from_jumanji(
         or actions that are neither finite nor in a box, or have too many combinations.
       ImportError: jumanji is not installed.
 
-    Example:
-      >>> import jumanji
-      >>> world = from_jumanji(jumanji.make("Snake-v1"))
-      >>> world.actions.num, world.allowed is None
-      (4, False)
+    >>> import jumanji
+    >>> world = from_jumanji(jumanji.make("Snake-v1"))
+    >>> world.actions.num, world.allowed is None
+    (4, False)
     """
     jumanji, wrappers = package("jumanji"), package("jumanji.wrappers")
     require_environment("jumanji", env, jumanji.Environment, "jumanji.make(name)")
@@ -197,20 +195,20 @@ def _allowed_apart(parts: Held, world: Seen) -> jax.Array:
     return some_allowed(found)
 
 
-def _reset(held: Held, key: chex.PRNGKey) -> Seen:
+def _reset(held: Held, key: Key) -> Seen:
     state, found = held.it.reset(key)
     return arrays(Seen(state, found.observation))
 
 
 def _step(
-    held: Held, endless: Held, parts: Held, world: Seen, action: PyTree, key: chex.PRNGKey
+    held: Held, endless: Held, parts: Held, world: Seen, action: PyTree, key: Key
 ) -> Timestep:
     if parts.it:
         action = jnp.stack(jnp.unravel_index(action, parts.it))
     return _moved(held, endless, world, action, key)
 
 
-def _moved(held: Held, endless: Held, world: Seen, action: PyTree, key: chex.PRNGKey) -> Timestep:
+def _moved(held: Held, endless: Held, world: Seen, action: PyTree, key: Key) -> Timestep:
     """A step with a scalar action, or with a vector of components."""
     del key  # the state has one
     spec = held.it.action_spec

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
-    arrays,
     copied,
     labels_of_state,
     observation_of,
     package,
     require_environment,
+    reset_to_arrays,
     timestep,
 )
 
@@ -47,18 +46,16 @@ def from_navix(
       ValueError: not a Navix environment.
       ImportError: navix is not installed.
 
-    Example:
-      >>> import navix
-      >>> world = from_navix(navix.make("Navix-Empty-5x5-v0"), propositions=["goal"],
-      ...                    labels=lambda state: state.events.goal_reached.happened[None])
-      >>> world.actions.num, world.propositions
-      (7, ('goal',))
+    >>> import navix
+    >>> world = from_navix(navix.make("Navix-Empty-5x5-v0"), propositions=["goal"],
+    ...                    labels=lambda state: state.events.goal_reached.happened[None])
+    >>> world.actions.num, world.propositions
+    (7, ('goal',))
     """
-    navix = package("navix")
-    require_environment("navix", env, navix.Environment, "navix.make(name)")
+    require_environment("navix", env, package("navix").Environment, "navix.make(name)")
     held = Held(env)
     return make_environment(
-        Partial(_reset, held),
+        Partial(reset_to_arrays, held),
         Partial(_step, held),
         Partial(observation_of),
         actions=len(env.action_set),
@@ -68,11 +65,7 @@ def from_navix(
     )
 
 
-def _reset(held: Held, key: chex.PRNGKey) -> PyTree:
-    return arrays(held.it.reset(key))
-
-
-def _step(held: Held, world: PyTree, action: PyTree, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
     del key  # the state has one
     running = copied(world).replace(step_type=jnp.zeros_like(world.step_type))
     found = held.it.step(running, action)

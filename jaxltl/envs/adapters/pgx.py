@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, as_partial, make_environment
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.adapters.common import (
     Foreign,
@@ -65,15 +64,13 @@ def from_pgx(
       ValueError: not a Pgx environment, no opponent, or no such player.
       ImportError: pgx is not installed.
 
-    Example:
-      >>> import pgx
-      >>> def anything(state, key):
-      ...     return jax.random.categorical(key, jnp.log(state.legal_action_mask))
-      >>> from_pgx(pgx.make("tic_tac_toe"), anything).actions.num
-      9
+    >>> import pgx
+    >>> def anything(state, key):
+    ...     return jax.random.categorical(key, jnp.log(state.legal_action_mask))
+    >>> from_pgx(pgx.make("tic_tac_toe"), anything).actions.num
+    9
     """
-    pgx = package("pgx")
-    require_environment("pgx", env, pgx.Env, "pgx.make(name)")
+    require_environment("pgx", env, package("pgx").Env, "pgx.make(name)")
     if not (isinstance(player, int | np.integer) and 0 <= player < env.num_players):
         raise ValueError(
             f"from_pgx: player={player!r}; {env.id} has the players 0 to {env.num_players - 1}."
@@ -83,8 +80,7 @@ def from_pgx(
             f"from_pgx: {env.id} is for {env.num_players} players; give an opponent, "
             "(state, key) -> action, where there are several, and None where there is one."
         )
-    others = None if opponent is None else as_partial(opponent)
-    game = Held(env), int(player), others
+    game = Held(env), int(player), None if opponent is None else as_partial(opponent)
     return make_environment(
         Partial(_reset, *game),
         Partial(_step, *game),
@@ -96,19 +92,14 @@ def from_pgx(
     )
 
 
-def _reset(held: Held, player: int, opponent: Partial | None, key: chex.PRNGKey) -> Turn:
+def _reset(held: Held, player: int, opponent: Partial | None, key: Key) -> Turn:
     start, others = jax.random.split(key)
     state = arrays(held.it.init(start))
     return Turn(*_await_turn(held, player, opponent, state, jnp.zeros(()), others))
 
 
 def _step(
-    held: Held,
-    player: int,
-    opponent: Partial | None,
-    world: Turn,
-    action: PyTree,
-    key: chex.PRNGKey,
+    held: Held, player: int, opponent: Partial | None, world: Turn, action: PyTree, key: Key
 ) -> Timestep:
     own, others = jax.random.split(key)
     state = arrays(held.it.step(copied(world.state), action, own), world.state)
@@ -119,12 +110,7 @@ def _step(
 
 
 def _await_turn(
-    held: Held,
-    player: int,
-    opponent: Partial | None,
-    state: PyTree,
-    earned: jax.Array,
-    key: chex.PRNGKey,
+    held: Held, player: int, opponent: Partial | None, state: PyTree, earned: jax.Array, key: Key
 ) -> tuple[PyTree, jax.Array]:
     """Plays the others' moves until the player moves or the game ends; state and reward."""
     if opponent is None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import chex
 import jax
 from jax.tree_util import Partial
 
+from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
@@ -49,13 +48,11 @@ def from_xminigrid(
       ValueError: not an xminigrid environment, one with auto-reset, or no limit of steps in `params`.
       ImportError: xminigrid is not installed.
 
-    Example:
-      >>> import xminigrid
-      >>> from_xminigrid(*xminigrid.make("MiniGrid-Empty-5x5")).actions.num
-      6
+    >>> import xminigrid
+    >>> from_xminigrid(*xminigrid.make("MiniGrid-Empty-5x5")).actions.num
+    6
     """
-    module = package("xminigrid.environment")
-    wrappers = package("xminigrid.wrappers")
+    module, wrappers = package("xminigrid.environment"), package("xminigrid.wrappers")
     require_environment("xminigrid", env, module.Environment, "xminigrid.make(name)[0]")
     refuse_wrappers(
         "xminigrid",
@@ -81,13 +78,11 @@ def from_xminigrid(
     )
 
 
-def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> PyTree:
+def _reset(held: Held, params: Foreign, key: Key) -> PyTree:
     return arrays(held.it.reset(params, key))
 
 
-def _step(
-    held: Held, params: Foreign, world: PyTree, action: PyTree, key: chex.PRNGKey
-) -> Timestep:
+def _step(held: Held, params: Foreign, world: PyTree, action: PyTree, key: Key) -> Timestep:
     del key
     found = held.it.step(params, copied(world), action)
     over = found.discount == 0

@@ -9,13 +9,14 @@ import pytest
 
 from jaxltl.core.automata.automaton import make_automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.environments.finite_task import (
+from jaxltl.core.environments.monitor import (
+    Verdict,
     finite_verdict_frequencies,
     finite_verdicts,
     make_finite_task,
+    verdict,
     verdict_frequencies,
 )
-from jaxltl.core.environments.monitor import Verdict, verdict
 from tests.reference_logic import holds_by_definition, random_formula, subsets, words
 from tests.support import counted_traces
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxltl.core.statistics.empirical_bernstein import bounded_mean
+from jaxltl.core.statistics.binomial import bounded_mean
 
 KINDS = {
     "rare": (0.01, lambda rng, n: (rng.random(n) < 0.01) * 1.0),

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.statistics.graph_assumption import LeastProbability, require_graph
+from jaxltl.core.statistics.confidence_sets import LeastProbability, require_graph
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
@@ -362,7 +362,7 @@ def model_from_counts(
       terminal: absorbing states.
       graph: the assumption on transitions that were not observed: ``"seen"``, they are impossible
         (except those with a count of 0); ``"complete"``, each choice may lead to every state; or
-        :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, they are impossible for
+        :class:`~jaxltl.core.statistics.confidence_sets.LeastProbability`, they are impossible for
         choices with sufficiently many samples.
 
     Returns:

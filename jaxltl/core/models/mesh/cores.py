@@ -23,7 +23,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import mlir
 from jax.sharding import SingleDeviceSharding
 
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.array_types import PyTree
 
 Result = TypeVar("Result")
 
@@ -179,8 +179,7 @@ class _Parts:
                 rows = np.minimum(np.arange(start, start + self.width), self.size - 1)
             given = [x[rows] if has else x for x, has in zip(shared, self.lanes, strict=True)]
             with jax.enable_x64(self.x64):  # local to a thread
-                results = self.compiled[start // self.width](*given)
-                for x, y in zip(found, results, strict=True):
+                for x, y in zip(found, self.compiled[start // self.width](*given), strict=True):
                     x[start:stop] = np.asarray(y)[: stop - start] if skip else np.asarray(y)
 
         with jax.enable_x64(self.x64):  # one copy of large arrays for all parts

@@ -14,7 +14,7 @@ from jax import lax
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core import validation
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.array_types import PyTree
 
 
 def vmap_over_mesh(
@@ -45,12 +45,11 @@ def vmap_over_mesh(
     Raises:
       ValueError: an unknown axis, other `in_axes`, or batches of different size.
 
-    Example:
-      >>> mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
-      >>> def draw(key, scale):
-      ...     return scale * jax.random.normal(key)
-      >>> vmap_over_mesh(draw, mesh, in_axes=(0, None))(jax.random.split(jax.random.key(0), 6), 0.1).shape
-      (6,)
+    >>> mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
+    >>> def draw(key, scale):
+    ...     return scale * jax.random.normal(key)
+    >>> vmap_over_mesh(draw, mesh, in_axes=(0, None))(jax.random.split(jax.random.key(0), 6), 0.1).shape
+    (6,)
     """
     validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
     names = axes_of(mesh, axis)
@@ -74,9 +73,8 @@ def on_host(tree: PyTree) -> PyTree:
     Returns:
       The tree of NumPy arrays.
 
-    Example:
-      >>> on_host({"a": jnp.arange(3), "b": 2.5})["a"].tolist()
-      [0, 1, 2]
+    >>> on_host({"a": jnp.arange(3), "b": 2.5})["a"].tolist()
+    [0, 1, 2]
     """
 
     def one(x: PyTree) -> PyTree:

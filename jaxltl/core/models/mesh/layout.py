@@ -55,24 +55,20 @@ class StateLayout(NamedTuple):
     @property
     def mine(self) -> list[int]:
         """The ranges of which this process holds a copy."""
-        here = jax.process_index()
-        return [
-            d
-            for d in range(self.parts)
-            if any(device.process_index == here for device in self.devices(d))
-        ]
+        here, each = jax.process_index(), range(self.parts)
+        return [d for d in each if any(x.process_index == here for x in self.devices(d))]
 
     def span(self, d: int) -> tuple[int, int]:
         return int(self.starts[d]), int(self.starts[d + 1])
 
     def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
-        here, found = jax.process_index(), []
-        for d, piece in pieces.items():
-            found += [
-                jax.device_put(piece, device)
-                for device in self.devices(d)
-                if device.process_index == here
-            ]
+        here = jax.process_index()
+        found = [
+            jax.device_put(piece, device)
+            for d, piece in pieces.items()
+            for device in self.devices(d)
+            if device.process_index == here
+        ]
         some = next(iter(pieces.values()))
         shape = (some.shape[0] * self.parts, *some.shape[1:])
         return jax.make_array_from_single_device_arrays(shape, self.sharding, found)

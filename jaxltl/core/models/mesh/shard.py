@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import brief, count
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
@@ -29,6 +28,7 @@ from jaxltl.core.models.sparse import (
     refuse_underflow,
     scaled,
 )
+from jaxltl.core.pretty_print import brief, count
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
@@ -60,10 +60,9 @@ class ModelPart:
       rewards: expected rewards of rows by name, ``float[r]``.
       row: ``int[r]``, row numbers of the whole model, for quantities on rows in :func:`to_mesh`.
 
-    Example:
-      >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # a cycle of two states
-      >>> part.successor.tolist(), part.row_start is None
-      ([1, 0], True)
+    >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # a cycle of two states
+    >>> part.successor.tolist(), part.row_start is None
+    ([1, 0], True)
     """
 
     entry_start: np.ndarray
@@ -99,11 +98,10 @@ def shard(
       ValueError: an invalid model, axis or order, or a probability that is zero or subnormal in JAX's
         default precision.
 
-    Example:
-      >>> from jaxltl import from_dense
-      >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), jax.make_mesh((1,), ("states",)))
-      >>> from_mesh(sharded, to_mesh(sharded, np.array([1.0, 2.0]))).tolist()
-      [1.0, 2.0]
+    >>> from jaxltl import from_dense
+    >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), jax.make_mesh((1,), ("states",)))
+    >>> from_mesh(sharded, to_mesh(sharded, np.array([1.0, 2.0]))).tolist()
+    [1.0, 2.0]
     """
     sparse = to_sparse(model)
     host, column = sparse.host, row_actions(sparse)
@@ -155,12 +153,11 @@ def model_from_parts(
     Raises:
       ValueError: an invalid part, naming the state and the value.
 
-    Example:
-      >>> def cycle(start, stop):  # from each state to the next
-      ...     state = np.arange(start, stop)
-      ...     return ModelPart(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
-      >>> model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",))).num_states
-      10
+    >>> def cycle(start, stop):  # from each state to the next
+    ...     state = np.arange(start, stop)
+    ...     return ModelPart(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
+    >>> model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",))).num_states
+    10
     """
     if not isinstance(num_states, int | np.integer) or num_states < 1:
         raise ValueError(
@@ -190,11 +187,10 @@ def to_mesh(model: ShardedMDP, quantity: Array, fill: Array = 0) -> jax.Array:
     Raises:
       ValueError: a wrong shape, or a weight that underflows in the model's precision.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
-      >>> to_mesh(shard(path, jax.make_mesh((1,), ("states",))), np.array([1.0, 2.0])).shape
-      (2,)
+    >>> import jaxltl as jl
+    >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+    >>> to_mesh(shard(path, jax.make_mesh((1,), ("states",))), np.array([1.0, 2.0])).shape
+    (2,)
     """
     quantity, index = np.asarray(quantity), model.number
     if quantity.shape[:1] != (model.num_given,):
@@ -241,12 +237,11 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     Returns:
       A NumPy array ``[S, ...]``.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
-      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
-      >>> from_mesh(model, to_mesh(model, np.array([1.0, 2.0]))).tolist()
-      [1.0, 2.0]
+    >>> import jaxltl as jl
+    >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+    >>> model = shard(path, jax.make_mesh((1,), ("states",)))
+    >>> from_mesh(model, to_mesh(model, np.array([1.0, 2.0]))).tolist()
+    [1.0, 2.0]
     """
     number, found = on_host((model.number, quantity))
     result = np.zeros((model.num_given, *found.shape[1:]), found.dtype)
@@ -311,10 +306,10 @@ def _assembled(
         np.concatenate(layout.exchanged({d: np.unique(x.label, axis=0) for d, x in parts.items()})),
         axis=0,
     )
-    pieces = {}
-    for d, x in parts.items():
-        rows = _tables(layout, halo, facts, d, x)
-        pieces[d] = _of_states(layout, facts, d, x, rows, labels)
+    pieces = {
+        d: _of_states(layout, facts, d, x, _tables(layout, halo, facts, d, x), labels)
+        for d, x in parts.items()
+    }
     whole: _Piece = jax.tree.map(
         lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values()
     )
@@ -547,10 +542,8 @@ def _of_states(
     different, of = np.unique(part.label, axis=0, return_inverse=True)
     place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
     kind[:here] = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
-    start, stop = layout.span(d)
-    number = np.full(layout.size, -1, np.int32)
-    order = layout.order
-    number[:here] = np.arange(start, stop) if order is None else order[start:stop]
+    own, number = slice(*layout.span(d)), np.full(layout.size, -1, np.int32)
+    number[:here] = np.arange(own.start, own.stop) if layout.order is None else layout.order[own]
     row = None if part.row is None else on_choices(part.row, -1, np.int32)
     initial = np.zeros(layout.size)
     initial[:here] = part.initial

@@ -12,16 +12,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxltl.core import struct, validation
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import brief, count, propositions_text, truncate
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Array, Model, PyTree
+from jaxltl.core.pretty_print import brief, count, propositions_text, truncate
 
 
 class RowTable(NamedTuple):
@@ -66,12 +66,11 @@ class ShardedMDP:
       mesh, axis: the devices, and the mesh axis of the states; static.
       rounds: for each round the pairs (source, target) of devices; None: all-gather; static.
 
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
-      >>> model = jl.models.shard(path, jax.make_mesh((1,), ("states",)))
-      >>> model.num_given, model.num_devices, model.num_exchanged
-      (2, 1, 0)
+    >>> import jaxltl as jl
+    >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+    >>> model = jl.models.shard(path, jax.make_mesh((1,), ("states",)))
+    >>> model.num_given, model.num_devices, model.num_exchanged
+    (2, 1, 0)
     """
 
     tables: tuple[RowTable, ...]
@@ -291,6 +290,5 @@ def _(model: ShardedMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
 
 @operators.transition_matrix.register
 def _(model: ShardedMDP, policy: jax.Array) -> jax.Array:
-    eye = jnp.eye(model.num_states, dtype=model.dtype)
-    ahead = operators.expectation(model, eye)  # [N, N, A]
+    ahead = operators.expectation(model, jnp.eye(model.num_states, dtype=model.dtype))  # [N, N, A]
     return jnp.einsum("nta,na->nt", ahead, policy, precision="highest")

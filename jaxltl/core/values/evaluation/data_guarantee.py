@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxltl.core.statistics.graph_assumption import (
+from jaxltl.core.statistics.confidence_sets import (
     Graph,
     LeastProbability,
     describe_graph,
@@ -107,7 +107,7 @@ def learn_guarantee(
       task: a formula, its text, or an automaton.
       confidence: in (0, 1), of all returned statements at once.
       graph: the assumption on the model's graph, required: ``"given"``, it is known; ``"seen"``,
-        ``"complete"`` or :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, as for
+        ``"complete"`` or :class:`~jaxltl.core.statistics.confidence_sets.LeastProbability`, as for
         `model_from_counts`.
       method: of counts; ``"anytime"`` (default) holds for adaptive sampling; ``"clopper-pearson"``,
         ``"hoeffding"`` and ``"weissman"`` need numbers of samples that do not depend on outcomes.

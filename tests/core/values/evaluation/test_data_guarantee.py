@@ -8,8 +8,11 @@ import pytest
 from jaxltl.core.models.construct.counts import make_counts, model_from_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.statistics.confidence_sets import intervals_from_counts
-from jaxltl.core.statistics.graph_assumption import LeastProbability, describe_graph
+from jaxltl.core.statistics.confidence_sets import (
+    LeastProbability,
+    describe_graph,
+    intervals_from_counts,
+)
 from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.reference_intervals import random_model
