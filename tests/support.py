@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.automaton import make_automaton
+from jaxltl.core.environments.environment import Box, Finite, some_action
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, to_dense
 from jaxltl.core.models.product import Product, product
 from tests import reference
@@ -206,3 +207,17 @@ def mass_preserving(rng: np.random.Generator, probability: np.ndarray) -> np.nda
 def nature_word(objective, direction):
     """The word for a nature that maximises (``"max"``) or minimises under an objective."""
     return "cooperative" if objective == direction else "adversarial"
+
+
+def random_action(key: jax.Array, actions: Finite | Box, allowed: Any = None) -> jax.Array:
+    """A uniform random available action; normal in unbounded directions of a box."""
+    if isinstance(actions, Finite):
+        weight = jnp.zeros(actions.num) if allowed is None else jnp.where(allowed, 0, -jnp.inf)
+        return jax.random.categorical(key, weight).astype(jnp.int32)
+    space = some_action(actions)
+    low, high = (jnp.broadcast_to(x, space.shape) for x in (actions.low, actions.high))
+    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+    share = jax.random.uniform(key, space.shape, space.dtype)
+    inside = jnp.where(bounded, low, 0) + share * jnp.where(bounded, high - low, 0)
+    normal = jax.random.normal(key, space.shape, space.dtype)
+    return jnp.where(bounded, inside, jnp.clip(normal, low, high))

@@ -181,11 +181,13 @@ def names_in(section):
 
 
 def fields_of(kind):
-    """The public fields of a dataclass, a named tuple or an enumeration."""
+    """The public fields of a dataclass, a named tuple or an enumeration, without those of bases."""
     if issubclass(kind, enum.Enum):
         return [member.name for member in kind]
     if dataclasses.is_dataclass(kind):
-        names = [field.name for field in dataclasses.fields(kind)]
+        bases = [base for base in kind.__mro__[1:] if dataclasses.is_dataclass(base)]
+        inherited = {field.name for base in bases for field in dataclasses.fields(base)}
+        names = [x.name for x in dataclasses.fields(kind) if x.name not in inherited]
     else:
         names = getattr(kind, "_fields", ())
     return [name for name in names if not name.startswith("_") and name not in ("parent", "name")]

@@ -39,7 +39,7 @@ from flax import linen as nn
 
 from jaxltl.algos.common import learner, trees
 from jaxltl.algos.common.learner import Best, stop_early
-from jaxltl.algos.common.settings import COUNT, Number, require_output, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
@@ -152,19 +152,16 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Parameters; once `stopped`, only the step counter changes.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
       best: the best held-out parameters, :class:`~jaxltl.algos.common.learner.Best`.
       stopped: ``bool[]``, whether patience is exhausted.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     optimizer: PyTree
     best: Best

@@ -29,7 +29,7 @@ from jax import lax
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.play import check_reward, explicit_game
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP
@@ -66,11 +66,9 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
-    """A root `key`, the number `step`, the table `q` ``float[S, A]``, and the model's state `position`."""
+class State(RunState):
+    """The table `q` ``float[S, A]``, and the model's state `position`."""
 
-    key: jax.Array
-    step: jax.Array
     q: jax.Array
     position: jax.Array
 

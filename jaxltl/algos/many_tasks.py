@@ -238,10 +238,8 @@ def sequence_agent(
         validation.instance(
             "actions", actions, Finite | Box, "the environment's, environment.actions"
         )
-    how = _How(
-        validation.choice("squash", squash, action_distributions.SQUASHES),
-        validation.boolean("sampled", sampled),
-    )
+    squash = validation.choice("squash", squash, action_distributions.SQUASHES)
+    how = struct.Static((squash, validation.boolean("sampled", sampled)))
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, (how, actions, as_partial(network, "network"), plan)), begin)
 
@@ -272,23 +270,6 @@ def sequence_policy(
     return jax.nn.softmax(actions[jnp.argmax(values)])
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class _Module:
-    """A network's definition as a static part of a pytree."""
-
-    network: nn.Module
-
-
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class _How:
-    """Settings by which an action is sampled."""
-
-    squash: str
-    sampled: bool
-
-
 def trained(network: nn.Module, parameters: PyTree, moments: PyTree = None) -> Partial:
     """A function ``observation -> (parameters of the action, value)``: a network with parameters.
 
@@ -296,11 +277,13 @@ def trained(network: nn.Module, parameters: PyTree, moments: PyTree = None) -> P
     the `moments` by which observations were normalised in training, ``state.moments``; None: not.
     """
     validation.instance("network", network, nn.Module, "a flax.linen.Module")
-    return Partial(_applied, _Module(network), parameters, moments)
+    return Partial(_applied, struct.Static(network), parameters, moments)
 
 
-def _applied(module: _Module, parameters: PyTree, moments: PyTree, observation: PyTree) -> PyTree:
-    return applied(module.network, parameters, normalized(moments, observation))
+def _applied(
+    network: struct.Static, parameters: PyTree, moments: PyTree, observation: PyTree
+) -> PyTree:
+    return applied(network.value, parameters, normalized(moments, observation))
 
 
 def _actions_of(parameters: PyTree) -> Finite:
@@ -334,13 +317,14 @@ def _judged(
 
 
 def _act(
-    agent: tuple[_How, Finite | Box | None, Callable[..., PyTree], Plan],
+    agent: tuple[struct.Static, Finite | Box | None, Callable[..., PyTree], Plan],
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
     key: Key,
 ) -> tuple[PyTree, PyTree]:
     how, space, network, plan = agent
+    squash, sampled = how.value
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
         validation.instance(
             "observation",
@@ -363,8 +347,8 @@ def _act(
         _actions_of(said) if space is None else space,
         said,
         allowed,
-        sampled=how.sampled,
-        squash=how.squash,
+        sampled=sampled,
+        squash=squash,
     )
     return action, Choice(state, taken, worth)
 

@@ -20,7 +20,7 @@ from flax.struct import field
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.status import Status
 
-__all__ = ["dataclass", "field", "metrics", "register", "register_annotated_pytree"]
+__all__ = ["Static", "dataclass", "field", "metrics", "register", "register_annotated_pytree"]
 
 ClassT = TypeVar("ClassT")
 _CODES = {"status": Status}
@@ -68,6 +68,13 @@ def metrics(cls: type[ClassT]) -> type[ClassT]:
 def _replace(self: Any, **updates: Any) -> Any:
     """A copy with the given fields replaced."""
     return dataclasses.replace(self, **updates)
+
+
+@dataclass
+class Static:
+    """A hashable `value` as a static part of a pytree."""
+
+    value: Any = field(pytree_node=False)
 
 
 class _Text:

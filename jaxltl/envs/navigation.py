@@ -26,7 +26,7 @@ The dissertation gives the geometry only in figure 9, from which these numbers a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -96,13 +96,6 @@ class Run(NamedTuple):
 
     state: State
     action: jax.Array
-
-
-@struct.dataclass
-class _Static:
-    """Static arguments of traced functions."""
-
-    value: Any = struct.field(pytree_node=False)
 
 
 class Settings(TypedDict, total=False):
@@ -385,13 +378,13 @@ def simulate(
     ((10, 30), (10, 30, 2))
     """
     _check_fits(world, network)
-    settings = _Static((num_trajectories, validation.boolean("absorbing", absorbing)))
+    settings = struct.Static((num_trajectories, validation.boolean("absorbing", absorbing)))
     return _simulate(network, settings, world, jnp.asarray(parameters), key)
 
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _simulate(
-    network: Network, settings: _Static, world: Navigation, parameters: jax.Array, key: Key
+    network: Network, settings: struct.Static, world: Navigation, parameters: jax.Array, key: Key
 ) -> Run:
     num_trajectories, absorbing = settings.value
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
@@ -449,9 +442,9 @@ def evaluator(
         if np.ndim(task) or task not in TASKS:
             raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
         absorbing = task == 1 if absorbing is None else absorbing
-        score = jax.tree_util.Partial(_table_4, _Static(int(task)))
+        score = jax.tree_util.Partial(_table_4, struct.Static(int(task)))
     absorbing = absorbing is not None and validation.boolean("absorbing", absorbing)
-    settings = _Static((int(num_trajectories), absorbing))
+    settings = struct.Static((int(num_trajectories), absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
 
 
@@ -463,14 +456,14 @@ def _check_fits(world: Navigation, network: Network) -> None:
         )
 
 
-def _table_4(task: _Static, world: Navigation, run: Run) -> tuple[jax.Array, jax.Array]:
+def _table_4(task: struct.Static, world: Navigation, run: Run) -> tuple[jax.Array, jax.Array]:
     return scores(world, run.state, task.value)
 
 
 @jax.jit
 def _evaluate(
     network: Network,
-    settings: _Static,
+    settings: struct.Static,
     world: Navigation,
     score: Scores,
     parameters: jax.Array,

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._elites import Sample
 from jaxltl.algos.common.schedules import Polynomial as Polynomial, Schedule
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import as_partial
 from jaxltl.core.models.mesh import lanes
@@ -203,11 +203,10 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """A distribution of policies, and the best samples.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       family: the distribution.
       best: the feasible sample with the highest objective by its one evaluation: parameters
         ``float[D]``, objective ``float[]`` and cost ``float[C]``.
@@ -220,8 +219,6 @@ class State:
         stays unchanged), else COMPLETED.
     """
 
-    key: jax.Array
-    step: jax.Array
     family: PyTree
     best: Sample
     least: Sample

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -98,11 +98,12 @@ def remove(paths: list[Path]) -> None:
         path.unlink(missing_ok=True)
 
 
-class Parts:
-    """The parts of a file, read on demand, each piece once."""
+class Parts(contextlib.ExitStack):
+    """The parts of a file, read on demand, each piece once, and closed in the end."""
 
-    def __init__(self, path: Path, closing: contextlib.ExitStack) -> None:
-        self._beside, self._closing = path, closing
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self._beside = Path(path)
         self._files, self._pieces = dict[str, Any](), dict[tuple[str, str], np.ndarray]()
 
     def read(self, stored: Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
@@ -119,20 +120,13 @@ class Parts:
         if (file, name) not in self._pieces:
             try:
                 if file not in self._files:
-                    opened = self._closing.enter_context(self._beside.with_name(file).open("rb"))
+                    opened = self.enter_context(self._beside.with_name(file).open("rb"))
                     self._files[file] = np.load(opened, allow_pickle=False)
                 self._pieces[file, name] = self._files[file][name]
             except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
                 what = "missing" if isinstance(error, FileNotFoundError) else "damaged"
                 raise ValueError(f"its part {file!r} is {what}.") from None
         return self._pieces[file, name]
-
-
-@contextlib.contextmanager
-def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
-    """The open parts of a file."""
-    with contextlib.ExitStack() as closing:
-        yield Parts(Path(path), closing)
 
 
 def _ends(index: tuple[slice, ...], shape: Sequence[int]) -> tuple[list[int], list[int]]:

@@ -26,7 +26,7 @@ True
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -40,18 +40,6 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Box, Finite, flat_observation
 from jaxltl.core.pretty_print import brief
-
-
-class HasNetwork(Protocol):
-    """A problem with a network and its initial memory."""
-
-    @property
-    def network(self) -> nn.Module:
-        """The module."""
-
-    @property
-    def memory(self) -> PyTree:
-        """Its initial memory; ``()`` without."""
 
 
 @brief
@@ -232,7 +220,7 @@ def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
     return found
 
 
-def has_memory(problem: HasNetwork) -> bool:
+def has_memory(problem: PyTree) -> bool:
     """``True`` if the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
 
     >>> from types import SimpleNamespace
@@ -242,9 +230,7 @@ def has_memory(problem: HasNetwork) -> bool:
     return bool(jax.tree.leaves(problem.memory))
 
 
-def evaluated(
-    problem: HasNetwork, parameters: PyTree, memory: PyTree, observation: PyTree
-) -> Output:
+def evaluated(problem: PyTree, parameters: PyTree, memory: PyTree, observation: PyTree) -> Output:
     """The :class:`Output` of the network of a `problem` for one `observation`.
 
     With its `parameters`, in which it is differentiable, and the `memory` before the observation.

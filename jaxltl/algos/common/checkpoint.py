@@ -89,7 +89,7 @@ def load(
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
         or other hyperparameters.
     """
-    with parts.reading(path) as others:
+    with parts.Parts(path) as others:
         try:
             # An open file of our own is closed even where a damaged archive is given up.
             with open(path, "rb") as file:

@@ -55,29 +55,16 @@ from jax.tree_util import Partial
 
 from jaxltl.algos.common import loops
 from jaxltl.algos.common.loops import MAX_STEPS, Learned, Until
-from jaxltl.algos.common.settings import HasStatus, flag_invalid, require_hparams
+from jaxltl.algos.common.settings import HasStatus, RunState, flag_invalid, require_hparams
 from jaxltl.algos.common.trees import choose
 from jaxltl.core import struct
 from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status
 
-
-class HasStep(Protocol):
-    """A learner's state."""
-
-    @property
-    def key(self) -> Key:
-        """Root key of the run."""
-
-    @property
-    def step(self) -> jax.Array:
-        """``int32[]``, number of steps made."""
-
-
 ProblemT = TypeVar("ProblemT")
 HparamsT = TypeVar("HparamsT")
-StateT = TypeVar("StateT", bound=HasStep)
+StateT = TypeVar("StateT", bound=RunState)
 MetricsT = TypeVar("MetricsT", bound=HasStatus)
 
 
@@ -331,7 +318,7 @@ def init_key(key: Key) -> Key:
     return jax.random.fold_in(key, 0xFFFFFFFF)
 
 
-def step_key(state: HasStep) -> Key:
+def step_key(state: RunState) -> Key:
     """The random key of the next step: the root key of `state` with its number of steps folded in.
 
     >>> from types import SimpleNamespace

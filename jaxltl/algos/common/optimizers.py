@@ -38,6 +38,16 @@ def optimizer_of(hparams: PyTree) -> optax.GradientTransformationExtraArgs:
     return optimizer(hparams.optimizer, hparams.learning_rate)
 
 
+def descended(
+    hparams: PyTree, gradient: PyTree, state: PyTree, **more: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Parameters of a learner's state, and its optimizer's state, after a step along a gradient."""
+    updates, memory = optimizer_of(hparams).update(
+        gradient, state.optimizer, state.parameters, **more
+    )
+    return optax.apply_updates(state.parameters, updates), memory
+
+
 def optimizer(name: str, learning_rate: Numeric) -> optax.GradientTransformationExtraArgs:
     """An optimizer of optax; ``"lbfgs"`` ignores the rate."""
     if name == "lbfgs":

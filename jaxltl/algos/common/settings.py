@@ -36,6 +36,22 @@ MAX_INT = 2**31 - 1
 COUNT = Range(1, MAX_INT, integer=True)
 
 
+@struct.dataclass
+class RunState:
+    """Base of a learner's state.
+
+    Attributes:
+      key: root key of the run.
+      step: ``int32[]``, number of steps made.
+
+    >>> RunState(jax.random.key(0), jnp.int32(3)).step.item()
+    3
+    """
+
+    key: jax.Array
+    step: jax.Array
+
+
 class HasStatus(Protocol):
     """A learner's metrics."""
 

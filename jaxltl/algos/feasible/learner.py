@@ -50,7 +50,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import learner, loops, optimizers, trees
 from jaxltl.algos.common.schedules import Schedule, at
-from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.common.settings import Number, RunState, static, traced
 from jaxltl.algos.feasible.problem import Problem, certify, require_problem
 from jaxltl.core import struct, validation
 from jaxltl.core.array_types import Key, PyTree
@@ -58,7 +58,6 @@ from jaxltl.core.models.parametric.parametric import ParametricMDP
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
 from jaxltl.core.values.prepared.prepared import (
-    Prepared,
     evaluate_prepared,
     is_direct,
     solve_prepared,
@@ -119,19 +118,16 @@ class Best:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """A search from one start.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: ``float[D]``, the point that the next step evaluates.
       inside: ``float[D]``, the last point at which the functions gave a model.
       best: the best of all points, :class:`Best`.
       optimizer: optax's state.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: jax.Array
     inside: jax.Array
     best: Best
@@ -169,7 +165,7 @@ def evaluate(
     """
     probability, rewards = problem.model.numbers(parameters)
     reward = None if problem.reward is None else rewards.get(problem.reward)
-    if _is_chain(problem.prepared):
+    if problem.prepared.num_rows == problem.prepared.num_states:  # a chain
         value, status = evaluate_prepared(problem.prepared, probability=probability, reward=reward)
     else:
         found = solve_prepared(
@@ -177,10 +173,6 @@ def evaluate(
         )
         value, status = found.value, found.status
     return jnp.sum(problem.weight * jnp.where(problem.weight > 0, value, 0)), status
-
-
-def _is_chain(prepared: Prepared) -> bool:
-    return prepared.num_rows == prepared.num_states
 
 
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
@@ -384,7 +376,7 @@ def _search(
 
     prepared = problem.prepared
     # The work of a solve depends on the numbers.
-    if not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic:
+    if not is_direct(prepared) if prepared.num_rows == prepared.num_states else prepared.cyclic:
         return lax.map(lambda start: one(*start), (keys, points))
     return jax.vmap(one)(keys, points)
 

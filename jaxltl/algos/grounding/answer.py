@@ -122,22 +122,17 @@ class RobustPolicy(NamedTuple):
 def with_labels(world: MDP, labels: np.ndarray, symbols: Sequence[str]) -> MDP:
     """The world labelled by a grounding with propositions `symbols`, for :func:`~jaxltl.product` and solvers.
 
-    Args:
-      world: a model with S states.
-      labels: ``bool[S, P]``, such as a world's part of ``Posterior.labels``; rows beyond S, of padded
-        worlds, are left out.
-      symbols: P names.
+    The `labels` of the `world` are ``bool[S, P]``, such as its part of ``Posterior.labels``; rows beyond
+    S, of padded worlds, are left out.
     """
     label = jnp.asarray(np.asarray(labels, bool)[: world.num_states])
     return replace(world, label=label, propositions=tuple(symbols))
 
 
 def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> list[Row]:
-    """A :class:`Row` of the posterior for each symbol: meaning, alternatives, and the steps that decide it.
+    """A :class:`Row` of the posterior `found` for each symbol: meaning, alternatives, deciding steps.
 
-    Args:
-      problem, hparams: as for :func:`~jaxltl.algos.grounding.posterior`.
-      found: the posterior.
+    Of a `problem` with `hparams`, as for :func:`~jaxltl.algos.grounding.posterior`.
     """
     steps = jax.jit(step_log_likelihood)
     automaton, rows = automaton_of(problem), []
@@ -214,7 +209,7 @@ def robust_policy(
       symbols: P names.
       task: a formula over them, or its automaton.
       tolerance: width of the bounds of the maximin.
-      max_points: maximal number of weighted sums.
+      max_points: maximal number of weighted sums; bounds hold at any number.
 
     Raises:
       ValueError: no grounding, or more than 8.
@@ -252,18 +247,12 @@ def robust_policy(
 def probability_under(
     robust: RobustPolicy, labels: np.ndarray, symbols: Sequence[str], task: Task
 ) -> float:
-    """Certified lower bound of a robust policy's satisfaction probability under any grounding.
+    """A certified lower bound of the satisfaction probability of a policy `robust` under any grounding.
 
-    Independent of the search: each policy is evaluated in the product of its chain with the task.
-
-    Args:
-      robust: the policy.
-      labels: ``bool[S, P]``, a grounding, not necessarily one of the policy's.
-      symbols: P names.
-      task: a formula over them, or its automaton.
-
-    Returns:
-      The lower bound from the initial distribution; loose if expected times are beyond 1e12 steps.
+    Of a `task`, a formula over P `symbols` or its automaton, with `labels` ``bool[S, P]``, not necessarily
+    those of one of the policy's groundings, from the initial distribution. Independent of the search: each
+    policy is evaluated in the product of its chain with the task. Loose if expected times are beyond 1e12
+    steps.
     """
     sparse = sparse_mdp_of_product(robust.front.product)
     label = np.asarray(labels, bool)[np.asarray(robust.front.product.base_state)]

@@ -40,19 +40,11 @@ _STARTS = 20  # of k-means, of which the one with the least distortion is kept
 
 
 def cluster_meanings(problem: Problem, num_clusters: int, *, seed: int = 0) -> np.ndarray:
-    """Candidate meanings ``bool[M, W, S]``: clusters of the observations of all states.
+    """The candidate meanings ``bool[M, W, S]`` of a `problem`, clusters of the observations of all states.
 
-    By k-means from the farthest-first traversal and 20 random starts (k-means++), of which the least
-    distortion is kept.
-
-    Args:
-      problem: with observations ``float[W, S, O]``.
-      num_clusters: M, the number of kinds of states, those without an object included.
-      seed: of the starts.
-
-    Returns:
-      The clusters, for the argument ``meanings`` of
-      :func:`~jaxltl.algos.grounding.hypotheses.posterior`; the largest one first.
+    For the argument ``meanings`` of :func:`~jaxltl.algos.grounding.hypotheses.posterior`, the largest one
+    first. By k-means from the farthest-first traversal and 20 random starts (k-means++) of a `seed`, of
+    which the least distortion is kept; M is `num_clusters`, states without an object included.
 
     Raises:
       ValueError: fewer than 2 clusters, or more than distinct observations.
@@ -89,14 +81,10 @@ def fit_labels(
     num_steps: int = 500,
     learning_rate: float = 0.01,
 ) -> State:
-    """A state with a network fitted to labels by cross-entropy, from which training goes on.
+    """A `state` with the network of a `problem` fitted to labels, from which training goes on.
 
-    Args:
-      state: from ``init``.
-      problem: with observations ``float[W, S, O]``.
-      labels: ``bool[W, S, P]``, such as ``Posterior.labels`` of a grounding.
-      num_steps: full-batch steps of Adam.
-      learning_rate: of Adam.
+    To the `labels` ``bool[W, S, P]``, such as ``Posterior.labels`` of a grounding, by cross-entropy and
+    `num_steps` full-batch steps of Adam at a `learning_rate`.
 
     Raises:
       ValueError: labels of another shape.
@@ -122,14 +110,9 @@ def fit_labels(
 
 
 def network_labels(state: State, problem: Problem, observation: jax.Array) -> np.ndarray:
-    """Labels ``bool[..., P]`` of observations by the network: symbols of probability above a half.
+    """The labels ``bool[..., P]`` by the network of a `problem`: symbols of probability above a half.
 
-    Args:
-      state: of a run, or of :func:`fit_labels`.
-      problem: with the network.
-      observation: ``float[..., O]``, such as that of a new world.
-
-    Returns:
-      Labels, for :func:`~jaxltl.algos.grounding.answer.with_labels`.
+    In a `state` of a run, or of :func:`fit_labels`, at an `observation` ``float[..., O]``, such as that of
+    a new world; for :func:`~jaxltl.algos.grounding.answer.with_labels`.
     """
     return np.asarray(applied(problem.network, state.parameters["grounding"], observation)) > 0

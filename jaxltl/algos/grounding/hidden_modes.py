@@ -211,10 +211,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, (_, status)), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams
     )
-    updates, optimizer = optimizers.optimizer_of(hparams).update(
-        gradient, state.optimizer, state.parameters
-    )
-    parameters = optax.apply_updates(state.parameters, updates)
+    parameters, optimizer = optimizers.descended(hparams, gradient, state)
     metrics = Metrics(loss, optax.tree.norm(gradient), status)
     return State(state.key, state.step + 1, parameters, optimizer), metrics
 

@@ -69,10 +69,8 @@ def fit_history(
 ) -> HistoryTables:
     """The :class:`HistoryTables` of demonstrations, ``past_states + past_actions + 2`` levels in all.
 
-    Args:
-      world: with the demonstrations.
-      demonstrations: at least two.
-      past_states, past_actions: at least 0, the lengths of the two chains.
+    Of at least two `demonstrations` in a `world`; `past_states` and `past_actions`, at least 0, are the
+    lengths of the two chains.
 
     Raises:
       ValueError: fewer than two demonstrations, another model's, or a negative length.

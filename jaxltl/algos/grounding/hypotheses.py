@@ -151,24 +151,18 @@ def _weighed(found: Posterior) -> Posterior:
 
 
 def select_demonstrations(found: Posterior, chosen: ArrayLike) -> Posterior:
-    """The :class:`Posterior` of some of the demonstrations, without scoring any grounding again.
+    """The :class:`Posterior` of those of N demonstrations of `found` that count, without new scores.
 
-    Args:
-      found: the posterior of all N demonstrations.
-      chosen: ``int[]`` or ``bool[N]``, those that count.
+    They are `chosen` by ``int[]`` or ``bool[N]``; groundings are in the order of their new weights.
     """
     return _weighed(replace(found, log_likelihood=found.log_likelihood[..., np.asarray(chosen)]))
 
 
 def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
-    """The rows ``int[]`` of the smallest set of groundings with total weight of at least `level`.
-
-    Args:
-      found: the posterior.
-      level: the nominal weight, above 0 and below 1.
+    """The rows ``int[]`` of `found` in the smallest set of groundings with a weight of at least `level`.
 
     Raises:
-      ValueError: a level outside this range.
+      ValueError: a level that is not above 0 and below 1.
 
     >>> import types
     >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
@@ -181,12 +175,7 @@ def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
 
 
 def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
-    """The symbols with several meanings in the credible set, each with these meanings, likeliest first.
-
-    Args:
-      found: the posterior.
-      level: nominal weight of the set.
-    """
+    """The symbols with several meanings, likeliest first, in the credible set of `found` of a `level`."""
     rows = found.assignment[credible_set(found, level)]
     several = {}
     for p, symbol in enumerate(found.symbols):
@@ -197,10 +186,7 @@ def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[
 
 
 def symbol_symmetries(automaton: Automaton) -> list[tuple[int, ...]]:
-    """The permutations of the symbols that leave the language unchanged, the identity included.
-
-    Args:
-      automaton: over P symbols; with more than 5 only the identity is returned.
+    """The permutations of symbols that leave the language of an `automaton` unchanged; of > 5 the identity.
 
     >>> import jaxltl as jl
     >>> symbol_symmetries(jl.to_automaton("F a & F b"))

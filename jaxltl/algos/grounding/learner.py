@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common.settings import RunState
 from jaxltl.algos.grounding.likelihood import (
     forward,
     letter_log_probability,
@@ -47,17 +48,14 @@ from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Parameters of a run.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: ``{"grounding": of the network, "log_scale": float[], "weights": float[F]}``.
       optimizer: optax's state.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     optimizer: PyTree
 
@@ -179,9 +177,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams
     )
-    updates, optimizer = optimizers.optimizer_of(hparams).update(
-        gradient, state.optimizer, state.parameters
-    )
+    parameters, optimizer = optimizers.descended(hparams, gradient, state)
     metrics = Metrics(
         loss=loss,
         neg_log_likelihood=-jnp.sum(parts.log_likelihood),
@@ -189,7 +185,6 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         gradient_norm=optax.tree.norm(gradient),
         status=parts.status,
     )
-    parameters = optax.apply_updates(state.parameters, updates)
     return State(state.key, state.step + 1, parameters, optimizer), metrics
 
 

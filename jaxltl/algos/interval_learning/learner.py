@@ -53,8 +53,7 @@ from jax.tree_util import Partial
 from jaxltl.algos.common import learner, loops, pac, splitmix
 from jaxltl.algos.common.play import draw, successor_slot, take
 from jaxltl.algos.interval_learning.problem import Hparams, Metrics, Problem, State
-from jaxltl.core import struct
-from jaxltl.core.array_types import Key, Numeric
+from jaxltl.core.array_types import Key, Numeric, PyTree
 from jaxltl.core.graphs.end_components import accepting_bottom_components, bottom_components
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
@@ -340,63 +339,33 @@ def consistent(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array
 # --- episodes ----------------------------------------------------------------------------------
 
 
-_States = tuple[jax.Array, jax.Array]  # states and memory states of all episodes
-
-
-@struct.dataclass
-class _Rules:
-    """Constants of a step."""
-
-    problem: Problem
-    best: jax.Array
-    explore: jax.Array
-    restart: jax.Array
-    start: jax.Array
-    next_memory: jax.Array
-
-
 def sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """Transition counts of a step's episodes, ``int32[S, A, K]``."""
-    model = problem.model
-    dtype, num_runs = model.dtype, hparams.num_runs
-    key = learner.step_key(state)
+    world, dtype, num_runs = problem.model.mdp, problem.model.dtype, hparams.num_runs
+    explore, restart = (jnp.asarray(x, dtype) for x in (hparams.exploration, hparams.restart))
+    start = jnp.asarray(problem.model.automaton.initial, jnp.int32)
+    next_memory, key = problem.model.next_memory, learner.step_key(state)
     stream = splitmix.streams(jax.random.fold_in(key, 0), (num_runs,))
-    rules = _Rules(
-        problem=problem,
-        best=state.best,
-        explore=jnp.asarray(hparams.exploration, dtype),
-        restart=jnp.asarray(hparams.restart, dtype),
-        start=jnp.asarray(model.automaton.initial, jnp.int32),
-        next_memory=model.next_memory,
-    )
-    first = draw(problem.start_table, splitmix.words(stream, jnp.uint32(0)))
-    states = first, jnp.broadcast_to(rules.start, (num_runs,))
-    keys = jax.random.split(jax.random.fold_in(key, 1), hparams.length)
 
-    def move(states: _States, x: tuple[jax.Array, jax.Array]) -> tuple[_States, tuple]:
-        number, key = x
+    def move(states: PyTree, x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        (s, q), (number, key) = states, x
         words = [splitmix.words(stream, 4 * number + i) for i in range(1, 5)]
-        return _move(rules, states, words, jax.random.split(key, num_runs))
+        ends = splitmix.uniform(words[0], dtype) < restart
+        restarts = take(problem.losing, (s, q)) | (take(problem.winning, (s, q)) & ends)
+        s = jnp.where(restarts, draw(problem.start_table, words[1]), s)
+        q = jnp.where(restarts, start, q)
+        explores = (splitmix.uniform(words[2], dtype) < explore)[:, None]
+        moves = jnp.where(explores, take(problem.allowed, (s, q)), take(state.best, (s, q)))
+        total = jnp.cumsum(moves.astype(dtype), axis=-1)
+        drawn = splitmix.uniform(words[3], dtype)[:, None] * total[:, -1:]
+        a = jnp.argmax(total > drawn, axis=-1).astype(jnp.int32)
+        keys = jax.random.split(key, num_runs)
+        t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
+        return (t, take(next_memory, (s, q))), (s, a, successor_slot(as_game(world), s, a, t))
 
+    first = draw(problem.start_table, splitmix.words(stream, jnp.uint32(0)))
+    keys = jax.random.split(jax.random.fold_in(key, 1), hparams.length)
     number = jnp.arange(hparams.length, dtype=jnp.uint32)
+    states = first, jnp.broadcast_to(start, (num_runs,))
     _, (s, a, k) = lax.scan(move, states, (number, keys))
     return jnp.zeros(state.counts.shape, jnp.int32).at[s, a, k].add(1)
-
-
-def _move(
-    rules: _Rules, states: _States, words: list[jax.Array], keys: jax.Array
-) -> tuple[_States, tuple[jax.Array, jax.Array, jax.Array]]:
-    """One move of each episode: the next states, and the indices of the transitions."""
-    problem, (s, q) = rules.problem, states
-    world, dtype = problem.model.mdp, problem.model.dtype
-    ends = splitmix.uniform(words[0], dtype) < rules.restart
-    restarts = take(problem.losing, (s, q)) | (take(problem.winning, (s, q)) & ends)
-    s = jnp.where(restarts, draw(problem.start_table, words[1]), s)
-    q = jnp.where(restarts, rules.start, q)
-    explore = splitmix.uniform(words[2], dtype) < rules.explore
-    moves = jnp.where(explore[:, None], take(problem.allowed, (s, q)), take(rules.best, (s, q)))
-    total = jnp.cumsum(moves.astype(dtype), axis=-1)
-    drawn = splitmix.uniform(words[3], dtype)[:, None] * total[:, -1:]
-    a = jnp.argmax(total > drawn, axis=-1).astype(jnp.int32)
-    t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
-    return (t, take(rules.next_memory, (s, q))), (s, a, successor_slot(as_game(world), s, a, t))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos.common.play import cumulative
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.graphs.end_components import Accepting, accepting_end_components
@@ -146,11 +146,10 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Counts, intervals and values.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       samples: ``int32[]``, observed transitions; near 2^31 further steps sample none.
       counts: ``int32[S, A, K]``, observations of each transition.
       lower, upper: ``float[S, A, K]``, intervals; 0 in padding.
@@ -160,8 +159,6 @@ class State:
       residual: ``float[]``, largest change of the last sweep.
     """
 
-    key: jax.Array
-    step: jax.Array
     samples: jax.Array
     counts: jax.Array
     lower: jax.Array

@@ -49,7 +49,7 @@ from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, splitmix
 from jaxltl.algos.common.play import draw, draw_alias, observed_reward, take
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.algos.maximin_q.problem import Problem
 from jaxltl.core import struct
 from jaxltl.core.models.game import Game
@@ -95,11 +95,10 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """The table, and the chains that update it.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       q: ``float[S, A]``, or ``float[S, A, A]`` over the system's states, actions and answers;
         minus infinity where the system and plus infinity where the environment has no allowed
         action, the neutral elements of maxima and minima.
@@ -113,8 +112,6 @@ class State:
       pending_reward: ``float[num_chains]``, the reward of that pair; None likewise.
     """
 
-    key: jax.Array
-    step: jax.Array
     q: jax.Array
     visits: jax.Array
     value: jax.Array

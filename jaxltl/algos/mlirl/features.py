@@ -177,7 +177,10 @@ def _task_values(
     if task.is_cosafe:
         target, every = np.isin(np.arange(num_memory), progress), np.arange(num_memory)
         regions += [model.final, *(target & (every != q) for q in every)]
-    entered = _chances(model, regions)
+    entered: list[jax.Array] = []  # probabilities of each region after a step, traced once for all
+    if regions:
+        inside = jnp.stack([jnp.broadcast_to(x, model.state_shape) for x in regions])
+        entered = list(jax.vmap(partial(expectation, model))(inside.astype(model.dtype)))
     if task.is_cosafe:
         goal, *entering = entered[-1 - num_memory :]
         columns += [goal, jnp.stack([x[:, q] for q, x in enumerate(entering)], axis=1)]
@@ -192,14 +195,6 @@ def _task_values(
     if nearer is not None:
         columns.append(nearer)
     return _stacked(columns, done)
-
-
-def _chances(model: Product, regions: Sequence[Array]) -> list[jax.Array]:
-    """Probabilities ``float[S, Q, A]`` of each region after a step, traced once for all regions."""
-    if not regions:
-        return []
-    inside = jnp.stack([jnp.broadcast_to(x, model.state_shape) for x in regions])
-    return list(jax.vmap(partial(expectation, model))(inside.astype(model.dtype)))
 
 
 def world_features(

@@ -41,7 +41,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner, optimizers, trees
-from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.common.settings import Number, RunState, static, traced
 from jaxltl.algos.mlirl import _line_search as line_search
 from jaxltl.algos.mlirl.features import (
     Features as Features,
@@ -149,18 +149,15 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Parameters, and the initial value of the next solve.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: of the reward, as ``Problem.start``; ``float[F]`` if linear.
       value: ``float[S]`` (``[S, Q]``), the value at the last evaluated parameters.
       optimizer: optax's state, or that of the line search.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     value: jax.Array
     optimizer: PyTree
@@ -374,10 +371,8 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
         parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
     else:
         before = _evaluate(state.parameters, problem, hparams, state.value)
-        updates, optimizer = optimizers.optimizer_of(hparams).update(
-            before.gradient, state.optimizer, state.parameters
-        )
-        parameters, value = optax.apply_updates(state.parameters, updates), _usable(before.parts)
+        parameters, optimizer = optimizers.descended(hparams, before.gradient, state)
+        value = _usable(before.parts)
     metrics = Metrics(
         loss=before.loss,
         neg_log_likelihood=before.parts.neg_log_likelihood,

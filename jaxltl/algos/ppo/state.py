@@ -9,7 +9,7 @@ from jax.sharding import NamedSharding
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.moments import Moments
 from jaxltl.algos.common.schedules import Schedule
-from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.environments.environment import Environment
@@ -103,11 +103,10 @@ class Walkers:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """A policy, its optimiser, and the environments.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
       walkers: the N environments.
@@ -116,8 +115,6 @@ class State:
       transitions: ``int32[]``, of environments so far; saturates at 2^31 - 1.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     optimizer: PyTree
     walkers: Walkers

@@ -17,7 +17,7 @@ from jaxltl.algos.common.play import (
     start_distribution,
     uniform_rows,
 )
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity, buchi
@@ -251,11 +251,10 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Observations, the optimistic model, and its near-optimal actions.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       moves: ``int32[]``, moves made, at most 2^31 - 1; further steps make none.
       position: ``int32[]``, the current state of the game.
       counts: ``int32[S, A, K]``, observations of each transition; in a deterministic game at most 1.
@@ -273,8 +272,6 @@ class State:
       fault: ``int32[]``, the first pair ``s * A + a`` with a reward outside of [0, R_max], or -1.
     """
 
-    key: jax.Array
-    step: jax.Array
     moves: jax.Array
     position: jax.Array
     counts: jax.Array

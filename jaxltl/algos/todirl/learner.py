@@ -46,6 +46,7 @@ from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.learner import Best, stop_early
+from jaxltl.algos.common.settings import RunState
 from jaxltl.algos.todirl.planning import backward_induction, reward, soft_plan
 from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 from jaxltl.core import struct
@@ -58,11 +59,10 @@ from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probabilit
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """Parameters; once `stopped`, only the step counter changes.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       value: ``float[W, S, Q]``, the soft value that the next solve starts from.
       optimizer: optax's state.
@@ -70,8 +70,6 @@ class State:
       stopped: ``bool[]``, whether patience is exhausted.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     value: jax.Array
     optimizer: PyTree
@@ -246,7 +244,9 @@ def _stationary(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likeliho
     policy = jnp.where(model.available, jnp.exp(log_policy), 0)
     satisfaction, cotangent = jnp.full((), jnp.nan, model.dtype), counts
     if hparams.mu is not None:
-        satisfaction, gain = jax.value_and_grad(partial(_satisfaction, model))(policy)
+        satisfaction, gain = jax.value_and_grad(
+            lambda policy: jnp.sum(model.initial * satisfaction_probability(model, policy).value)
+        )(policy)
         cotangent = counts + hparams.mu * policy * gain
     slope = lax.stop_gradient(
         soft_policy_adjoint(
@@ -263,11 +263,6 @@ def _stationary(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likeliho
         error=jnp.max(solution.upper - solution.lower) / 2,
         status=solution.status,
     )
-
-
-def _satisfaction(model: Product, policy: jax.Array) -> jax.Array:
-    """The mean satisfaction probability over initial states."""
-    return jnp.sum(model.initial * satisfaction_probability(model, policy).value)
 
 
 def _time_dependent(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
@@ -329,8 +324,8 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         state.parameters, problem, hparams, state.value
     )
-    updates, optimizer = optimizers.optimizer_of(hparams).update(
-        gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
+    parameters, optimizer = optimizers.descended(
+        hparams, gradient, state, value=loss, grad=gradient, value_fn=loss_of
     )
     metrics = Metrics(
         loss=loss,
@@ -342,7 +337,6 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         error=parts.error,
         status=parts.status,
     )
-    parameters = optax.apply_updates(state.parameters, updates)
     best, stopped = stop_early(
         state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience
     )

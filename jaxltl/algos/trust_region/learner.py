@@ -50,6 +50,7 @@ compiles for seconds, so only shapes are shown.)
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -97,12 +98,11 @@ from jaxltl.algos.trust_region.state import (
     Metrics,
     Problem,
     State,
-    action_size,
     make_problem,
     observed_vector,
 )
 from jaxltl.core.array_types import Key, PyTree
-from jaxltl.core.environments.environment import require_key
+from jaxltl.core.environments.environment import require_key, some_action
 
 __all__ = [
     "METHODS",
@@ -145,7 +145,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
 @jax.jit
 def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
     seen = jax.eval_shape(lambda k: observed_vector(problem, problem.environment.reset(k)), key)
-    num_actions = action_size(problem)
+    num_actions = math.prod(some_action(problem.environment.actions).shape)
     dtype, (size,), num_values = seen.dtype, seen.shape, 1 + (hparams.method == "cpo")
     mean_key, value_key, first_key = jax.random.split(learner.init_key(key), 3)
     mean = mean_network(hparams, num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))

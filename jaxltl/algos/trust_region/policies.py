@@ -15,7 +15,7 @@ from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
 from jaxltl.algos.common.collection import Transition, transition
 from jaxltl.algos.trust_region._policy_networks import gaussian, normalized
-from jaxltl.algos.trust_region.state import Hparams, Problem, State, as_action, observed_vector
+from jaxltl.algos.trust_region.state import Hparams, Problem, State, observed_vector
 from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import flat_observation, require_key, some_action
@@ -60,16 +60,6 @@ def require_state(state: State) -> None:
     validation.instance("state", state, State, "one of trust_region.init or trust_region.train")
 
 
-def _require_observed(state: State, observation: jax.Array) -> None:
-    """Raises ValueError for observations of another size."""
-    size = state.moments.mean.shape
-    if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
-        raise ValueError(
-            f"observation is {validation.shorten(observation)}; the policy was trained on vectors "
-            f"float[..., {size[0]}], as flat_observation makes of an environment's."
-        )
-
-
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
     """The learned policy as an agent that samples its actions, for ``run_episode``."""
     return _agent(_sampled_action, state, problem, hparams)
@@ -95,19 +85,20 @@ def _agent(
 
 
 def _sampled_action(
-    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key | None
 ) -> tuple[jax.Array, PyTree]:
+    """The action of an agent; the mean without a key."""
     state, problem, hparams = run
-    mean, deviation = act(state, hparams, flat_observation(observation))
-    noise = jax.random.normal(key, mean.shape, mean.dtype)
-    return as_action(problem, mean + deviation * noise), memory
+    action, deviation = act(state, hparams, flat_observation(observation))
+    if key is not None:
+        action = action + deviation * jax.random.normal(key, action.shape, action.dtype)
+    return actions_of.as_action(problem.environment.actions, action, None), memory
 
 
 def _mean_action(
     run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
 ) -> tuple[jax.Array, PyTree]:
-    state, problem, hparams = run
-    return as_action(problem, act(state, hparams, flat_observation(observation))[0]), memory
+    return _sampled_action(run, memory, observation, allowed, None)
 
 
 def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -115,10 +106,18 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
 
     Both ``float[..., A]``, in units of the action before clipping, of a run's `state` and `hparams`;
     differentiable in the parameters.
+
+    Raises:
+      ValueError: observations of another size, or a state of another learner.
     """
     validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
     require_state(state)
-    _require_observed(state, observation)
+    size = state.moments.mean.shape
+    if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
+        raise ValueError(
+            f"observation is {validation.shorten(observation)}; the policy was trained on vectors "
+            f"float[..., {size[0]}], as flat_observation makes of an environment's."
+        )
     return gaussian(state.parameters, hparams, normalized(state.moments, hparams, observation))
 
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 
 import jax
 import jax.numpy as jnp
 
 from jaxltl.algos.common.moments import Moments
-from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, RunState, static, traced
 from jaxltl.core import struct, validation
 from jaxltl.core.array_types import Numeric, PyTree
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
-    clipped_action,
     flat_observation,
     require_environment,
-    some_action,
 )
 from jaxltl.core.types import require_shape
 from jaxltl.core.validation import Range
@@ -88,17 +85,6 @@ def observed_vector(problem: Problem, world: PyTree) -> jax.Array:
     return flat_observation(problem.environment.observe(world))
 
 
-def action_size(problem: Problem) -> int:
-    """A, the length of a flattened action."""
-    return math.prod(some_action(problem.environment.actions).shape)
-
-
-def as_action(problem: Problem, action: jax.Array) -> jax.Array:
-    """The clipped action of a vector ``float[A]``."""
-    actions: PyTree = problem.environment.actions
-    return clipped_action(actions, action.reshape(actions.shape).astype(actions.dtype))
-
-
 METHODS = ("trpo", "cpo")
 
 
@@ -152,11 +138,10 @@ class Hparams:
 
 
 @struct.dataclass
-class State:
+class State(RunState):
     """A policy, value networks and moments of observations.
 
     Attributes:
-      key, step: root key, and steps made, ``int32[]``.
       parameters: of the policy: ``{"mean": network, "log_deviation": float[A]}``.
       values: parameters of the value networks with a leading axis [V]: of rewards, and with CPO of
         costs. They also read the time, on which sums over a finite horizon depend.
@@ -166,8 +151,6 @@ class State:
       trajectories: ``int32[]``, sampled so far; saturates at 2^31 - 1.
     """
 
-    key: jax.Array
-    step: jax.Array
     parameters: PyTree
     values: PyTree
     value_moments: jax.Array

@@ -364,20 +364,6 @@ def some_action(actions: Finite | Box) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype))
 
 
-def random_action(key: Key, actions: Finite | Box, allowed: Array | None = None) -> jax.Array:
-    """A uniform random available action; normal in unbounded directions of a box."""
-    if isinstance(actions, Finite):
-        weight = jnp.zeros(actions.num) if allowed is None else jnp.where(allowed, 0, -jnp.inf)
-        return jax.random.categorical(key, weight).astype(jnp.int32)
-    space = some_action(actions)
-    low, high = (jnp.broadcast_to(x, space.shape) for x in (actions.low, actions.high))
-    bounded = jnp.isfinite(low) & jnp.isfinite(high)
-    share = jax.random.uniform(key, space.shape, space.dtype)
-    inside = jnp.where(bounded, low, 0) + share * jnp.where(bounded, high - low, 0)
-    normal = jax.random.normal(key, space.shape, space.dtype)
-    return jnp.where(bounded, inside, jnp.clip(normal, low, high))
-
-
 def clipped_action(actions: Box, action: Array) -> jax.Array:
     """The projection of an action onto a box."""
     return jnp.clip(action, actions.low, actions.high)

@@ -128,7 +128,7 @@ def intervals_from_counts(
     >>> sets.num_claims, sets.lower.round(3).tolist(), sets.upper.round(3).tolist()
     (4, [[0.401, 0.017, 0.0], [0.159, 0.159, 0.0]], [[0.983, 0.599, 0.355], [0.841, 0.841, 0.0]])
     """
-    _check_method(method)
+    validation.choice("method", method, get_args(Method))
     check_confidence(confidence)
     count, listed, is_entry = _entries(counts, entry_start, used)
     row = np.repeat(np.arange(listed.size), listed)
@@ -192,7 +192,7 @@ def samples_needed(
     num_outcomes: int = 2,
 ) -> int:
     """Number of samples of a row after which even the widest interval has at most a given width."""
-    _check_method(method)
+    validation.choice("method", method, get_args(Method))
     check_confidence(confidence)
     if not 0 < validation.finite_number("width", width) < 1:
         raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
@@ -221,10 +221,6 @@ def samples_needed(
 
 
 # --- arguments --------------------------------------------------------------------------------
-
-
-def _check_method(method: str) -> None:
-    validation.choice("method", method, get_args(Method))
 
 
 def check_confidence(confidence: float) -> None:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jaxltl.core.continuous import make_dynamics, shield_dynamics, synthesize_policy
-from jaxltl.core.environments.environment import random_action
 from jaxltl.core.environments.episodes import Agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.task_environment import task_environment
+from tests.support import random_action
 
 SAFE = "G !pit"
 CHOICES = np.array([[-1.0], [0.0], [1.0]])

@@ -16,11 +16,11 @@ from jaxltl.core.environments.environment import (
     allowed_in,
     make_box,
     make_environment,
-    random_action,
     some_action,
 )
 from jaxltl.core.environments.episodes import Agent, auto_reset_step, make_agent, run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
+from tests.support import random_action
 
 
 def reset(length, key):

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.environments.environment import random_action
 from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.tabulate import tabulate
@@ -19,7 +18,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 from tests import reference
-from tests.support import as_mdp
+from tests.support import as_mdp, random_action
 
 S, A, K = 6, 2, 3
 COUNT = 4000

@@ -10,7 +10,7 @@ from jax.tree_util import Partial
 
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton, run
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.environments.environment import Timestep, make_box, make_environment, random_action
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -27,7 +27,7 @@ from jaxltl.core.environments.task_environment import (
 )
 from jaxltl.core.environments.time_limit import with_time_limit
 from tests import reference
-from tests.support import as_mdp, lane
+from tests.support import as_mdp, lane, random_action
 
 NAMES = ("a", "b", "c")
 FORMULAS = (

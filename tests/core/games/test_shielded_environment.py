@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from jaxltl.core.environments.environment import Timestep, make_box, make_environment, random_action
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import Agent, run_episode
 from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.monitor import Verdict
@@ -23,7 +23,7 @@ from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs.robots import grid_game
 from tests import reference
-from tests.support import as_mdp
+from tests.support import as_mdp, random_action
 
 SAFE = "G !collision"
 OFTEN = "G !collision & G F (system_a | system_b)"

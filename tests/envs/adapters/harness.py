@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxltl.core.environments.environment import allowed_in, random_action
+from jaxltl.core.environments.environment import allowed_in
 from jaxltl.core.environments.episodes import auto_reset_step
+from tests.support import random_action
 
 
 def load(name):

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl as jl
-from jaxltl.core.environments.environment import random_action
 from jaxltl.core.environments.episodes import auto_reset_step
 from tests.envs.adapters.harness import keys_of, own_walk, walk
+from tests.support import random_action
 
 LIMIT, STEPS, WALKS = 20, 50, 3  # an episode's steps, a walk's, and how many walks are one vmap
 

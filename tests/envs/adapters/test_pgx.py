@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.environments.environment import Finite, random_action
+from jaxltl.core.environments.environment import Finite
 from jaxltl.envs import from_pgx
 from tests.envs.adapters.harness import load, same_as_own, single_precision, walk  # noqa: F401
+from tests.support import random_action
 
 
 @pytest.fixture(scope="module")

@@ -240,14 +240,10 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
             first += index.size
         return found
 
-    quantity = jnp.where(_across(model.available, quantity), quantity, 0)
+    available, missing = model.available, quantity.ndim - model.available.ndim
+    available = available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
+    quantity = jnp.where(available, quantity, 0)
     return over_devices(model, one, model.tables, model.place, model.sent, quantity)
-
-
-def _across(available: jax.Array, quantity: jax.Array) -> jax.Array:
-    """``[N, A]`` broadcast to quantities ``[N, ..., A]``."""
-    missing = quantity.ndim - available.ndim
-    return available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
 
 
 @distinct_labels.register
