@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from dataclasses import fields, is_dataclass, replace
+from typing import TypeVar, cast
 
 from jaxltl.core.language.expressions import (
     MAX_INTEGER,
@@ -26,17 +26,14 @@ from jaxltl.core.language.syntax import (
     Constant,
     Declaration,
     Module,
-    Outcome,
     Program,
     RenamedModule,
-    RewardItem,
-    RewardStructure,
     Syntax,
     Variable,
 )
 
 Change = Callable[[Expression], Expression]
-Named = TypeVar("Named", Constant, Module)
+Tree = TypeVar("Tree")
 
 
 def read_program(
@@ -98,43 +95,19 @@ def constant_value(name: str, value: object) -> Value:
     return value
 
 
-@dataclass(frozen=True)
-class _Changed:
-    """Applies a function to the expressions of a tree, and renames actions and variables."""
-
-    change: Change
-    names: Mapping[str, str] = field(default_factory=dict)
-
-    def declaration(self, d: Declaration) -> Declaration:
-        ends = (None if e is None else self.change(e) for e in (d.low, d.high, d.initial))
-        low, high, initial = ends
-        name = self.names.get(d.name, d.name)
-        return replace(d, name=name, low=low, high=high, initial=initial)
-
-    def command(self, c: Command) -> Command:
-        action = self.names.get(c.action, c.action)
-        outcomes = tuple(map(self.outcome, c.outcomes))
-        return Command(action, self.change(c.guard), outcomes, c.place)
-
-    def outcome(self, o: Outcome) -> Outcome:
-        upper = None if o.upper is None else self.change(o.upper)
-        assignments = [
-            Assignment(self.names.get(a.variable, a.variable), self.change(a.expression), a.place)
-            for a in o.assignments
-        ]
-        return Outcome(self.change(o.probability), upper, tuple(assignments))
-
-    def module(self, m: Module) -> Module:
-        return Module(
-            m.name,
-            tuple(map(self.declaration, m.declarations)),
-            tuple(map(self.command, m.commands)),
-            m.place,
-        )
-
-    def rewards(self, r: RewardStructure) -> RewardStructure:
-        items = [RewardItem(i.action, self.change(i.guard), self.change(i.value)) for i in r.items]
-        return replace(r, items=tuple(items))
+def _changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None) -> Tree:
+    """Applies a function to the expressions of a tree, and renames its actions and variables."""
+    found: object = tree
+    if isinstance(tree, Expression):
+        found = change(tree)
+    elif isinstance(tree, tuple):
+        found = tuple([_changed(x, change, names) for x in tree])
+    elif isinstance(tree, str):
+        found = (names or {}).get(tree, tree)
+    elif is_dataclass(tree) and not isinstance(tree, type):
+        parts = {f.name: getattr(tree, f.name) for f in fields(tree)}
+        found = type(tree)(**{name: _changed(x, change, names) for name, x in parts.items()})
+    return cast(Tree, found)
 
 
 class _Resolver:
@@ -148,9 +121,7 @@ class _Resolver:
         formulas = self.expanded_formulas()
         expand = _substitution(formulas)
         modules = self.renamed(
-            tuple(
-                _Changed(expand).module(m) if isinstance(m, Module) else m for m in syntax.modules
-            ),
+            tuple(_changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules),
             formulas,
         )
         self.check_names(modules)
@@ -159,15 +130,15 @@ class _Resolver:
         labels = self.labels(expand, known)
         fold = _substitution(known | labels)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
-        modules = [_Changed(fold).module(m) for m in modules]
+        modules = [_changed(m, fold) for m in modules]
         owned: list[tuple[Declaration, int | None]] = []
-        owned += [(_Changed(both).declaration(d), None) for d in syntax.variables]
+        owned += [(_changed(d, both), None) for d in syntax.variables]
         owned += [(d, i) for i, m in enumerate(modules) for d in m.declarations]
         variables = tuple(self.variable(d, i) for d, i in owned)
         parameters = tuple(
             c.name for c in syntax.constants if c.name not in constants and c.type == "double"
         )
-        rewards = tuple(_Changed(both).rewards(r) for r in syntax.rewards)
+        rewards = _changed(syntax.rewards, both)
         used: set[str] = set()
         for e in (
             *(e for m in modules for c in m.commands for e in c.expressions),
@@ -405,7 +376,7 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
                 renaming.place,
                 f"the copy {renaming.name} does not rename {d.name}, a variable of {base.name}.",
             )
-    copy = _Changed(rename, names).module(base)
+    copy = _changed(base, rename, names)
     placed = tuple(replace(d, place=renaming.place) for d in copy.declarations)
     return replace(copy, name=renaming.name, declarations=placed, place=renaming.place)
 

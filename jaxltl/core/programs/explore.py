@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,26 +34,26 @@ class Explored:
 
     Attributes:
       layout, words: the states as packed words.
+      actions: names of actions, the first of which is ``""``.
+      num_initial: the initial states are the first ones.
       row_count: ``int32[S]``, choices of each state; 0 of a deadlock.
       action: ``int32[R]``, index in `actions`.
       entry_count: ``int64[R]``.
       successor: ``int32[T]``.
       weight: ``[T]``, see :mod:`~jaxltl.core.programs.weights`.
-      actions: names of actions, the first of which is ``""``.
       owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
-      num_initial: the initial states are the first ones.
     """
 
     layout: Layout
     words: Words
+    actions: tuple[str, ...]
+    num_initial: int
     row_count: NDArray[np.int32]
     action: NDArray[np.int32]
     owner: NDArray[np.int32]
     entry_count: Integers
     successor: NDArray[np.int32]
     weight: Weight
-    actions: tuple[str, ...]
-    num_initial: int
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,13 @@ class _Column:
     parts: tuple[tuple[int, int], ...]  # modules, and the column of the action in each
 
 
-@dataclass
-class _Output:
-    """Parts of the arrays of :class:`Explored`."""
-
-    row_count: list[NDArray[np.int32]] = field(default_factory=list)
-    action: list[NDArray[np.int32]] = field(default_factory=list)
-    owner: list[NDArray[np.int32]] = field(default_factory=list)
-    entry_count: list[Integers] = field(default_factory=list)
-    successor: list[NDArray[np.int32]] = field(default_factory=list)
-    weight: list[Weight] = field(default_factory=list)
+_ARRAYS = {  # of :class:`Explored`, which a search makes in parts
+    "row_count": np.int32,
+    "action": np.int32,
+    "owner": np.int32,
+    "entry_count": np.int64,
+    "successor": np.int32,
+}
 
 
 def explore(
@@ -108,9 +106,11 @@ class Search:
         names = sorted({a for code in self.codes for a in code.actions if a})
         self.actions = ("", *names)
         self.columns = _columns(self.codes, self.actions)
+        self.action_of = np.array([c.action for c in self.columns], np.int32)
+        self.owner_of = np.array([c.owner for c in self.columns], np.int32)
         self.known = HashTable(layout.num_words)
         self.orbits: tuple[Orbit, ...] = ()  # successors are found up to these symmetries
-        self.output = _Output()
+        self.output: dict[str, list[NDArray[Any]]] = {n: [] for n in (*_ARRAYS, "weight")}
         self.num_transitions = 0
 
     def run(self, initial: Words, progress: Progress | None) -> Explored:
@@ -124,20 +124,15 @@ class Search:
             done = stop
             if progress is not None:
                 progress(len(self.known), done)
-        out, width = self.output, self.weights.shape
-        empty = np.zeros(0, np.int32)
-        return Explored(
-            self.layout,
-            self.known.words(0, len(self.known)),
-            np.concatenate(out.row_count),
-            np.concatenate(out.action or [empty]),
-            np.concatenate(out.owner or [empty]),
-            np.concatenate(out.entry_count or [empty]),
-            np.concatenate(out.successor or [empty]),
-            np.concatenate(out.weight or [np.zeros((0, *width), self.weights.dtype)]),
-            self.actions,
-            num_initial,
-        )
+        return self.explored(num_initial)
+
+    def explored(self, num_initial: int) -> Explored:
+        """The result; rows are in the order of expansion."""
+        empty: dict[str, Any] = {name: np.zeros(0, dtype) for name, dtype in _ARRAYS.items()}
+        empty["weight"] = np.zeros((0, *self.weights.shape), self.weights.dtype)
+        arrays = {name: np.concatenate(x or [empty[name]]) for name, x in self.output.items()}
+        words = self.known.words(0, len(self.known))
+        return Explored(self.layout, words, self.actions, num_initial, **arrays)
 
     def _narrow(self, initial: Words) -> int:
         """Expands small levels state by state; returns the number of states that are done."""
@@ -150,16 +145,20 @@ class Search:
         )
         self.known.fill(found.words(self.layout))
         self._check_size()
-        rows, column, entries = found.arrays()
-        self.num_transitions = int(entries.sum())
-        out = self.output
-        out.row_count.append(rows)
-        out.action.append(self.action_of[column])
-        out.owner.append(self.owner_of[column])
-        out.entry_count.append(entries)
-        out.successor.append(np.array(found.successor, np.int32))
-        out.weight.append(np.array(found.weight, np.float64))
+        self.num_transitions = sum(found.entry_count)
+        self._add(
+            row_count=np.array(found.row_count, np.int32),
+            action=self.action_of[np.array(found.column, np.int64)],
+            owner=self.owner_of[np.array(found.column, np.int64)],
+            entry_count=np.array(found.entry_count, np.int64),
+            successor=np.array(found.successor, np.int32),
+            weight=np.array(found.weight, np.float64),
+        )
         return found.done
+
+    def _add(self, **parts: NDArray[Any]) -> None:
+        for name, part in parts.items():
+            self.output[name].append(part)
 
     def _check_size(self) -> None:
         if len(self.known) > self.max_states:
@@ -188,24 +187,16 @@ class Search:
             )
         state, cell = np.nonzero(total)
         total_of = total[state, cell].astype(np.int64)
-        self.output.row_count.append(total.sum(1).astype(np.int32))
         place = concatenated_ranges(np.zeros(total_of.size, np.int64), total_of)
         cells = np.arange(state.size).repeat(total_of)
         rows = _Rows(state[cells], cell[cells], place, [None] * len(self.tables))
         self._choose(rows, local, per_module)
-        for column_part, name in ((self.action_of, "action"), (self.owner_of, "owner")):
-            getattr(self.output, name).append(column_part[rows.column])
+        self._add(
+            row_count=total.sum(1).astype(np.int32),
+            action=self.action_of[rows.column],
+            owner=self.owner_of[rows.column],
+        )
         self._expand_rows(rows, [table for table, _ in local], words)
-
-    @property
-    def action_of(self) -> NDArray[np.int32]:
-        """The action of each column."""
-        return np.array([c.action for c in self.columns], np.int32)
-
-    @property
-    def owner_of(self) -> NDArray[np.int32]:
-        """The module of each column, or -1."""
-        return np.array([c.owner for c in self.columns], np.int32)
 
     def _choose(
         self, rows: _Rows, local: list[tuple[Choices, Integers | None]], counts: Sequence[Integers]
@@ -240,7 +231,7 @@ class Search:
                 0, f"a choice has {count.max():.3g} successors, more than {_MAX_BRANCHING}."
             )
         number = count.astype(np.int64)
-        self.output.entry_count.append(number)
+        self._add(entry_count=number)
         end = np.cumsum(number)
         self.num_transitions += int(end[-1]) if end.size else 0
         if self.num_transitions > _TRANSITIONS * self.max_states:
@@ -293,8 +284,7 @@ class Search:
         assert weight is not None
         for orbit in self.orbits:
             orbit.sort(self.layout, tuple(target))
-        self.output.successor.append(self.known.insert(tuple(target)))
-        self.output.weight.append(weight)
+        self._add(successor=self.known.insert(tuple(target)), weight=weight)
         self._check_size()
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.generated import Local, Unsupported, Updates, generate
@@ -41,14 +40,6 @@ class Narrow:
         return tuple(
             np.array([k >> (64 * w) & _WORD for k in self.keys], np.uint64)
             for w in range(layout.num_words)
-        )
-
-    def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
-        """Numbers of choices, columns of choices, and numbers of successors."""
-        return (
-            np.array(self.row_count, np.int32),
-            np.array(self.column, np.int64),
-            np.array(self.entry_count, np.int64),
         )
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, cast
+from dataclasses import replace
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
@@ -22,7 +22,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
-from jaxltl.core.programs.explore import Explored, Search
+from jaxltl.core.programs.explore import Search
 from jaxltl.core.programs.initial import initial_states
 from jaxltl.core.programs.layout import Reader, make_layout
 from jaxltl.core.programs.symmetry import find_orbits
@@ -332,15 +332,12 @@ class _Part:
 
     def _expand(self, states: Integers) -> Integers:
         """Adds the successors of some states, and returns them."""
-        before, out = self.num_states, self.search.output
-        parts: tuple[list[NDArray[Any]], ...] = (
-            *(out.row_count, out.entry_count, out.successor, out.weight),
-        )
-        begin = [len(part) for part in parts]
+        before, output = self.size, self.search.output
+        begin = {name: len(parts) for name, parts in output.items()}
         self.search.expand(tuple(k[states] for k in self.search.known.keys))
         rows, entries, successor, probability = (
-            np.concatenate(part[i:]) if len(part) > i else np.zeros(0, np.int64)
-            for part, i in zip(parts, begin, strict=True)
+            np.concatenate(output[name][begin[name] :] or [np.zeros(0, np.int64)])
+            for name in ("row_count", "entry_count", "successor", "weight")
         )
         self.order.append(states)
         self.num_expanded += states.size
@@ -380,24 +377,13 @@ class _Part:
 
     def build(self) -> None:
         """Makes the model of the explored part: `model`, whose states are those of `states`."""
-        out, size = self.search.output, self.num_states
+        found, size = self.search.explored(self.num_initial), self.size
         done = np.concatenate(self.order)
         self.states = np.concatenate([done, np.flatnonzero(~self.truths[2, :size])])
         place = np.empty(size, np.int32)
         place[self.states] = np.arange(size, dtype=np.int32)
-        empty = np.zeros(0, np.int32)
-        found = Explored(
-            self.layout,
-            self.search.known.words(0, 0),
-            np.concatenate([*out.row_count, np.zeros(size - done.size, np.int32)]),
-            np.concatenate(out.action or [empty]),
-            np.concatenate(out.owner or [empty]),
-            np.concatenate(out.entry_count or [empty]),
-            place[np.concatenate(out.successor or [empty])],
-            np.concatenate(out.weight or [np.zeros(0)]),
-            self.search.actions,
-            self.num_initial,
-        )
+        rows = np.append(found.row_count, np.zeros(size - done.size, np.int32))
+        found = replace(found, row_count=rows, successor=place[found.successor])
         found, _ = with_loops(found, Numbers(), np.flatnonzero(found.row_count == 0), {})
         if self.program.kind == "dtmc" and found.action.size > size:
             found, _ = as_chain(found, Numbers(), {})
