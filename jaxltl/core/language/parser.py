@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import Literal, NoReturn, cast
 
 from jaxltl.core.language.expressions import FUNCTIONS, RELATIONS, TRUE, Expression, Type, literal
 from jaxltl.core.language.source import LanguageError, Source, TokenReader
@@ -251,9 +251,8 @@ class _ProgramParser(ExpressionParser):
 
     def program(self) -> Syntax:
         readers = {
-            "const": self.constant,
-            "rate": self.constant,
-            "prob": self.constant,
+            **dict.fromkeys(("const", "rate", "prob"), self.constant),
+            **dict.fromkeys(_KINDS, self.model_type),
             "formula": self.formula,
             "label": self.label,
             "global": self.global_variable,
@@ -264,17 +263,14 @@ class _ProgramParser(ExpressionParser):
         }
         while self.kinds[self.at] != "end":
             text = self.texts[self.at]
-            if self.kinds[self.at] == "word" and text in _KINDS:
-                self.model_type(text)
-            elif self.kinds[self.at] == "word" and text in readers:
-                readers[text]()
-            elif self.kinds[self.at] == "word" and text in _REFUSED:
-                raise LanguageError(self.place, f"{text}: {_REFUSED[text]} are not supported.")
-            else:
+            if text in _REFUSED:
+                self.refuse()
+            if text not in readers:
                 self.fail(
                     "the type of the model (dtmc, mdp, smg), const, formula, label, global, "
                     "module, rewards, init or player"
                 )
+            readers[text]()
         if not self.modules:
             raise LanguageError(self.place, "the model has no module; it needs at least one.")
         return Syntax(
@@ -290,10 +286,15 @@ class _ProgramParser(ExpressionParser):
             tuple(self.players),
         )
 
-    def model_type(self, text: str) -> None:
+    def refuse(self) -> NoReturn:
+        """Raises LanguageError: the next word is a feature that is not supported."""
+        text = self.texts[self.at]
+        raise LanguageError(self.place, f"{text}: {_REFUSED[text]} are not supported.")
+
+    def model_type(self) -> None:
         if self.kind is not None:
             raise LanguageError(self.place, "the type of the model is given twice.")
-        self.kind = _KINDS[text]
+        self.kind = _KINDS[self.texts[self.at]]
         self.at += 1
 
     def name(self, what: str) -> tuple[str, int]:
@@ -376,9 +377,7 @@ class _ProgramParser(ExpressionParser):
         commands: list[Command] = []
         while not self.accept("endmodule"):
             if self.texts[self.at] == "invariant":
-                raise LanguageError(
-                    self.place, f"invariant: {_REFUSED['invariant']} are not supported."
-                )
+                self.refuse()
             if self.texts[self.at] == "[":
                 commands.append(self.command())
             elif self.kinds[self.at] == "word" and not commands:
@@ -417,15 +416,11 @@ class _ProgramParser(ExpressionParser):
         while self.accept("+"):
             outcomes.append(self.outcome())
         self.expect(";", " or '+' after an update")
-        if len(outcomes) > 1:
-            for each in outcomes:
-                if each.probability is TRUE:
-                    raise LanguageError(place, "an update of several has no probability.")
-        fixed = tuple(
-            Outcome(literal(1), None, o.assignments) if o.probability is TRUE else o
-            for o in outcomes
-        )
-        return Command(action, guard, fixed, place)
+        if outcomes[0].probability is TRUE and len(outcomes) == 1:
+            outcomes = [Outcome(literal(1), None, outcomes[0].assignments)]
+        if any(o.probability is TRUE for o in outcomes):
+            raise LanguageError(place, "an update of several has no probability.")
+        return Command(action, guard, tuple(outcomes), place)
 
     def outcome(self) -> Outcome:
         """An update; without a probability, the constant TRUE stands for it."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from typing import TypeVar, cast
 
 from jaxltl.core.language.expressions import (
@@ -118,7 +119,7 @@ class _Resolver:
 
     def program(self) -> Program:
         syntax = self.syntax
-        formulas = self.expanded_formulas()
+        formulas = _expanded(syntax.formulas, "formula", {})
         expand = _substitution(formulas)
         modules = self.renamed(
             tuple(_changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules),
@@ -127,7 +128,8 @@ class _Resolver:
         self.check_names(modules)
         constants, derived = self.constant_values(expand)
         known = derived | {name: literal(value) for name, value in constants.items()}
-        labels = self.labels(expand, known)
+        quoted = [(f'"{name}"', expand(e)) for name, e in syntax.labels]
+        labels = _expanded(quoted, "label", known)
         fold = _substitution(known | labels)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
         modules = [_changed(m, fold) for m in modules]
@@ -158,23 +160,9 @@ class _Resolver:
             None if syntax.initial is None else both(syntax.initial),
             syntax.players,
         )
-        _Checker(program, self.undefined(constants)).check()
+        undefined = {c.name: c.place for c in syntax.constants if c.name not in constants}
+        _Checker(program, undefined).check()
         return program
-
-    def undefined(self, constants: Mapping[str, Value]) -> dict[str, int]:
-        return {c.name: c.place for c in self.syntax.constants if c.name not in constants}
-
-    def expanded_formulas(self) -> dict[str, Expression]:
-        raw = self.syntax.formulas
-        table: dict[str, Expression] = {}
-        for name, e in raw:
-            if name in table:
-                raise LanguageError(e.place, f"the formula {name} is defined twice.")
-            table[name] = e
-        done: dict[str, Expression] = {}
-        for name in _in_order({n: (names_in(e), e.place) for n, e in table.items()}, "formula"):
-            done[name] = substitute(table[name], done)
-        return {name: done[name] for name in table}
 
     def renamed(
         self, modules: tuple[Module | RenamedModule, ...], formulas: Mapping[str, Expression]
@@ -218,7 +206,7 @@ class _Resolver:
         """The value of each constant that is defined or given, and expressions over parameters."""
         table = {c.name: c for c in self.syntax.constants}
         texts = {c.name: expand(c.expression) for c in table.values() if c.expression is not None}
-        order = _in_order({n: (names_in(e), table[n].place) for n, e in texts.items()}, "constant")
+        order = _in_order(texts, "constant", {c.name: c.place for c in self.syntax.constants})
         found: dict[str, Value] = {}
         derived: dict[str, Expression] = {}
         for name, value in self.given.items():
@@ -271,17 +259,20 @@ class _Resolver:
             raise LanguageError(d.place, f"{e} is given for {d.name}; expected {kind}.")
         return e.value
 
-    def labels(self, expand: Change, known: Mapping[str, Expression]) -> dict[str, Expression]:
-        """The expression of each label by its name in quotes; labels may use others."""
-        table: dict[str, Expression] = {}
-        for name, e in self.syntax.labels:
-            if f'"{name}"' in table:
-                raise LanguageError(e.place, f'the label "{name}" is defined twice.')
-            table[f'"{name}"'] = expand(e)
-        done = dict(known)
-        for name in _in_order({n: (names_in(e), e.place) for n, e in table.items()}, "label"):
-            done[name] = substitute(table[name], done)
-        return {name: done[name] for name in table}
+
+def _expanded(
+    items: Sequence[tuple[str, Expression]], what: str, known: Mapping[str, Expression]
+) -> dict[str, Expression]:
+    """Expressions by name, which may use each other; LanguageError for a circle."""
+    table: dict[str, Expression] = {}
+    for name, e in items:
+        if name in table:
+            raise LanguageError(e.place, f"the {what} {name} is defined twice.")
+        table[name] = e
+    done = dict(known)
+    for name in _in_order(table, what, {n: e.place for n, e in table.items()}):
+        done[name] = substitute(table[name], done)
+    return {name: done[name] for name in table}
 
 
 def _no_value(name: str) -> str:
@@ -320,48 +311,24 @@ def _substitution(names: Mapping[str, Expression]) -> Change:
     return change
 
 
-def _in_order(needs: Mapping[str, tuple[set[str], int]], what: str) -> list[str]:
+def _in_order(
+    table: Mapping[str, Expression], what: str, places: Mapping[str, int]
+) -> Iterable[str]:
     """Names so that each comes after those that it needs; LanguageError for a circle."""
-    order: dict[str, None] = {}
-    for start in needs:
-        path: dict[str, Iterator[str]] = {}
-        todo = [start]
-        while todo:
-            name = todo[-1]
-            if name in order:
-                todo.pop()
-                continue
-            rest = path.setdefault(name, iter(sorted(needs[name][0] & needs.keys())))
-            following = next((n for n in rest if n not in order), None)
-            if following is None:
-                order[name] = None
-                todo.pop()
-            elif following in path:
-                raise LanguageError(
-                    needs[following][1], f"the {what} {following} depends on itself."
-                )
-            else:
-                todo.append(following)
-    return list(order)
+    needs = {name: sorted(names_in(e) & table.keys()) for name, e in table.items()}
+    try:
+        return tuple(TopologicalSorter(needs).static_order())
+    except CycleError as error:
+        name = min(error.args[1], key=places.__getitem__)
+        raise LanguageError(places[name], f"the {what} {name} depends on itself.") from None
 
 
 def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expression]) -> Module:
     """The copy of a module, after formulas have been substituted."""
     names = dict(renaming.renaming)
-    memory: dict[int, Expression] = {}
-
-    def rename(e: Expression) -> Expression:
-        if (found := memory.get(id(e))) is not None:
-            return found
-        if e.operator == "name" and e.value in names:
-            found = replace(e, value=names[str(e.value)])
-        elif e.operands:
-            found = replace(e, operands=tuple([rename(x) for x in e.operands]))
-        else:
-            found = e
-        memory[id(e)] = found
-        return found
-
+    rename = _substitution(
+        {old: Expression("name", value=new, place=renaming.place) for old, new in names.items()}
+    )
     for old, new in renaming.renaming:
         # PRISM renames within the formula, Storm takes the other formula.
         if old in formulas and new in formulas and rename(formulas[old]) != formulas[new]:

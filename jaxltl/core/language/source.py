@@ -46,47 +46,31 @@ class Source:
         return ValueError(f"{self.name!r}, line {line}, column {column}: {error.message}")
 
 
-@dataclass(frozen=True)
-class Tokens:
-    """Kinds, texts and offsets of the tokens of a text; the last one has the kind "end"."""
-
-    kinds: list[str]
-    texts: list[str]
-    starts: list[int]
-
-
-def tokenize(text: str, start: int = 0) -> Tokens:
-    """The tokens of a text from an offset on.
-
-    A character that begins no token has the kind "unknown" and ends the tokens: a reader that
-    stops before it has no error.
-    """
-    kinds: list[str] = []
-    texts: list[str] = []
-    starts: list[int] = []
-    place, match = start, _TOKEN.match
-    while found := match(text, place):
-        kind = str(found.lastgroup)
-        if kind != "space":
-            kinds.append(kind)
-            texts.append(found[0])
-            starts.append(place)
-        place = found.end()
-        if len(kinds) > MAX_TOKENS:
-            raise LanguageError(place, f"the text has more than {MAX_TOKENS} words and signs.")
-    kinds.append("unknown" if place < len(text) else "end")
-    texts.append(text[place : place + 1])
-    starts.append(place)
-    return Tokens(kinds, texts, starts)
-
-
 class TokenReader:
-    """A place in the tokens of a text."""
+    """The tokens of a text from an offset on, and a place in them.
+
+    The last token has the kind "end", or "unknown" at a character that begins no token: a reader
+    that stops before it has no error.
+    """
 
     def __init__(self, text: str, start: int = 0) -> None:
-        tokens = tokenize(text, start)
-        self.kinds, self.texts, self.starts = tokens.kinds, tokens.texts, tokens.starts
+        self.kinds: list[str] = []
+        self.texts: list[str] = []
+        self.starts: list[int] = []
         self.at = 0
+        place, match = start, _TOKEN.match
+        while found := match(text, place):
+            if found.lastgroup != "space":
+                self._append(str(found.lastgroup), found[0], place)
+            place = found.end()
+            if len(self.kinds) > MAX_TOKENS:
+                raise LanguageError(place, f"the text has more than {MAX_TOKENS} words and signs.")
+        self._append("unknown" if place < len(text) else "end", text[place : place + 1], place)
+
+    def _append(self, kind: str, text: str, start: int) -> None:
+        self.kinds.append(kind)
+        self.texts.append(text)
+        self.starts.append(start)
 
     @property
     def place(self) -> int:
@@ -116,16 +100,13 @@ class TokenReader:
         if not self.accept(text):
             self.fail(f"{text!r}{after}")
 
-    def word(self, expected: str) -> str:
+    def word(self, expected: str, kind: str = "word") -> str:
         """Takes a name."""
-        if self.kinds[self.at] != "word":
+        if self.kinds[self.at] != kind:
             self.fail(expected)
         self.at += 1
         return self.texts[self.at - 1]
 
     def quoted(self, expected: str) -> str:
         """Takes a name in double quotes."""
-        if self.kinds[self.at] != "quoted":
-            self.fail(expected)
-        self.at += 1
-        return self.texts[self.at - 1][1:-1]
+        return self.word(expected, "quoted")[1:-1]
