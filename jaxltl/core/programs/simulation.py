@@ -137,15 +137,15 @@ def _require_name(program: Program, kind: str, name: str, known: Iterable[str]) 
 
 def _require_simulated(program: Program) -> None:
     """Raises ValueError for what has no simulation."""
-    found, remedy = "", ""
+    text = ""
     if program.kind == "smg":
-        found, remedy = "an smg", "build the model, for model_environment"
+        text = "an smg is not simulated; build the model, for model_environment."
     elif program.has_intervals:
-        found, remedy = "a program with intervals of probabilities", "give numbers"
+        text = "a program with intervals of probabilities is not simulated; give numbers."
     elif program.parameters:
-        found, remedy = f"a program whose constant {program.parameters[0]} has no value", "give it"
-    if found:
-        raise ValueError(f"{program.source.name!r}: {found} is not simulated; {remedy}.")
+        text = f"a program whose constant {program.parameters[0]} has no value is not simulated; give it."
+    if text:
+        raise ValueError(f"{program.source.name!r}: {text}")
 
 
 # --- functions of the environment -----------------------------------------------------------------
@@ -365,16 +365,12 @@ _Ends = tuple[float, float, bool]  # least and largest value, and True for integ
 def _check_integers(program: Program) -> None:
     """Raises LanguageError for integers that may not fit into 32 bits."""
     known: dict[int, _Ends] = {}
-    ranges: dict[str, _Ends] = {}
+    ranges = {v.name: (float(v.low), float(v.high), v.type == "int") for v in program.variables}
     for v in program.variables:
-        ranges[v.name] = float(v.low), float(v.high), v.type == "int"
         _require_32_bits(ranges[v.name], v.place, v.name)
-    expressions = list(program.labels.values())
-    for m in program.modules:
-        for c in m.commands:
-            expressions += [c.guard, *_command_expressions(c)]
-    expressions += [e for r in program.rewards for i in r.items for e in (i.guard, i.value)]
-    for e in expressions:
+    rewards = [e for r in program.rewards for i in r.items for e in (i.guard, i.value)]
+    commands = [e for m in program.modules for c in m.commands for e in c.expressions]
+    for e in (*program.labels.values(), *commands, *rewards):
         _ends(e, ranges, known)
 
 
@@ -397,48 +393,36 @@ def _ends(e: Expression, ranges: dict[str, _Ends], known: dict[int, _Ends]) -> _
 
 
 def _node_ends(e: Expression, parts: list[_Ends], ranges: dict[str, _Ends]) -> _Ends:
-    operator = e.operator
-    if operator == "literal":
+    if e.operator == "name":
+        return ranges[str(e.value)]
+    if e.operator == "literal":
         value = float(e.value) if isinstance(e.value, bool | int | float) else 0.0
         return value, value, type(e.value) is int
-    if operator == "name":
-        return ranges[str(e.value)]
-    if operator in ("floor", "ceil", "round"):
-        low, high, whole = parts[0]
-        return (low, high, True) if whole else (low - 1, high + 1, True)
-    if operator == "?:":
-        parts = parts[1:]
-    whole = all(p[2] for p in parts)
-    lows, highs = [p[0] for p in parts], [p[1] for p in parts]
-    if operator == "neg":
-        return -highs[0], -lows[0], whole
-    if operator == "+":
-        return sum(lows), sum(highs), whole
-    if operator == "-":
-        return lows[0] - highs[1], highs[0] - lows[1], whole
-    if operator == "*":
-        size = math.prod(max(abs(a), abs(b)) for a, b, _ in parts)
-        return (0.0 if min(lows) >= 0 else -size), size, whole
-    if operator in ("?:", "min", "max"):
-        return min(lows), max(highs), whole
-    if operator == "mod":
-        return 0.0, max(highs[1] - 1, 0.0), True
-    if operator in ("/", "pow", "log"):
-        return _power_ends(parts) if operator == "pow" else _quotient_ends(operator, parts)
+    parts = parts[e.operator == "?:" :]
+    lows, highs, whole = [p[0] for p in parts], [p[1] for p in parts], all(p[2] for p in parts)
+    sizes = [max(abs(low), abs(high)) for low, high, _ in parts]
+    match e.operator:
+        case "floor" | "ceil" | "round":
+            return lows[0] - (not whole), highs[0] + (not whole), True
+        case "neg":
+            return -highs[0], -lows[0], whole
+        case "+":
+            return sum(lows), sum(highs), whole
+        case "-":
+            return lows[0] - highs[1], highs[0] - lows[1], whole
+        case "*":
+            return (0.0 if min(lows) >= 0 else -math.prod(sizes)), math.prod(sizes), whole
+        case "?:" | "min" | "max":
+            return min(lows), max(highs), whole
+        case "mod":
+            return 0.0, max(highs[1] - 1, 0.0), True
+        case "pow":
+            base, exponent = max(sizes[0], 1.0), max(highs[1], 0.0)
+            power = math.inf if exponent * math.log2(base) > 60 else base**exponent
+            return (0.0 if lows[0] >= 0 else -power), power if whole else math.inf, whole
+        case "/" if lows[1] > 0 or highs[1] < 0:
+            size = sizes[0] / min(abs(lows[1]), abs(highs[1]))
+            return -size, size, False
+        case "/" | "log":
+            return -math.inf, math.inf, False
     return 0.0, 1.0, False  # Boolean
-
-
-def _power_ends(parts: list[_Ends]) -> _Ends:
-    (low, high, _), (_, exponent, _) = parts
-    size = max(abs(low), abs(high), 1.0)
-    power = math.inf if exponent * math.log2(size) > 60 else size ** max(exponent, 0.0)
-    whole = all(p[2] for p in parts)
-    return (0.0 if low >= 0 else -power), power if whole else math.inf, whole
-
-
-def _quotient_ends(operator: str, parts: list[_Ends]) -> _Ends:
-    (low, high, _), (least, most, _) = parts
-    if operator == "log" or least <= 0 <= most:
-        return -math.inf, math.inf, False
-    size = max(abs(low), abs(high)) / min(abs(least), abs(most))
-    return -size, size, False
