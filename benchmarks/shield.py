@@ -27,7 +27,7 @@ import jaxltl as jl
 from jaxltl.algos import ppo
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.core.environments.environment import Timestep
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.envs.robots import robots
 
 _SAFE = "G !collision"

@@ -25,7 +25,7 @@ from jaxltl.algos import (
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core import validation
 from jaxltl.core.automata.sequences import reach_avoid_sequences
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.core.statistics.binomial import bounded_mean
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.values.evaluation.evaluation import share_estimate

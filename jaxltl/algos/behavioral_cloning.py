@@ -42,9 +42,8 @@ from jaxltl.algos.common.learner import Best, stop_early
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
+from jaxltl.core.models import Product, Trajectories
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.validation import Range
 
 # --- policy networks -----------------------------------------------------------------------------

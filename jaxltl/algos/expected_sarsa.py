@@ -31,9 +31,7 @@ from jaxltl.algos.common import learner
 from jaxltl.algos.common.play import check_reward, explicit_game
 from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
-from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.ops.operators import sample_successor
+from jaxltl.core.models import MDP, sample_successor, with_allowed
 from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.validation import Range
 

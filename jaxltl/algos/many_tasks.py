@@ -59,10 +59,8 @@ from jaxltl.algos.common.actor_critic import ActorCritic, dense
 from jaxltl.algos.common.moments import normalized
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import struct, validation
-from jaxltl.core.automata import sequences
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.environments import sequence_task
+from jaxltl.core.automata import Automaton, sequences, to_automaton
+from jaxltl.core.environments import Agent, TaskObservation, sequence_task
 from jaxltl.core.environments.environment import (
     Box,
     Finite,
@@ -70,8 +68,6 @@ from jaxltl.core.environments.environment import (
     flat_observation,
     require_key,
 )
-from jaxltl.core.environments.episodes import Agent
-from jaxltl.core.environments.task_environment import TaskObservation
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief

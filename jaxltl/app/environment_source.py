@@ -13,12 +13,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-
-from jaxltl.core.validation import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments.environment import Environment, make_environment, require_environment
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import with_time_limit
+from jaxltl.core.validation import errors_in
 from jaxltl.envs.continuous_worlds import BenchmarkWorld
 
 BUILT_IN = {
@@ -128,7 +127,6 @@ def _of_package(
     propositions: list[str],
 ) -> Environment:
     """An environment of another package, by its adapter."""
-    adapters = importlib.import_module(f"jaxltl.envs.adapters.{root}")
     module, function = PACKAGES[root]
     try:
         make = getattr(importlib.import_module(module), function)
@@ -137,7 +135,7 @@ def _of_package(
             f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".'
         ) from None
     extra = {"auto_reset": False} if root == "craftax" else {}
-    adapter = getattr(adapters, f"from_{root}")
+    adapter = getattr(importlib.import_module("jaxltl.envs"), f"from_{root}")
     ours = {x: arguments[x] for x in inspect.getfullargspec(adapter).kwonlyargs if x in arguments}
     with _user_errors(f"{root}:{name}"):
         made = make(name, **extra, **{k: v for k, v in arguments.items() if k not in ours})

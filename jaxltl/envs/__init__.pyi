@@ -9,12 +9,12 @@ from . import (
     temporal_gridworld as temporal_gridworld,
 )
 from .adapters.brax import from_brax as from_brax
-from .adapters.craftax import from_craftax as from_craftax
+from .adapters.gymnax import from_craftax as from_craftax
 from .adapters.gymnax import from_gymnax as from_gymnax
 from .adapters.jumanji import from_jumanji as from_jumanji
-from .adapters.navix import from_navix as from_navix
+from .adapters.minigrid import from_navix as from_navix
 from .adapters.pgx import from_pgx as from_pgx
-from .adapters.xminigrid import from_xminigrid as from_xminigrid
+from .adapters.minigrid import from_xminigrid as from_xminigrid
 from .flat_world import flat_world as flat_world
 from .gridworld import gridworld as gridworld
 from .gymnasium_runner import run_policy as run_policy

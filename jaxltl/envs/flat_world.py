@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
+from jaxltl.core.environments.episodes import with_time_limit, without_time_limit
 from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.pretty_print import brief
 

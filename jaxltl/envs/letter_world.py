@@ -17,8 +17,13 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments import (
+    Environment,
+    Timestep,
+    make_box,
+    make_environment,
+    with_time_limit,
+)
 from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.text_map import parse_map

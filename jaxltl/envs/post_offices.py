@@ -15,9 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton, make_automaton
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models import MDP, Game, make_game, make_mdp, restrict
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import base_model
 from jaxltl.core.pretty_print import brief

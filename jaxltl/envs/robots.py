@@ -17,8 +17,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.games.objective import States, states_with_label
 from jaxltl.core.logic.labels import satisfying
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models import MDP, Game, make_game, make_mdp
 from jaxltl.core.models.ops import operators
 from jaxltl.envs.gridworld import ACTIONS as MOVES, gridworld, parse_map
 

@@ -23,12 +23,10 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models.construct.lifting import project_trajectories
-from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models import MDP, Trajectories, project_trajectories, rollout
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.trajectories import Trajectories, rollout
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.envs.cell_kinds import (

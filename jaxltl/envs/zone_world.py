@@ -24,8 +24,13 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.core import struct, validation
-from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments import (
+    Environment,
+    Timestep,
+    make_box,
+    make_environment,
+    with_time_limit,
+)
 from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.pretty_print import brief
 

@@ -27,8 +27,7 @@ from jaxltl.algos.trust_region._step import (
     surrogate,
 )
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
-from jaxltl.core.environments.episodes import run_episode
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import run_episode, with_time_limit
 from jaxltl.core.types import Status
 from tests.support import counted_traces
 

@@ -14,7 +14,7 @@ from jaxltl.core.continuous.certificate import closed_loop
 from jaxltl.core.continuous.grid import make_grid
 from jaxltl.core.continuous.images import image_boxes
 from jaxltl.core.continuous.regions import box
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.envs import continuous_worlds as worlds
 
 CASES = {

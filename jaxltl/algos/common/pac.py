@@ -27,8 +27,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models import MDP, Game
 from jaxltl.core.models.ops.operators import action_max
 from jaxltl.core.models.protocols import Array, Numeric
 from jaxltl.core.types import Solution, require_shape

@@ -51,10 +51,9 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import product
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
+from jaxltl.core.values import Objective, satisfaction_probability
 from jaxltl.core.values.multi_objective.front_search import FrontSearch
-from jaxltl.core.values.multi_objective.objectives import Objective
 from jaxltl.core.values.multi_objective.results import Front
-from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
 MOST_MEMBERS = 8  # objectives at once, see Objective

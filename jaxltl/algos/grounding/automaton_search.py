@@ -36,10 +36,8 @@ from jaxltl.algos.common.settings import Number
 from jaxltl.algos.grounding.hypotheses import step_log_likelihood
 from jaxltl.algos.grounding.problem import LinearGrounding, Problem, joined_demonstrations
 from jaxltl.core.automata.automaton import Automaton, make_automaton
-from jaxltl.core.models.construct.batch import stack_products
-from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models import MDP, Trajectories, stack_products
 from jaxltl.core.models.product import distinct_labels
-from jaxltl.core.models.trajectories import Trajectories
 
 SCALES = (10.0, 25.0, 50.0, 100.0)
 _BATCH = 32

@@ -39,8 +39,7 @@ from jaxltl.algos.grounding.likelihood import NEVER, forward
 from jaxltl.algos.grounding.problem import joined_demonstrations
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.models import MDP, Trajectories
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range, require_in_range
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value

@@ -36,8 +36,7 @@ from jaxltl.algos.common.settings import Number
 from jaxltl.algos.grounding.likelihood import certain_memory, motive_log_policy
 from jaxltl.algos.grounding.problem import Hparams, Problem
 from jaxltl.core import struct
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.language import is_equivalent
+from jaxltl.core.automata import Automaton, is_equivalent
 from jaxltl.core.models.product import Product
 
 Score = Callable[[np.ndarray], np.ndarray]

@@ -15,9 +15,7 @@ from flax import linen as nn
 from jaxltl.algos.common.settings import Number, applied
 from jaxltl.algos.grounding.problem import event_reward
 from jaxltl.core.array_types import PyTree
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.ops.operators import expectation
-from jaxltl.core.models.product import Product
+from jaxltl.core.models import MDP, Product, expectation
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 _TOLERANCE = 1e-3  # of soft values: changes a log-likelihood by as much a step

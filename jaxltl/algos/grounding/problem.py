@@ -14,15 +14,12 @@ from numpy.typing import ArrayLike
 from jaxltl.algos.common import optimizers
 from jaxltl.algos.common.settings import Number, require_output, static, traced
 from jaxltl.core import struct
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.automata.language import is_empty, is_universal
-from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models import MDP, Product, Trajectories, make_trajectories
 from jaxltl.core.models.construct.batch import stack_observations, stack_products, unstack_product
-from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.validation import Range
 
 _MAX_SYMBOLS = 10  # 2^P letters

@@ -10,15 +10,12 @@ from jaxltl.algos.common.play import cumulative
 from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.automata.translate import Task
-from jaxltl.core.graphs.end_components import Accepting, accepting_end_components
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
-from jaxltl.core.graphs.end_components import end_components
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.padded import to_padded
+from jaxltl.core.graphs.end_components import Accepting, accepting_end_components, end_components
+from jaxltl.core.models import forall_successor, to_padded, to_sparse
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.validation import Range

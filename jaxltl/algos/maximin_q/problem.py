@@ -22,8 +22,7 @@ from jaxltl.algos.common.play import (
 )
 from jaxltl.core import struct
 from jaxltl.core.graphs.end_components import bottom_components
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.game import Game
+from jaxltl.core.models import Game, restrict
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.types import require_shape
 

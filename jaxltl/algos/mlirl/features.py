@@ -22,13 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.construct.lifting import lift_trajectories
-from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models import MDP, DenseMDP, Trajectories, expectation, lift_trajectories
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.models.product import Product, read_probability
 from jaxltl.core.models.protocols import ActionModel, Array
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.shortest_path import expected_steps
 from jaxltl.core.types import Solution

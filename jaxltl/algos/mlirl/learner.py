@@ -52,18 +52,14 @@ from jaxltl.algos.mlirl.features import (
 )
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
+from jaxltl.core.models import MDP, DenseMDP, Product, Trajectories, with_allowed
 from jaxltl.core.models.construct.lifting import allowed_steps, lift_trajectories
-from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.validation import Range
-from jaxltl.core.values.discounted.boltzmann import boltzmann_value
+from jaxltl.core.values import boltzmann_value, satisfaction_probability
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 from jaxltl.core.values.engine.iterate import in_turn
-from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 __all__ = [
     "Features",

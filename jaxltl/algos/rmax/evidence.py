@@ -14,16 +14,12 @@ from jaxltl.algos.rmax.learner import policy
 from jaxltl.algos.rmax.problem import Hparams, Problem, State, reward_error
 from jaxltl.core import struct
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.models import Game, Rewards, interval_rows, restrict
 from jaxltl.core.models.protocols import Array
-from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.types import Solution
-from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
-from jaxltl.core.values.interval.robust import robust_discounted_value
+from jaxltl.core.values import minimax_value, robust_discounted_value, strategy_value
 from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
 

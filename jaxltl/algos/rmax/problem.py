@@ -23,10 +23,8 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity, buchi
 from jaxltl.core.games.winning import objective_at, solve, task_game
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.game import Game
+from jaxltl.core.models import Game, forall_successor, restrict
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import require_shape
 from jaxltl.core.validation import Range

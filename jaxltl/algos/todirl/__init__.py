@@ -14,7 +14,7 @@ from jaxltl.algos.todirl.learner import (
     train as train,
     train_until as train_until,
 )
-from jaxltl.algos.todirl.planning import plan as plan, reward as reward
+from jaxltl.algos.todirl.learner import plan as plan, reward as reward
 from jaxltl.algos.todirl.problem import (
     Concatenated as Concatenated,
     Hparams as Hparams,

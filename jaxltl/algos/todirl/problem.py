@@ -13,6 +13,7 @@ from jaxltl.algos.common import optimizers
 from jaxltl.algos.common.settings import COUNT, Number, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
+from jaxltl.core.models import Product, Trajectories
 from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
     stack_models,
@@ -21,8 +22,6 @@ from jaxltl.core.models.construct.batch import (
     unstack_product as lane,
 )
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.validation import Range
 
 

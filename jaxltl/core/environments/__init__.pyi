@@ -43,4 +43,4 @@ from .task_environment import (
     stack_tasks as stack_tasks,
     task_environment as task_environment,
 )
-from .time_limit import with_time_limit as with_time_limit
+from .episodes import with_time_limit as with_time_limit

@@ -1,12 +1,14 @@
-"""Agents, and episodes of an agent in a simulated environment."""
+"""Agents, episodes of an agent in a simulated environment, and time limits."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
@@ -17,6 +19,7 @@ from jaxltl.core.environments.environment import (
     Timestep,
     allowed_in,
     as_partial,
+    optional,
     require_environment,
     require_key,
 )
@@ -253,3 +256,89 @@ def auto_reset_step(
     ended = jnp.asarray(found.terminated, bool) | jnp.asarray(found.truncated, bool)
     fresh = environment.reset(reset_key)
     return jax.tree.map(lambda x, y: jnp.where(ended, x, y), fresh, found.world), found
+
+
+# --- time limits -------------------------------------------------------------------------------
+
+
+def with_time_limit(environment: Environment, num_steps: int) -> Environment:
+    """The environment with episodes truncated after `num_steps` steps.
+
+    Its states are pairs ``(world, time)``; observations do not include the time.
+
+    Args:
+      environment, num_steps: the environment and the limit.
+
+    Returns:
+      The environment; its horizon is the smaller of `num_steps` and the horizon before.
+
+    Raises:
+      ValueError: a limit below 1.
+
+    >>> from jaxltl import environments, gridworld
+    >>> with_time_limit(environments.model_environment(gridworld("a b")), 10).horizon
+    10
+    """
+    num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
+    inner, limit = require_environment(environment), np.int32(num_steps)
+    parts: dict[str, PyTree] = {n: optional(f, getattr(inner, n)) for n, f in _TIMED.items()}
+    return replace(
+        inner,
+        step=Partial(_step_clock, limit, inner.step),
+        outcomes=optional(_clocked, limit, inner.outcomes),
+        horizon=min(num_steps, inner.horizon or num_steps),
+        **parts,
+    )
+
+
+def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
+    """The environment inside :func:`with_time_limit` and the limit; any other environment and None."""
+    timed: PyTree = require_environment(environment)
+    if timed.step.func is not _step_clock:
+        return environment, None
+    parts = {
+        name: part and part.args[-1]
+        for name in ("step", "outcomes", *_TIMED)
+        for part in [getattr(timed, name)]
+    }
+    return replace(environment, horizon=None, **parts), int(timed.step.args[0])
+
+
+def _reset_clock(reset: Callable[..., PyTree], key: Key) -> PyTree:
+    return reset(key), jnp.int32(0)
+
+
+def _step_clock(
+    limit: jax.Array, step: Callable[..., Timestep], timed: PyTree, action: PyTree, key: Key
+) -> Timestep:
+    found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
+    return found._replace(
+        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    )
+
+
+def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
+    worlds, probability = starts()
+    return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
+
+
+def _clocked(
+    limit: jax.Array, outcomes: Callable[..., PyTree], timed: PyTree, action: PyTree
+) -> tuple[Timestep, jax.Array]:
+    found, probability = outcomes(timed[0], action)
+    found, time = Timestep(*found), timed[1] + 1
+    times = jnp.full(jnp.shape(probability), time)
+    return found._replace(
+        world=(found.world, times), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    ), probability
+
+
+def _of_first(function: Callable[..., PyTree], timed: PyTree) -> PyTree:
+    return function(timed[0])
+
+
+_TIMED: dict[str, Callable[..., PyTree]] = {
+    "reset": _reset_clock,
+    "starts": _start_clock,
+    **dict.fromkeys(("observe", "labels", "allowed"), _of_first),
+}

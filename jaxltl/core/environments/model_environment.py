@@ -11,11 +11,7 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.construct.padded import to_padded
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.ops.operators import sample_successor
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models import MDP, DenseMDP, Game, SparseMDP, sample_successor, to_padded
 
 
 def model_environment(

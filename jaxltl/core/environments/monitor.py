@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core import struct, validation
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.automata.runs import (
     Verdict as Verdict,
     lasso_verdicts as lasso_verdicts,
     verdict as verdict,
     verdicts as verdicts,
 )
-from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.protocols import Array

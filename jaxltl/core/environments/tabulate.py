@@ -22,7 +22,7 @@ from jaxltl.core.environments.environment import (
     reads_key,
     require_key,
 )
-from jaxltl.core.environments.time_limit import without_time_limit
+from jaxltl.core.environments.episodes import without_time_limit
 from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief, count, nested_repr, value_range

@@ -23,8 +23,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.environments.environment import (
     ENDINGS,
     Environment,

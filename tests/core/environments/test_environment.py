@@ -18,8 +18,13 @@ from jaxltl.core.environments.environment import (
     make_environment,
     some_action,
 )
-from jaxltl.core.environments.episodes import Agent, auto_reset_step, make_agent, run_episode
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import (
+    Agent,
+    auto_reset_step,
+    make_agent,
+    run_episode,
+    with_time_limit,
+)
 from tests.support import random_action
 
 

@@ -12,8 +12,8 @@ import pytest
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment, reads_key
+from jaxltl.core.environments.episodes import with_time_limit, without_time_limit
 from jaxltl.core.environments.tabulate import tabulate
-from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
 from jaxltl.envs.letter_world import letter_world
 
 S, A, K = 12, 3, 4

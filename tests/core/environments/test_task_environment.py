@@ -11,7 +11,7 @@ from jax.tree_util import Partial
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton, run
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
-from jaxltl.core.environments.episodes import make_agent, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode, with_time_limit
 from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.environments.task_environment import (
@@ -25,7 +25,6 @@ from jaxltl.core.environments.task_environment import (
     task_tables,
     with_task_tables,
 )
-from jaxltl.core.environments.time_limit import with_time_limit
 from tests import reference
 from tests.support import as_mdp, lane, random_action
 

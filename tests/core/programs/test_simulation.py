@@ -10,9 +10,8 @@ from jax.tree_util import Partial
 from scipy import stats
 
 from benchmarks import simulation
-from jaxltl.core.environments.episodes import Agent, run_episode
+from jaxltl.core.environments.episodes import Agent, run_episode, with_time_limit
 from jaxltl.core.environments.task_environment import task_environment
-from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.programs.choices import list_choices

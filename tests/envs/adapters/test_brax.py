@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.environments.episodes import make_agent, run_episode
-from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import make_agent, run_episode, with_time_limit
 from jaxltl.envs import from_brax
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,

@@ -17,7 +17,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, as_partial
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.environments.tabulate import Table
-from jaxltl.core.environments.time_limit import without_time_limit
+from jaxltl.core.environments.episodes import without_time_limit
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, product

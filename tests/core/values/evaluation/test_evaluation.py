@@ -13,10 +13,9 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Timestep, make_environment
-from jaxltl.core.environments.episodes import make_agent, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode, with_time_limit
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.task_environment import task_environment
-from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.statistics.binomial import anytime, clopper_pearson
 from jaxltl.core.types import Status
 from jaxltl.core.values.evaluation import evaluation
