@@ -556,16 +556,13 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
     click.echo(experiment.table(result))
     if pictures:
-        _write_pictures(pictures, out or Path("out") / "reproduce")
+        from jaxltl.core.files import atomic_write
+
+        out = out or Path("out") / "reproduce"
+        out.mkdir(parents=True, exist_ok=True)
+        for name, picture in pictures:
+            with atomic_write(out / name) as file:
+                file.write(picture)
+        click.echo(f"\nwrote {', '.join(name for name, _ in pictures)} to {out}")
     if as_json:
         _print_json(result)
-
-
-def _write_pictures(pictures: list[tuple[str, bytes]], out: Path) -> None:
-    from jaxltl.core.files import atomic_write
-
-    out.mkdir(parents=True, exist_ok=True)
-    for name, picture in pictures:
-        with atomic_write(out / name) as file:
-            file.write(picture)
-    click.echo(f"\nwrote {', '.join(name for name, _ in pictures)} to {out}")

@@ -257,7 +257,9 @@ def learn(setup: Setup, training: Training) -> Outcome:
     chosen = _least_loss(learned)
     if setup.is_probability:
         seed = training.seed
-        learned, chosen = _weighed(setup, problem, hparams, _lane(learned, chosen), seed), 0
+        parameters = part_of(learned.parameters, slice(chosen, chosen + 1))
+        lane = replace(one_seed(learned, chosen), parameters=parameters)
+        learned, chosen = _weighed(setup, problem, hparams, lane, seed), 0
     training.stage("checking")
     judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
     test = judged.part(slice(count, None)) if count < len(judged.status) else None
@@ -296,11 +298,6 @@ def _least_loss(learned: Learned) -> int:
     score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
     loss = np.where(np.isfinite(learned.history["loss"][-1]), learned.history["loss"][-1], np.inf)
     return int(np.argmin(score if np.isfinite(score).any() else loss))
-
-
-def _lane(learned: Learned, i: int) -> Learned:
-    """The networks of one seed."""
-    return replace(one_seed(learned, i), parameters=part_of(learned.parameters, slice(i, i + 1)))
 
 
 def _weighed(

@@ -105,7 +105,9 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
     progress("strategy")
     strategy = restricted = strategy_verdict = moves = None
     if wins[initial].any():
-        strategy = _strategy(file, nodes)
+        method, bound = file.strategy.method, file.strategy.bound
+        with errors_in(f"{file.path}: [strategy] "):
+            strategy = permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
         restricted = apply_strategy(strategy)
         strategy_verdict = check_strategy(nodes, strategy, restricted)
         moves = expected_moves(nodes, strategy, restricted)
@@ -143,12 +145,6 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
         start=np.searchsorted(number, start),
         automaton=automaton,
     )
-
-
-def _strategy(file: GameFile, nodes: Nodes) -> Permissive:
-    method, bound = file.strategy.method, file.strategy.bound
-    with errors_in(f"{file.path}: [strategy] "):
-        return permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
 
 
 def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) -> Verification:
@@ -195,7 +191,10 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
     moves are resolved against it.
     """
     game, objective = nodes.game, winning.objective
-    failed = _failed(nodes, objective)
+    failed = np.asarray(objective.lost)  # a violation that no continuation can undo
+    if nodes.automaton is not None:
+        verdict = np.asarray(make_monitor(nodes.automaton).verdict)
+        failed = failed | (verdict == Verdict.VIOLATED)[nodes.automaton_state]
     time = np.asarray(attractor(game, jnp.asarray(failed), rule=~game.system).rank)
     time = np.where(failed, 0, np.where(time > 0, time, np.iinfo(np.int32).max))
     successor, used = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability) > 0
@@ -232,15 +231,6 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
     return Play(
         steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
     )
-
-
-def _failed(nodes: Nodes, objective: Parity | GR1) -> np.ndarray:
-    """Nodes with a violation that no continuation can undo."""
-    failed = np.asarray(objective.lost)
-    if nodes.automaton is not None:
-        verdict = np.asarray(make_monitor(nodes.automaton).verdict)
-        failed = failed | (verdict == Verdict.VIOLATED)[nodes.automaton_state]
-    return failed
 
 
 def demand(found: Synthesis) -> None:

@@ -76,12 +76,6 @@ def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> In
     return converted
 
 
-def parity_objective(priority: Integers) -> Parity:
-    """Parity objective of min-even priorities ``int32[S]``."""
-    none = to_jax(np.zeros(priority.shape, bool))
-    return Parity(to_jax(priority), none, none, int(priority.max(initial=0)) + 1)
-
-
 _SPACE = re.compile(r"(?:\s+|//[^\n]*)*")
 _HEAD = re.compile(r"parity\s+([0-9]+)\s*;")
 _START = re.compile(r"start\s+([0-9]+)\s*;")
@@ -295,7 +289,9 @@ def objective_of(game: Game) -> Parity:
       [2, 1]
     """
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
-    return parity_objective(min_even(max_even(valuation, None)[0]))
+    priority = min_even(max_even(valuation, None)[0])
+    none = to_jax(np.zeros(priority.shape, bool))
+    return Parity(to_jax(priority), none, none, int(priority.max(initial=0)) + 1)
 
 
 def edges_of(game: Game, place: str) -> tuple[Integers, Integers]:

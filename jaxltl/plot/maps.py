@@ -178,7 +178,9 @@ def _cells(
             _name_cell(axes, (c, r), marks[str(kind)], color, blank=bool(blank), tiny=tiny)
         if numbers and not blank and not tiny:
             tone = PAPER if shown[r, c] < sum(limits) / 2 else INK
-            write(axes, (c + 0.5, r + 0.58), _short_number(float(shown[r, c])), 7, tone)
+            value = float(shown[r, c])  # to three digits, without a leading zero
+            text = f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
+            write(axes, (c + 0.5, r + 0.58), text, 7, tone)
     rule_cells(axes, rows, columns, FAINT)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
     number_cells(axes, rows, columns)
@@ -228,11 +230,6 @@ def kind_colors(kinds: NDArray[np.str_], wall: str) -> dict[str, str]:
         )
         for i, kind in enumerate(special)
     }
-
-
-def _short_number(value: float) -> str:
-    """A number to three digits, without a leading zero."""
-    return f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
 
 
 def strategies(

@@ -115,7 +115,8 @@ def solution(
             limits=_limits(values),
             wall=_WALL,
         )
-    chosen = _open_memories(values, inside) if memories is None else [int(q) for q in memories]
+    several = [q for q in range(values.shape[1]) if np.ptp(values[inside, q]) > 0] or [0]
+    chosen = several[:_MOST_PANELS] if memories is None else [int(q) for q in memories]
     if not chosen or not all(0 <= q < values.shape[1] for q in chosen):
         raise ValueError(f"memories={memories}; give some of 0 to {values.shape[1] - 1}.")
     names = model.automaton.state_names or ("",) * values.shape[1]
@@ -144,11 +145,6 @@ def _arrows(policy: np.ndarray | None, inside: NDArray[np.bool_]) -> NDArray[np.
         return None
     chance = np.eye(4)[policy] if policy.dtype.kind in "iu" else policy.astype(float)
     return np.where(inside[:, None], chance, np.nan)
-
-
-def _open_memories(values: np.ndarray, inside: NDArray[np.bool_]) -> list[int]:
-    spread = [q for q in range(values.shape[1]) if np.ptp(values[inside, q]) > 0]
-    return (spread or [0])[:_MOST_PANELS]
 
 
 def _strip(found: Solution) -> Figure:

@@ -75,7 +75,9 @@ def figures(
     for task, methods in plan.feasible_starts:
         progress(f"the robot, task {task}, from feasible policies: {', '.join(methods)}")
         robot = _robot(task)
-        initial = _feasible_policies(robot, seeds or SEEDS, plan)
+        # A distribution of feasible policies for each seed, by minimising the cost alone.
+        hparams, keys = replace(robot.hparams, margin=1e3), _keys(seeds or SEEDS, 100 + task)
+        initial = _train(keys, robot.problem, hparams, plan.steps // 2)[0].family
         pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, initial)) for m in methods]
     evaluated = []
     for runs in (usual, pretrained):
@@ -264,13 +266,6 @@ def _train_from(
         return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
 
     return jax.vmap(one)(keys, family)
-
-
-def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> PyTree:
-    """For each seed a distribution of feasible policies, found by minimising the cost alone."""
-    hparams = replace(robot.hparams, margin=1e3)
-    state, _ = _train(_keys(seeds, 100 + robot.task), robot.problem, hparams, plan.steps // 2)
-    return state.family
 
 
 def _trust_region(

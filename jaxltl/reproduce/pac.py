@@ -15,7 +15,6 @@ from jax.tree_util import Partial
 from jaxltl.algos import rmax
 from jaxltl.algos.common import loops, pac
 from jaxltl.app.job import plain
-from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
 from jaxltl.core.models import expectation, restrict
 from jaxltl.core.types import check
@@ -250,28 +249,21 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Fig
     }
 
 
-def _without_both(automaton: Automaton) -> Automaton:
-    """The automaton without the letter that no cell has, for shorter guards."""
-    kept = ~automaton.letters.all(axis=1)
-    return replace(
-        automaton,
-        letters=automaton.letters[kept],
-        delta=automaton.delta[:, kept],
-        priority=automaton.priority[:, kept],
-    )
-
-
 def pictures(result: Figures) -> list[tuple[str, bytes]]:
     """Figures 17 to 19: the task, the values, and the strategies of the first seed."""
     from jaxltl import plot
 
+    task = surveillance()
+    kept = ~task.letters.all(axis=1)  # without the letter that no cell has, for shorter guards
+    letters, delta, priority = task.letters[kept], task.delta[:, kept], task.priority[:, kept]
+    task = replace(task, letters=letters, delta=delta, priority=priority)
     best = np.asarray(result["figure17"]["best"], float)
     danger = np.array([np.isin(np.arange(9), cells) for cells in _DANGER.values()])
     shown, maps = result["figure18"], result["figure19"]
     titles = [f"light {light}, q{q}" for light in _DANGER for q in (1, 2, 3, 4)]
     laid_out = {k: np.asarray(maps[k], float).reshape(8, 9, -1) for k in ("initial", "learned")}
     drawn = {
-        "figure_17_automaton": plot.automaton(_without_both(surveillance())),
+        "figure_17_automaton": plot.automaton(task),
         "figure_17_best_moves": plot.strategies(
             _MAP,
             best,

@@ -105,14 +105,10 @@ def _automaton(formula: str, worlds: list[grid.World]) -> Automaton:
 
 def _stacked(worlds: list[grid.World], memory: Automaton) -> Product:
     """Products in single precision along a leading axis."""
-    return _single(stack_products([w.mdp for w in worlds], memory, label_on="exit"))
-
-
-def _single(tree: PyTree) -> PyTree:
-    def one(x: jax.Array) -> jax.Array:
-        return x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return jax.tree.map(one, tree)
+    return jax.tree.map(
+        lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x,
+        stack_products([w.mdp for w in worlds], memory, label_on="exit"),
+    )
 
 
 def _lane(tree: PyTree, number: int) -> PyTree:

@@ -298,7 +298,11 @@ def keys_of(schema: type[Table]) -> list[KeyHelp]:
     """
     entries = []
     for field in _fields(schema):
-        kind, default = field.type, _default(field.default)
+        kind, default = field.type, field.default
+        if default is attrs.NOTHING:
+            default = ...
+        elif hasattr(default, "factory"):
+            default = default.factory()
         texts = [x for x in getattr(kind, "__metadata__", ()) if isinstance(x, str)] or [""]
         about, example = [*texts, _example(kind, default)][:2]
         entries.append(KeyHelp(key_name(field), requirement(kind), default, about, example))
@@ -317,9 +321,3 @@ def _example(kind: object, default: object) -> str:
         if part is bool:
             return "true"
     return ""
-
-
-def _default(default: object) -> Any:
-    if default is attrs.NOTHING:
-        return ...
-    return default.factory() if hasattr(default, "factory") else default

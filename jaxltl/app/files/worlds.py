@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -74,11 +73,7 @@ def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:
     if formula is None:
         return mdp
     with errors_in(f"{str(path)!r}: "):
-        return replace(mdp, initial=_uniform_where(formula, mdp))
-
-
-def _uniform_where(formula: str, mdp: MDP) -> jax.Array:
-    holds = satisfying(np.asarray(mdp.label), mdp.propositions, formula, "initial")
-    if not holds.any():
-        raise ValueError(f"initial={formula!r} holds in no state.")
-    return jnp.asarray(holds / holds.sum(), mdp.dtype)
+        holds = satisfying(np.asarray(mdp.label), mdp.propositions, formula, "initial")
+        if not holds.any():
+            raise ValueError(f"initial={formula!r} holds in no state.")
+        return replace(mdp, initial=jnp.asarray(holds / holds.sum(), mdp.dtype))

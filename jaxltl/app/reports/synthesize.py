@@ -263,7 +263,10 @@ def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str
     world = found.world
     if world.text is not None and world.places is not None:
         count = len(world.places)
-        few = None if count <= MOST_MAPS else _most_lost(found, count)
+        few = None
+        if count > MOST_MAPS:  # those with the most losing cells, in order
+            lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
+            few = sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
         made.append(
             (
                 "region.svg",
@@ -290,12 +293,6 @@ def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
             f"{rows} and columns 1 to {columns}."
         )
     return int(here[0])
-
-
-def _most_lost(found: Synthesis, count: int) -> list[int]:
-    """The environment's places with the most losing cells, in order."""
-    lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
-    return sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
 
 
 def _moves_picture(found: Synthesis, environment: int | None) -> Any:

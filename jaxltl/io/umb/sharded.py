@@ -80,7 +80,9 @@ def read_sharded(
         index = read_index(archive.stream())
         _check_kind(index, place)
         ranges = ranges_of(index.states, mesh, axis)
-        _check_memory(index, ranges, place)
+        size = sum(x.size(index.counts[x.part]) for x in index.items().values())
+        own = sum(stop - start for start, stop in ranges)
+        check_memory(size * own // index.states, place)
         try:
             parts: dict[_Span, ModelPart] = {}
             # A plain archive is read range by range, a compressed one once for all ranges.
@@ -113,11 +115,6 @@ def _check_kind(index: Index, place: str) -> None:
             f"{place}{problem}; a mesh supports Markov chains and MDPs with point probabilities. "
             "Use read_model."
         )
-
-
-def _check_memory(index: Index, ranges: list[_Span], place: str) -> None:
-    size = sum(x.size(index.counts[x.part]) for x in index.items().values())
-    check_memory(size * sum(stop - start for start, stop in ranges) // index.states, place)
 
 
 @dataclass(frozen=True)
@@ -264,7 +261,9 @@ def _parts(
     place = archive.place
     held, items = _read(archive, index, ranges), index.items()
     whole = {x: held.found[x].arrays[0] for x in _WHOLE if x in held.found and x != _IS_INITIAL}
-    some = _some_initial(held, index)
+    some = index.states  # initial states
+    if _IS_INITIAL in held.found:
+        some = count_bits(held.found[_IS_INITIAL].arrays[0], index.states)
     for i, span in enumerate(ranges):
         spans = {part: x[i] for part, x in held.spans.items()}
         here = index.of(*(spans[part] for part in index.counts))
@@ -291,14 +290,6 @@ def _of_range(runs: _Runs, item: Items, span: _Span) -> Bytes:
     return write_bits(read_bits(content, first + span[1] - span[0])[first:])
 
 
-def _some_initial(held: _Held, index: Index) -> int:
-    """Number of initial states; 0 if the initial distribution is uniform over all states."""
-    if _IS_INITIAL not in held.found:
-        return 0
-    count = count_bits(held.found[_IS_INITIAL].arrays[0], index.states)
-    return 0 if count == index.states else count
-
-
 def _part(
     contents: dict[str, Bytes],
     index: Index,
@@ -317,7 +308,7 @@ def _part(
     initial = exact_initial(contents)
     if initial is None:
         initial = np.full(index.states, 1 / num_states)
-        if some:
+        if 0 < some < num_states:
             initial = read_bits(contents[_IS_INITIAL], index.states) / some
     with errors_in(place):
         model = sparse_part(

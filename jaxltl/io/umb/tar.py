@@ -33,15 +33,13 @@ class Stream:
     def __init__(self, source: Iterator[bytes] | FileBytes, place: str):
         self._source, self._held, self.place, self.position = source, memoryview(b""), place, 0
 
-    def _next(self) -> bytes | None:
-        if isinstance(self._source, FileBytes):
-            return self._source[self.position : self.position + _STEP] or None
-        return next(self._source, None)
-
     def _some(self, limit: int) -> memoryview:
         """Between 1 and `most` bytes; empty at the end."""
         while not self._held:
-            piece = self._next()
+            if isinstance(self._source, FileBytes):
+                piece = self._source[self.position : self.position + _STEP] or None
+            else:
+                piece = next(self._source, None)
             if piece is None:
                 return self._held
             self._held = memoryview(piece)
@@ -210,16 +208,13 @@ def tar_pieces(contents: Sequence[tuple[str, NDArray[np.uint8] | bytes]]) -> Ite
     """Bytes of a tar archive of named contents, in pieces."""
     for name, content in contents:
         view = memoryview(content)  # type: ignore[arg-type]  # a Buffer since Python 3.12
-        yield memoryview(_header(name, len(view)))
+        info = tarfile.TarInfo(name)
+        info.size = len(view)
+        form = tarfile.USTAR_FORMAT if info.size < 8**11 else tarfile.GNU_FORMAT
+        yield memoryview(info.tobuf(form))
         yield view
         yield memoryview(bytes(-len(view) % _BLOCK))
     yield memoryview(bytes(2 * _BLOCK))
-
-
-def _header(name: str, size: int) -> bytes:
-    info = tarfile.TarInfo(name)
-    info.size = size
-    return info.tobuf(tarfile.USTAR_FORMAT if size < 8**11 else tarfile.GNU_FORMAT)
 
 
 _GZIP_BLOCK = 2**20

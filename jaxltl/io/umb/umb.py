@@ -115,8 +115,16 @@ def _model(contents: dict[str, Bytes], index: Index, place: str) -> SparseMDP | 
     if index.players == 0:
         check_chain(row_start, place)
     annotations = annotations_of(contents, index, place)
-    if f"{VALUATIONS}/valuations.bin" in contents:
-        annotations["valuation"] = _valuation(contents, index, place)
+    if (member := f"{VALUATIONS}/valuations.bin") in contents:
+        of_class = contents.get(f"{VALUATIONS}/valuation-to-class.bin")
+        annotations["valuation"] = read_variables(
+            contents.pop(member),
+            None if of_class is None else of_class.view("<u4"),
+            index.records,
+            index.states,
+            texts_of(contents, VALUATIONS, place),
+            f"{place}{member}: ",
+        )
     probability = probability_of(contents, index, entry_start, place)
     initial = _initial(contents, index)
     owner = _owners(contents, index, row_start, place)
@@ -136,24 +144,9 @@ def _model(contents: dict[str, Bytes], index: Index, place: str) -> SparseMDP | 
     return model if owner is None else make_game(model, owner)
 
 
-def _valuation(
-    contents: dict[str, Bytes], index: Index, place: str
-) -> dict[str, NDArray[np.generic]]:
-    of_class = contents.get(f"{VALUATIONS}/valuation-to-class.bin")
-    return read_variables(
-        contents.pop(f"{VALUATIONS}/valuations.bin"),
-        None if of_class is None else of_class.view("<u4"),
-        index.records,
-        index.states,
-        texts_of(contents, VALUATIONS, place),
-        f"{place}{VALUATIONS}/valuations.bin: ",
-    )
-
-
 def _initial(contents: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
     """Initial distribution; None for the uniform one over all states."""
-    exact = exact_initial(contents)
-    if exact is not None:
+    if (exact := exact_initial(contents)) is not None:
         return exact
     if "state-is-initial.bin" not in contents:
         return None
