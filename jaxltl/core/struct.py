@@ -56,7 +56,8 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
     made.replace = _replace
     static = [f.name for f in dataclasses.fields(made) if not f.metadata.get("pytree_node", True)]
     register(made, [f.name for f in dataclasses.fields(made) if f.name not in static], static)
-    return made
+    result: type[ClassT] = made
+    return result
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))

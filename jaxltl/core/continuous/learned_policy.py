@@ -135,7 +135,8 @@ def _undecided_row(tables: TaskTables) -> Floats:
             "no function of the state alone; learn with embedding=np.zeros((Q, 1)), which hides them, "
             "or synthesize a policy with memory by synthesize_policy."
         )
-    return rows[int(tables.initial)] if not len(found) else found[0]
+    result: Floats = rows[int(tables.initial)] if not len(found) else found[0]
+    return result
 
 
 def learned_policy(policy: Policy, dynamics: Dynamics, formula: str | Formula) -> StatePolicy:

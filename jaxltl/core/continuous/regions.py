@@ -61,7 +61,8 @@ class Region:
     @property
     def num_states(self) -> int:
         """n; 0 for a region of functions alone, which fits any space."""
-        return max(self.low.shape[1], self.normal.shape[1])
+        result: int = max(self.low.shape[1], self.normal.shape[1])
+        return result
 
     def contains(self, x: Array) -> Array:
         """``bool[...]``: membership of the states ``x float[..., n]``, NumPy or JAX; no derivative."""
@@ -70,7 +71,7 @@ class Region:
         low, high, normal, offset = (
             xp.asarray(y, x.dtype) for y in (self.low, self.high, self.normal, self.offset)
         )
-        found = xp.zeros(x.shape[:-1], bool)
+        found: Array = xp.zeros(x.shape[:-1], bool)
         if len(low):
             y = x[..., None, :]
             found = found | ((low <= y) & (y < high)).all(-1).any(-1)

@@ -315,4 +315,5 @@ def _least(value: Floats, factors: Factors, factor: Integers, outside: float) ->
     if outside:
         rest = np.maximum(free[..., 0] - filled[..., -1], 0)
         total = total + out_low.reshape(-1, *middle) + rest
-    return np.clip(total - (value.shape[-1] + 8) * _UNIT, 0, 1)
+    result: Floats = np.clip(total - (value.shape[-1] + 8) * _UNIT, 0, 1)
+    return result

@@ -120,4 +120,5 @@ def contained(task: TaskProduct, rows: Successors, states: Booleans, memory: int
     inside = count_in(table, rows.start, rows.stop) == cells
     if not task.outside[memory]:
         inside &= ~rows.outside
-    return inside & ((cells > 0) | rows.outside)
+    result: Booleans = inside & ((cells > 0) | rows.outside)
+    return result

@@ -63,7 +63,8 @@ def enclose(
 
     def shaped(low: PyTree, high: PyTree) -> tuple[PyTree, PyTree]:
         found = enclosed(*(jax.tree.map(lambda x: x[None], tree) for tree in (low, high)))
-        return jax.tree.map(lambda x: x[0], found)
+        result: tuple[PyTree, PyTree] = jax.tree.map(lambda x: x[0], found)
+        return result
 
     return shaped
 

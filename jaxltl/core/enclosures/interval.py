@@ -45,20 +45,23 @@ class Interval:
     def magnitude(self) -> Array:
         """Largest absolute value, elementwise."""
         xp = module_of(self.low)
-        return xp.maximum(size_of(self.low), size_of(self.high))
+        result: Array = xp.maximum(size_of(self.low), size_of(self.high))
+        return result
 
     @property
     def middle(self) -> Array:
         """A point inside, elementwise; near the centre."""
         xp = module_of(self.low)
-        return xp.clip(0.5 * self.low + 0.5 * self.high, self.low, self.high)
+        result: Array = xp.clip(0.5 * self.low + 0.5 * self.high, self.low, self.high)
+        return result
 
     @property
     def radius(self) -> Array:
         """At least the distance from :attr:`middle` to either bound."""
         xp, middle = module_of(self.low), self.middle
         distance = xp.maximum(self.high - middle, middle - self.low)
-        return distance * (1 + 4 * eps(self.low)) + tiny(self.low)
+        result: Array = distance * (1 + 4 * eps(self.low)) + tiny(self.low)
+        return result
 
 
 def module_of(x: Array) -> Any:
@@ -141,7 +144,8 @@ def multiply(x: Interval, y: Interval) -> Interval:
 def times(a: Array, b: Array) -> Array:
     """`a b`, with 0 for `0 * inf`."""
     xp = module_of(a)
-    return xp.where((a == 0) | (b == 0), 0, a * b)
+    result: Array = xp.where((a == 0) | (b == 0), 0, a * b)
+    return result
 
 
 def reciprocal(x: Interval) -> Interval:
@@ -232,4 +236,5 @@ def _contains_multiple(x: Interval, shift: float, period: float) -> Array:
     xp = module_of(x.low)
     first, last = (x.low + shift) / period, (x.high + shift) / period
     slack = 256 * eps(x.low) * (1 + size_of(first) + size_of(last))
-    return xp.floor(last + slack) >= xp.ceil(first - slack)
+    result: Array = xp.floor(last + slack) >= xp.ceil(first - slack)
+    return result

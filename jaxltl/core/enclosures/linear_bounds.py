@@ -168,7 +168,8 @@ def _joined(arrays: list[Array]) -> Array:
     """Concatenation along the last axis, with boxes repeated."""
     xp = module_of(arrays[0])
     lead = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
-    return xp.concatenate([xp.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays], -1)
+    result: Array = xp.concatenate([xp.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays], -1)
+    return result
 
 
 def _product(matrix: Array, x: Interval) -> Interval:
@@ -219,7 +220,8 @@ def _padded(slope: Array, count: int) -> Array:
     if not missing:
         return slope
     zeros = xp.zeros((slope.shape[0], missing, slope.shape[2]), slope.dtype)
-    return xp.concatenate([slope, zeros], 1)
+    result: Array = xp.concatenate([slope, zeros], 1)
+    return result
 
 
 def _forward(
@@ -421,8 +423,8 @@ def _scatter(slope: Array, index: np.ndarray, total: int) -> Array:
     if len(index) == total and (index == np.arange(total)).all():
         return slope
     xp = module_of(slope)
-    zeros = xp.zeros((*slope.shape[:-1], total), slope.dtype)
-    if xp is jnp:
+    zeros: Array = xp.zeros((*slope.shape[:-1], total), slope.dtype)
+    if isinstance(zeros, jnp.ndarray):
         return zeros.at[..., index].add(slope)
     order = np.argsort(index, kind="stable")
     entries, starts = np.unique(index[order], return_index=True)

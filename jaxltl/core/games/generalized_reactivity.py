@@ -78,12 +78,14 @@ def _keep(arena: _Arena, moves: Array, inside: Array, counters: Array) -> tuple[
 
 def _within(arena: _Arena, moves: Array, inside: Array) -> Array:
     """Moves of the system that surely stay inside, and all moves of the environment."""
-    return moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
+    result: Array = moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
+    return result
 
 
 def _near(arena: _Arena, found: Array) -> Array:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
-    return arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
+    result: Array = arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
+    return result
 
 
 def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array, Array]:
@@ -134,7 +136,8 @@ def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Arra
         goal = missed & assumption
         towards = attract(graph, ~inside | goal, allowed, rule=~system, among=missed)
         moves.append(graph.xp.where(goal, graph.first(allowed)[1], towards.action))
-    return graph.xp.stack(moves)
+    result: Array = graph.xp.stack(moves)
+    return result
 
 
 def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:

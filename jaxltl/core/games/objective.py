@@ -16,7 +16,7 @@ from jaxltl.core import struct
 from jaxltl.core.pretty_print import brief, count, value_range
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Array, LabelledModel, Model, base_model
 
@@ -106,20 +106,20 @@ def states_with_label(model: Model, condition: States, place: str = "condition")
     """
     if isinstance(condition, str) and condition in ("true", "false"):
         # Of traced games too.
-        return to_jax(np.full(model.state_shape, condition == "true"))
+        return jax_array(np.full(model.state_shape, condition == "true"))
     if isinstance(condition, str | Formula):
         world = cast(LabelledModel, base_model(model))
         holds = satisfying(distinct_labels(world), world.propositions, condition, place)
         xp, holds = namespace(letters_by_state(world, np.asarray(holds)))
         extra = len(model.state_shape) - 1
-        return to_jax(xp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape))
+        return jax_array(xp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape))
     _, condition = namespace(condition if is_traced(condition) else np.asarray(condition))
     if condition.shape != model.state_shape or condition.dtype != bool:
         raise ValueError(
             f"{place} is {condition.dtype}{list(condition.shape)}; give "
             f"bool{list(model.state_shape)}, or a Boolean formula over propositions."
         )
-    return to_jax(condition)
+    return jax_array(condition)
 
 
 def safety(game: Model, safe: States) -> Parity:
@@ -322,7 +322,7 @@ def gr1(
             states_with_label(game, x, f"{name}[{i}]") for i, x in enumerate(sets)
         ]
         xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
-        return to_jax(xp.stack(found))
+        return jax_array(xp.stack(found))
 
     _, inside = namespace(states_with_label(game, safe, "safe"))
     return GR1(

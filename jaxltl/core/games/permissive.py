@@ -24,7 +24,7 @@ from jaxltl.core.models.construct.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops import operators
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.sparse.graph.row_graph import RowGraph
@@ -225,14 +225,14 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
                 f"policy has shape {policy.shape}; the mask's states have {allowed.shape[:-1]}."
             )
         inside = xp.take_along_axis(allowed, policy[..., None], axis=-1)[..., 0]
-        return to_jax(xp.where(inside | ~some, policy, first.astype(policy.dtype)))
+        return jax_array(xp.where(inside | ~some, policy, first.astype(policy.dtype)))
     if policy.shape != allowed.shape:
         raise ValueError(f"policy has shape {policy.shape}; the mask has {allowed.shape}.")
     kept = xp.where(allowed, policy, 0)
     total = kept.sum(-1, keepdims=True)
     uniform = (allowed / xp.maximum(allowed.sum(-1, keepdims=True), 1)).astype(policy.dtype)
     shielded = xp.where(total > 0, kept / xp.where(total > 0, total, 1), uniform)
-    return to_jax(xp.where(some[..., None], shielded, policy))
+    return jax_array(xp.where(some[..., None], shielded, policy))
 
 
 # --- shared by all methods -------------------------------------------------------------------
@@ -260,12 +260,14 @@ def concrete_graph(game: Game, objective: Parity | GR1 | None = None) -> RowGrap
 
 def _region(arena: _Arena) -> np.ndarray:
     solve: Callable[..., PyTree] = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
-    return solve(arena.graph, arena.game.system, arena.objective).region
+    result: np.ndarray = solve(arena.graph, arena.game.system, arena.objective).region
+    return result
 
 
 def staying(graph: RowGraph, region: np.ndarray) -> np.ndarray:
     """``bool[S, A]``: the moves that surely stay in a region."""
-    return graph.available & region[..., None] & graph.forall(region)
+    result: np.ndarray = graph.available & region[..., None] & graph.forall(region)
+    return result
 
 
 def _wins_somewhere(game: Game, region: np.ndarray) -> bool:

@@ -26,7 +26,7 @@ from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import Model, PyTree
 
@@ -84,7 +84,7 @@ class Winning:
     def realizable(self) -> jax.Array:
         """``bool[]``: True if the system wins from every initial state."""
         xp, region, initial = namespace(self.region, self.game.initial)
-        return to_jax(xp.all(region | (initial <= 0)))
+        return jax_array(xp.all(region | (initial <= 0)))
 
 
 def winning_region(
@@ -206,7 +206,7 @@ def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> PyT
     states = objective.lost.ndim
 
     def pick(x: Array) -> jax.Array:
-        return to_jax(x.reshape(*x.shape[: x.ndim - states], -1)[..., origin])
+        return jax_array(x.reshape(*x.shape[: x.ndim - states], -1)[..., origin])
 
     return jax.tree.map(pick, arrays)
 

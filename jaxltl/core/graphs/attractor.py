@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
@@ -88,7 +88,10 @@ def attractor(
         raise ValueError(f"chance={chance!r}; choose some or all.")
     graph = graph_of(model, goal, allowed, exists, among)
     goal, allowed, exists, among = take(graph, (goal, allowed, exists, among))
-    return to_jax(attract(graph, goal, allowed, rule=exists, chance=chance, among=among))
+    result: Attractor = to_jax(
+        attract(graph, goal, allowed, rule=exists, chance=chance, among=among)
+    )
+    return result
 
 
 def attract(
@@ -132,7 +135,7 @@ def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -
       [True, False, True]
     """
     graph = graph_of(model, goal, allowed)
-    return to_jax(avoid(graph, *take(graph, (goal, allowed))))
+    return jax_array(avoid(graph, *take(graph, (goal, allowed))))
 
 
 def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
@@ -169,7 +172,8 @@ def almost_surely_reaching(
     """
     graph = graph_of(model, goal, allowed, reaching)
     goal, allowed, reaching = take(graph, (goal, allowed, reaching))
-    return to_jax(surely(graph, goal, allowed, reaching=reaching))
+    result: Attractor = to_jax(surely(graph, goal, allowed, reaching=reaching))
+    return result
 
 
 def surely(
@@ -190,7 +194,8 @@ def surely(
 
     found = attract(graph, goal, allowed) if reaching is None else reaching
     # A state that cannot reach the goal at all is what removes others.
-    return graph.repeat(body, (found, ~graph.xp.all(found.region)))[0]
+    result: Attractor = graph.repeat(body, (found, ~graph.xp.all(found.region)))[0]
+    return result
 
 
 class Sets(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxltl.core.graphs.attractor import avoid, attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, Array
 from jaxltl.core.pretty_print import brief
@@ -60,7 +60,8 @@ def end_components(
       [[False, True], [True, False], [False, False]]
     """
     graph = graph_of(model, region, allowed)
-    return to_jax(components_within(graph, *take(graph, (region, allowed))))
+    result: EndComponents = to_jax(components_within(graph, *take(graph, (region, allowed))))
+    return result
 
 
 def components_within(graph: Graph, region: Array, allowed: Array | None = None) -> EndComponents:
@@ -77,7 +78,8 @@ def components_within(graph: Graph, region: Array, allowed: Array | None = None)
 def bottom_components(model: Model, allowed: jax.Array) -> EndComponents:
     """Bottom strongly connected components of the chain that takes all allowed actions."""
     graph = graph_of(model, allowed)
-    return to_jax(closed_components(graph, take(graph, allowed)))
+    result: EndComponents = to_jax(closed_components(graph, take(graph, allowed)))
+    return result
 
 
 def closed_components(graph: Graph, allowed: Array) -> EndComponents:
@@ -127,7 +129,8 @@ def accepting_end_components(model: Product) -> Accepting:
     start = Accepting(
         ~everywhere, graph.first(available)[1], xp.zeros(available.shape, bool), nothing - 1
     )
-    return to_jax(graph.times(priority.max() // 2 + 1, body, start))
+    result: Accepting = to_jax(graph.times(priority.max() // 2 + 1, body, start))
+    return result
 
 
 def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
@@ -147,4 +150,4 @@ def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
     # A component that reads no priority is not accepting.
     start = xp.full(graph.state_shape, 1, priority.dtype)
     least = graph.times(priority.max() + 1, body, start)
-    return to_jax(inside & (least % 2 == 0))
+    return jax_array(inside & (least % 2 == 0))

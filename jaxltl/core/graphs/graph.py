@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias, cast
 
 import jax
@@ -23,7 +22,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.construct.convert import keep_latest
@@ -88,7 +87,7 @@ class TracedGraph:
         if is_sharded(self.model):
             return components_by_sweeps(self, core, allowed, closed)
         shape, flat = self.state_shape, int(np.prod(self.state_shape))
-        result = (
+        shapes = (
             jax.ShapeDtypeStruct(shape, jnp.int32),
             jax.ShapeDtypeStruct(choice_shape(self.model), jnp.bool_),
         )
@@ -97,13 +96,14 @@ class TracedGraph:
             return graph_of(model).components(core, allowed, closed)
 
         def callback() -> PyTree:
-            return host_callback(host, result, self.model, core, allowed)
+            return host_callback(host, shapes, self.model, core, allowed)
 
         def trivial() -> PyTree:
             number = jnp.arange(flat, dtype=jnp.int32).reshape(shape)
-            return number, jnp.zeros(result[1].shape, bool)
+            return number, jnp.zeros(shapes[1].shape, bool)
 
-        return lax.cond(core.any(), callback, trivial)
+        result: tuple[Array, Array] = lax.cond(core.any(), callback, trivial)
+        return result
 
     def anywhere(self, mark: jax.Array, component: jax.Array) -> jax.Array:
         """Mask of states with a marked state in their component: ``bool[S]``."""
@@ -124,7 +124,7 @@ struct.register(TracedGraph, ["model"])
 Graph: TypeAlias = Any  # a RowGraph with NumPy's arrays, or a TracedGraph with JAX's
 
 
-@partial(jax.jit, static_argnames=("chance",))
+@jit("chance")
 def _sweeps(
     graph: TracedGraph, goal: Array, allowed: Array, rule: Array, among: Array, *, chance: str
 ) -> PyTree:

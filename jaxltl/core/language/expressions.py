@@ -269,7 +269,7 @@ def apply(operator: str, values: list[Any], place: int = -1) -> Value:
     (2, 0.25, 3)
     """
     try:
-        result = SCALAR[operator](*values)
+        result: Value = SCALAR[operator](*values)
     except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
         shown = ", ".join(str(x) for x in values)
         raise LanguageError(place, f"{operator} of {shown} is not defined: {error}.") from None

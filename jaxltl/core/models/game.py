@@ -80,22 +80,22 @@ class Game(Generic[Arena]):
         return self.mdp.state_shape
 
     @property
-    def successor_probability(self) -> jax.Array:
+    def successor_probability(self) -> Array:
         """``float[S, A, K]``."""
         return cast(SuccessorModel, self.mdp).successor_probability
 
     @property
-    def available(self) -> jax.Array:
+    def available(self) -> Array:
         """``bool[S, A]``."""
         return cast(SuccessorModel, self.mdp).available
 
     @property
-    def initial(self) -> jax.Array:
+    def initial(self) -> Array:
         """``float[S]``, the initial distribution."""
         return self.mdp.initial
 
     @property
-    def label(self) -> jax.Array:
+    def label(self) -> Array:
         """``bool[S, P]``, the propositions that hold in each state."""
         return cast(LabelledModel, self.mdp).label
 

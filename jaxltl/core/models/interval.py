@@ -448,7 +448,8 @@ def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
     total = x + y
     part = total - x
     off = (x - (total - part)) + (y - part)
-    return np.where(side * off > 0, np.nextafter(total, side * np.inf), total)
+    result: np.ndarray = np.where(side * off > 0, np.nextafter(total, side * np.inf), total)
+    return result
 
 
 def _pointed(

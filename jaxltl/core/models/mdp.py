@@ -344,16 +344,16 @@ def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
 
 
 def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndarray:
-    available = validation.boolean_array("available", available)
-    if available.shape != shape:
-        raise ValueError(f"available has shape {available.shape}; expected {shape}.")
-    stuck = ~available.any(axis=1)
+    checked: np.ndarray = validation.boolean_array("available", available)
+    if checked.shape != shape:
+        raise ValueError(f"available has shape {checked.shape}; expected {shape}.")
+    stuck = ~checked.any(axis=1)
     if stuck.any():
         raise ValueError(
             f"state {np.flatnonzero(stuck)[0]} has no available action; give it one, "
             "for example a loop to itself."
         )
-    return available
+    return checked
 
 
 def checked_initial(
@@ -372,7 +372,8 @@ def checked_initial(
     if (small := underflows(initial, dtype)) is not None:
         s = int(np.argmax(small))
         raise ValueError(f"initial probability of state {s} {underflow_text(initial[s], dtype)}.")
-    return initial
+    result: np.ndarray = initial
+    return result
 
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:

@@ -25,7 +25,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.struct import register_annotated_pytree
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
 from jaxltl.core.models.protocols import Array, LabelledModel, SuccessorModel, World
 
 
@@ -86,7 +86,7 @@ class Product(Generic[World]):
     @property
     def num_memory(self) -> int:
         """Q, the number of automaton states."""
-        return self.automaton.delta.shape[-2]
+        return int(self.automaton.delta.shape[-2])
 
     @property
     def num_actions(self) -> int:
@@ -104,7 +104,7 @@ class Product(Generic[World]):
         return cast(SuccessorModel, self.mdp).num_successors
 
     @property
-    def successor_probability(self) -> jax.Array:
+    def successor_probability(self) -> Array:
         """``float[S, 1, A, K]``: the same in every memory state."""
         return cast(SuccessorModel, self.mdp).successor_probability[:, None]
 
@@ -119,13 +119,13 @@ class Product(Generic[World]):
         xp, available, allowed = namespace(cast(SuccessorModel, self.mdp).available, self.allowed)
         shape = (*self.state_shape, self.num_actions)
         available = xp.broadcast_to(available[:, None, :], shape)
-        return to_jax(available if allowed is None else available & allowed)
+        return jax_array(available if allowed is None else available & allowed)
 
     @property
     def next_memory(self) -> jax.Array:
         """``int32[S, Q]``: the memory state after reading the label of s in memory state q."""
         _, delta, letter = namespace(self.automaton.delta, self.letter)
-        return to_jax(delta[:, letter].T)
+        return jax_array(delta[:, letter].T)
 
     @property
     def initial_memory(self) -> jax.Array:
@@ -133,22 +133,22 @@ class Product(Generic[World]):
         automaton = self.automaton
         xp, start, delta, letter = namespace(automaton.initial, automaton.delta, self.letter)
         if self.label_on == "exit":
-            return to_jax(xp.full(letter.shape, start, np.int32))
-        return to_jax(delta[start, letter])
+            return jax_array(xp.full(letter.shape, start, np.int32))
+        return jax_array(delta[start, letter])
 
     @property
     def initial(self) -> jax.Array:
         """``float[S, Q]``, the initial distribution."""
         xp, world, memory = namespace(self.mdp.initial, self.initial_memory)
         starts = memory[:, None] == xp.arange(self.num_memory)
-        return to_jax(xp.where(starts, world[:, None], 0).astype(self.dtype))
+        return jax_array(xp.where(starts, world[:, None], 0).astype(self.dtype))
 
     @property
     def final(self) -> jax.Array:
         """``bool[S, Q]``: the final automaton states."""
         xp, automaton = namespace(self.automaton)
         final = automaton.final
-        return to_jax(xp.broadcast_to(final, self.state_shape))
+        return jax_array(xp.broadcast_to(final, self.state_shape))
 
 
 def occurring_letters(
@@ -177,7 +177,7 @@ def occurring_letters(
 
 
 @overload
-def product(
+def product(  # type: ignore[overload-overlap]  # a Game is no product's world
     world: Game, task: Automaton | Formula | str, *, label_on: str = ...
 ) -> Game[Product]: ...
 
@@ -248,7 +248,7 @@ def distinct_labels(world: LabelledModel) -> np.ndarray:
 @singledispatch
 def letters_by_state(world: LabelledModel, letter: np.ndarray) -> jax.Array:
     """``int32[S]``, the letter of each state, from that of each of the :func:`distinct_labels`."""
-    return to_jax(letter)
+    return jax_array(letter)
 
 
 def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:

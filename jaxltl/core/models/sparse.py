@@ -116,17 +116,17 @@ class SparseMDP:
     @property
     def num_states(self) -> int:
         """S."""
-        return self.row_start.shape[-1] - 1
+        return int(self.row_start.shape[-1] - 1)
 
     @property
     def num_rows(self) -> int:
         """R, the number of choices."""
-        return self.entry_start.shape[-1] - 1
+        return int(self.entry_start.shape[-1] - 1)
 
     @property
     def num_transitions(self) -> int:
         """T, the number of entries."""
-        return self.successor.shape[-1]
+        return int(self.successor.shape[-1])
 
     @property
     def is_chain(self) -> bool:
@@ -151,7 +151,8 @@ class SparseMDP:
     @property
     def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
-        return self.probability.dtype
+        result: np.dtype = np.dtype(self.probability.dtype)
+        return result
 
     @cached_property
     def host(self) -> HostMDP:
@@ -204,7 +205,8 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
     """
     reward = reward_structure(model, reward)
     if is_traced((model, reward)):
-        return _traced_reward(model, reward)
+        result: np.ndarray = _traced_reward(model, reward)
+        return result
     host = model.host
     total = np.zeros(host.num_rows)
     if reward.state is not None:
@@ -417,7 +419,8 @@ def checked_starts(name: str, start: Array, total: int, of: str) -> np.ndarray:
         raise ValueError(
             f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must ascend."
         )
-    return start.astype(np.int64)  # NumPy takes no unsigned ones for counts
+    result: np.ndarray = start.astype(np.int64)  # NumPy takes no unsigned ones for counts
+    return result
 
 
 def placed(row_start: np.ndarray, row: int, first: int = 0) -> str:
@@ -513,7 +516,8 @@ def _checked_action(action: Array, num_rows: int, names: tuple[str, ...]) -> np.
             f"actions go from {action.min()} to {action.max()}; there are "
             f"{len(names)} names, for 0 to {len(names) - 1}."
         )
-    return action.astype(np.int32)
+    result: np.ndarray = action.astype(np.int32)
+    return result
 
 
 def _canonical(
@@ -567,7 +571,8 @@ def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> 
     shape = (entry_start.size - 1, int(successor.max()) + 1)
     within = csr_array((place, successor.copy(), entry_start), shape=shape)
     within.sort_indices()
-    return within.data
+    result: np.ndarray = within.data
+    return result
 
 
 def scaled(
@@ -586,4 +591,5 @@ def scaled(
     wrong = off > (count + 2) * np.finfo(np.float64).eps
     if not wrong.any():
         return probability
-    return probability / np.repeat(np.where(wrong, total, 1), count)
+    result: np.ndarray = probability / np.repeat(np.where(wrong, total, 1), count)
+    return result

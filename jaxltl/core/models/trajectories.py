@@ -15,7 +15,7 @@ from jaxltl.core import struct, validation
 from jaxltl.core.pretty_print import batch_text, brief, count, value_range
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.struct import register_annotated_pytree
-from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
@@ -65,7 +65,7 @@ class Trajectories:
     def mask(self) -> jax.Array:
         """``bool[N, T]``, False in padding."""
         xp, length = namespace(self.length)
-        return to_jax(xp.arange(self.state.shape[-1]) < length[..., None])
+        return jax_array(xp.arange(self.state.shape[-1]) < length[..., None])
 
 
 def make_trajectories(
@@ -221,9 +221,10 @@ def rollout(
             f"{model.state_shape}; give the model that the policy was projected to."
         )
     nowhere = np.zeros(model.state_shape, bool)
-    return _rollout(
+    result: Trajectories = _rollout(
         model, policy, key, nowhere if stop is None else stop, num_trajectories, num_steps
     )
+    return result
 
 
 @partial(jax.jit, static_argnums=(4, 5))

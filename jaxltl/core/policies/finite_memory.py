@@ -135,12 +135,15 @@ class FiniteMemoryPolicy:
             )
         if not isinstance(key, np.random.Generator):
             jax = sys.modules["jax"]  # the key is its own
-            return jax.random.categorical(key, jax.numpy.log(row), axis=-1).astype(np.int32)
+            weight = jax.numpy.log(row)
+            chosen: Array = jax.random.categorical(key, weight, axis=-1).astype(np.int32)
+            return chosen
         total = np.asarray(row, np.float64).cumsum(-1)
         point = key.random(total.shape[:-1])[..., None] * total[..., -1:]
         # Rounding may give the total itself, which is the last action of positive weight.
         last = (total < total[..., -1:]).sum(-1)
-        return np.minimum((total <= point).sum(-1), last).astype(np.int32)
+        result: Array = np.minimum((total <= point).sum(-1), last).astype(np.int32)
+        return result
 
     def update(
         self, at: Progress, state: Array | int | str, label: Label | None = None

@@ -45,7 +45,8 @@ class Layout:
             raw = raw >> np.uint64(field.shift)
         raw = raw & np.uint64((1 << field.variable.bits) - 1)
         if field.variable.type == "bool":
-            return raw != 0
+            result: NDArray[Any] = raw != 0
+            return result
         found = raw.astype(np.int64)
         if field.variable.low:
             found += field.variable.low

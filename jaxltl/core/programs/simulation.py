@@ -315,7 +315,8 @@ def _outcome_marks(weights: Sequence[jax.Array], uniform: jax.Array) -> list[jax
 
 
 def _any(marks: Sequence[jax.Array]) -> jax.Array:
-    return reduce(jnp.logical_or, marks, jnp.bool_(False))
+    result: jax.Array = reduce(jnp.logical_or, marks, jnp.bool_(False))
+    return result
 
 
 def _all(marks: Sequence[jax.Array]) -> jax.Array:

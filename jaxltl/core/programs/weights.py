@@ -31,7 +31,8 @@ class Numbers:
 
     def possible(self, weight: Weight) -> NDArray[np.bool_]:
         """Marks weights that are not zero."""
-        return weight != 0
+        result: NDArray[np.bool_] = weight != 0
+        return result
 
     def ends(self, weight: Weight) -> tuple[Weight, Weight]:
         """Lower and upper ends."""
@@ -57,7 +58,8 @@ class Intervals(Numbers):
         return [np.stack(pair, 1) for pair in zip(ends[::2], ends[1::2], strict=True)]
 
     def possible(self, weight: Weight) -> NDArray[np.bool_]:
-        return weight[:, 1] != 0
+        result: NDArray[np.bool_] = weight[:, 1] != 0
+        return result
 
     def ends(self, weight: Weight) -> tuple[Weight, Weight]:
         return weight[:, 0], weight[:, 1]

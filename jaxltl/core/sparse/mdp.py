@@ -113,7 +113,8 @@ class HostMDP(HostGraph):
         if self.successor.size <= _SMALL:
             weighted = self.probability * value[self.successor]
             return np.add.reduceat(weighted, self.entry_start[:-1])
-        return self.matrix @ value
+        result: Floats = self.matrix @ value
+        return result
 
     def over_choices(self, operation: np.ufunc, quantity: np.ndarray) -> np.ndarray:
         """A reduction, such as ``np.maximum``, over the choices of each state: ``[R]`` to ``[S]``."""

@@ -93,7 +93,8 @@ class _World(NamedTuple):
 
     @property
     def num_memory(self) -> int:
-        return self.step.shape[1]
+        result: int = self.step.shape[1]
+        return result
 
     def after(self, target: Integers, source: Integers, memory: Integers) -> NDArray[np.int64]:
         """The pairs that follow when ``source`` leads to ``target``."""

@@ -52,7 +52,8 @@ class Rows:
         if region.all():
             return self.count > 0
         if self.successor.size > SCIPY_SIZE:
-            return self.matrix @ region.astype(self.matrix.dtype) > 0
+            result: Booleans = self.matrix @ region.astype(self.matrix.dtype) > 0
+            return result
         return self.reduce(np.logical_or, region[self.successor], False)
 
     def least(self, value: np.ndarray, default: float) -> np.ndarray:
@@ -83,7 +84,7 @@ class Rows:
 def concatenated_ranges(start: Integers, count: Integers) -> Integers:
     """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all ranges, concatenated."""
     end = count.cumsum()
-    found = (start - end + count).repeat(count)
+    found: Integers = (start - end + count).repeat(count)
     found += np.arange(found.size)
     return found
 
@@ -179,7 +180,8 @@ def rows_from_dense(used: Booleans) -> Rows:
 def some_action(mask: Booleans) -> Booleans:
     """Marks where a mask ``bool[..., A]`` holds for some action."""
     if mask.shape[-1] > _FEW:
-        return np.any(mask, -1, keepdims=True)[..., 0]
+        result: Booleans = np.any(mask, -1, keepdims=True)[..., 0]
+        return result
     some: Booleans = mask[..., 0].copy()
     for a in range(1, mask.shape[-1]):
         some |= mask[..., a]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, occurring_letters, product
@@ -69,7 +69,10 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
         padded = _pad_successors(pad_states(world, num_states), width)
         products.append(replace(lane, mdp=jax.tree.map(np.asarray, padded), letter=letter))
-    return to_jax(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products))
+    result: Product = to_jax(
+        jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products)
+    )
+    return result
 
 
 def _like_first(world: Model, number: int, first: MDP) -> MDP:
@@ -114,7 +117,7 @@ def pad_states(mdp: MDP, num_states: int) -> MDP:
     stays[..., 0] = 1
 
     def below(array: Array, rows: np.ndarray) -> jax.Array:
-        return to_jax(np.concatenate([np.asarray(array), rows]))
+        return jax_array(np.concatenate([np.asarray(array), rows]))
 
     return replace(
         mdp,
@@ -149,7 +152,8 @@ def as_stacked(model: Product) -> Product:
 
 def _stacked(models: Sequence[Product]) -> Product:
     xp, *models = namespace(*models)
-    return to_jax(jax.tree.map(lambda *x: xp.stack(x), *models))
+    result: Product = to_jax(jax.tree.map(lambda *x: xp.stack(x), *models))
+    return result
 
 
 def num_worlds(model: Product) -> int:
@@ -160,8 +164,10 @@ def num_worlds(model: Product) -> int:
 def unstack_product(model: Product, number: int) -> Product:
     """One product of a batch, padding included."""
     if is_traced((model, number)):
-        return jax.tree.map(lambda x: x[number], model)
-    return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
+        result: Product = jax.tree.map(lambda x: x[number], model)
+    else:
+        result = to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
+    return result
 
 
 def restrict_stacked_actions(models: Product, allowed: PyTree) -> Product:
@@ -305,7 +311,7 @@ def demonstration_counts(
                 pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
             counts = np.bincount(pair[inside], minlength=size)
         found.append(counts.reshape(shape))
-    return to_jax(np.stack(found).astype(models.dtype))
+    return jax_array(np.stack(found).astype(models.dtype))
 
 
 def stack_observations(models: Product, observation: PyTree) -> jax.Array:
@@ -321,7 +327,8 @@ def stack_observations(models: Product, observation: PyTree) -> jax.Array:
     if not np.isfinite(np.asarray(observation)).all():
         w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
         raise ValueError(f"world {w}: the observation in state {s} is not finite.")
-    return observation
+    result: jax.Array = observation
+    return result
 
 
 def training_counts(

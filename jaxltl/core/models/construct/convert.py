@@ -68,7 +68,8 @@ def to_sparse(model: Model) -> SparseMDP:
 
 def _distribution(initial: ArrayLike) -> np.ndarray:
     initial = np.asarray(initial, np.float64)
-    return initial / initial.sum()
+    result: np.ndarray = initial / initial.sum()
+    return result
 
 
 def _product(model: Product) -> SparseMDP:

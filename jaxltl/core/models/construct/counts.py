@@ -456,7 +456,8 @@ def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
     """Empirical frequencies; rows with a zero use additive smoothing by one."""
     width = np.diff(start)
     more = np.repeat(np.minimum.reduceat(count, start[:-1]) == 0, width) + count.astype(np.float64)
-    return more / np.repeat(np.add.reduceat(more, start[:-1]), width)
+    result: NDArray[np.float64] = more / np.repeat(np.add.reduceat(more, start[:-1]), width)
+    return result
 
 
 def _require_counts(counts: object) -> None:

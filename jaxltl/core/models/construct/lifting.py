@@ -121,7 +121,7 @@ def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
         np.asarray(x) for x in (trajectories.state, trajectories.action, trajectories.mask)
     )
     place = (state, memory_along(model, state)) if isinstance(model, Product) else (state,)
-    kept = inside & np.asarray(model.available)[(*place, action)]
+    kept: np.ndarray = inside & np.asarray(model.available)[(*place, action)]
     if (lost := np.flatnonzero(inside.any(1) & ~kept.any(1))).size:
         n = lost[0]
         raise ValueError(

@@ -33,7 +33,8 @@ def _deadlocks(model: SparseMDP) -> np.ndarray:
     row = host.row_start[:-1]
     entry = host.entry_start[row]
     alone = (np.diff(host.row_start) == 1) & (host.entry_start[row + 1] - entry == 1)
-    return alone & (host.successor[entry] == np.arange(host.num_states))
+    result: np.ndarray = alone & (host.successor[entry] == np.arange(host.num_states))
+    return result
 
 
 def states_satisfying(

@@ -36,7 +36,8 @@ def over_cores(function: Callable[..., Result], *arguments: PyTree) -> Result:
     The function is pure and closes over no traced array. Rounding is that of ``vmap`` of the lanes
     of one core.
     """
-    return _call(function, None, jax.tree.map(jnp.asarray, arguments))
+    result: Result = _call(function, None, jax.tree.map(jnp.asarray, arguments))
+    return result
 
 
 def num_cores() -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core import validation
 from jaxltl.core.array_types import PyTree
 
@@ -256,7 +257,7 @@ def _number(lanes: tuple[bool, ...], arguments: PyTree) -> int:
             "number of lanes, at least 1, along the first axis of each, and in_axes of None for "
             "what all lanes share."
         )
-    return numbers[0][0]
+    return int(numbers[0][0])
 
 
 def _placed(
@@ -286,9 +287,10 @@ def _placed(
 def _from_each(x: PyTree, sharding: NamedSharding) -> jax.Array:
     """An array over the devices of several processes, from each process's part."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(
+        result: jax.Array = jax.random.wrap_key_data(
             _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
         )
+        return result
     numbers = np.asarray(x)
     return jax.make_array_from_callback(numbers.shape, sharding, lambda part: numbers[part])
 
@@ -301,14 +303,16 @@ def _copied(x: jax.Array, mesh: Mesh) -> jax.Array:
 def _constrained(x: jax.Array, mesh: Mesh | AbstractMesh, spec: PartitionSpec) -> jax.Array:
     sharding = NamedSharding(mesh, spec)
     if AxisType.Explicit in mesh.axis_types:
-        return jax.sharding.reshard(x, sharding)
-    return lax.with_sharding_constraint(x, sharding)
+        result: jax.Array = jax.sharding.reshard(x, sharding)
+    else:
+        result = lax.with_sharding_constraint(x, sharding)
+    return result
 
 
 # --- lanes ----------------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("function", "mesh", "axes", "lanes", "options"))
+@jit("function", "mesh", "axes", "lanes", "options")
 def _mapped(
     function: Callable[..., PyTree],
     mesh: Mesh,

@@ -37,7 +37,7 @@ class StateLayout(NamedTuple):
 
     @property
     def parts(self) -> int:
-        return self.mesh.shape[self.axis]
+        return int(self.mesh.shape[self.axis])
 
     @property
     def sharding(self) -> NamedSharding:
@@ -50,7 +50,7 @@ class StateLayout(NamedTuple):
 
     def owner(self, d: int) -> int:
         """The process that sends a range's data."""
-        return min(device.process_index for device in self.devices(d))
+        return int(min(device.process_index for device in self.devices(d)))
 
     @property
     def mine(self) -> list[int]:

@@ -431,7 +431,8 @@ class _Halo(NamedTuple):
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
         owner, found = self.layout.place(successor)
         if self.asked is None:
-            return (owner * self.layout.size + found).astype(np.int32)
+            result: np.ndarray = (owner * self.layout.size + found).astype(np.int32)
+            return result
         for e in np.unique(owner[owner != d]):
             here = owner == e
             of_e = _within(self.asked[d], *self.layout.span(int(e)))

@@ -107,12 +107,13 @@ class ShardedMDP:
     @property
     def num_successors(self) -> int:
         """The largest number of successors of a choice."""
-        return max(table.successor.shape[1] for table in self.tables)
+        return int(max(table.successor.shape[1] for table in self.tables))
 
     @property
     def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
-        return self.tables[0].probability.dtype
+        result: np.dtype = np.dtype(self.tables[0].probability.dtype)
+        return result
 
     @property
     def label(self) -> jax.Array:
@@ -122,7 +123,7 @@ class ShardedMDP:
     @property
     def num_devices(self) -> int:
         """D."""
-        return self.mesh.shape[self.axis]
+        return int(self.mesh.shape[self.axis])
 
     @property
     def sharding(self) -> NamedSharding:
@@ -162,7 +163,8 @@ def over_devices(model: ShardedMDP, function: Callable[..., PyTree], *arguments:
 def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> jax.Array:
     """On a device: its own values and the received ones, by local place."""
     if model.rounds is None:
-        return lax.all_gather(value, model.axis, tiled=True)
+        result: jax.Array = lax.all_gather(value, model.axis, tiled=True)
+        return result
     parts = [value]
     for index, pairs in zip(sent, model.rounds, strict=True):
         parts.append(lax.ppermute(kernels.gather(value, index), model.axis, pairs))
@@ -186,9 +188,10 @@ def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.
         found = jnp.concatenate([_rows(table, seen, term, combine) for table in tables])
         return jnp.moveaxis(kernels.gather(found, place), 1, -1)
 
-    return over_devices(
+    result: jax.Array = over_devices(
         model, one, model.tables, model.place, model.sent, model.available, jnp.asarray(value)
     )
+    return result
 
 
 def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
@@ -231,7 +234,8 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
             every = lax.all_to_all(
                 seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False
             )
-            return every.max(axis=0)
+            result: jax.Array = every.max(axis=0)
+            return result
         found, first = seen[:size], size
         for index, pairs in zip(sent, model.rounds, strict=True):
             back = [(target, source) for source, target in pairs]
@@ -243,7 +247,8 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
     available, missing = model.available, quantity.ndim - model.available.ndim
     available = available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
     quantity = jnp.where(available, quantity, 0)
-    return over_devices(model, one, model.tables, model.place, model.sent, quantity)
+    result: jax.Array = over_devices(model, one, model.tables, model.place, model.sent, quantity)
+    return result
 
 
 @distinct_labels.register
@@ -253,7 +258,8 @@ def _(world: ShardedMDP) -> np.ndarray:
 
 @letters_by_state.register
 def _(world: ShardedMDP, letter: np.ndarray) -> jax.Array:
-    return _looked_up(world.kind, letter)
+    result: jax.Array = _looked_up(world.kind, letter)
+    return result
 
 
 _looked_up = jax.jit(lambda kind, letter: kernels.gather(letter, kind))

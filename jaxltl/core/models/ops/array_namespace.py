@@ -1,10 +1,12 @@
-"""NumPy or jax.numpy, by the kind of the arrays.
+"""NumPy or jax.numpy, by the kind of the arrays; conversion to JAX, and typed compilation.
 
 Operations of ``jax.numpy`` outside of ``jit`` compile a program for each shape; NumPy does not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core.array_types import PyTree
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., PyTree])
 
 
 def is_traced(tree: PyTree) -> bool:
@@ -30,9 +34,19 @@ def namespace(*trees: PyTree) -> tuple[PyTree, ...]:
 
 def to_jax(tree: PyTree) -> PyTree:
     """A tree with JAX arrays, without compilation."""
+    return jax.tree.map(jax_array, tree)
 
-    def one(x: ArrayLike) -> jax.Array:
-        # device_put may share memory with its argument, hence the copy.
-        return x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
 
-    return jax.tree.map(one, tree)
+def jax_array(array: ArrayLike) -> jax.Array:
+    """A JAX array, without compilation."""
+    # device_put may share memory with its argument, hence the copy.
+    return array if isinstance(array, jax.Array) else jax.device_put(np.array(array))
+
+
+def jit(*static: str) -> Callable[[FunctionT], FunctionT]:
+    """Decorator: ``jax.jit`` with static arguments by name, which keeps the function's type."""
+
+    def compiled(function: FunctionT) -> FunctionT:
+        return cast(FunctionT, jax.jit(function, static_argnames=static))
+
+    return compiled

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.ops.choices import action_argmax, action_mean
 from jaxltl.core.models.ops.operators import combined
@@ -52,7 +53,7 @@ def words(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return lax.real(x), lax.imag(x)
 
 
-@jax.jit
+@jit()
 def plus(x: jax.Array, y: jax.Array) -> jax.Array:
     """Sum with a relative error of at most ``4 u^2`` for the unit roundoff u."""
     # AccurateDWPlusDW of Joldes, Muller and Popescu (2017, theorem 3.1): 3 u^2 / (1 - 4 u).
@@ -68,7 +69,7 @@ def minus(x: jax.Array, y: jax.Array) -> jax.Array:
     return lax.real(plus(x, -y))
 
 
-@jax.jit
+@jit()
 def times(w: jax.Array, x: jax.Array) -> jax.Array:
     """Product of a float and a double word, with a relative error of at most ``64 u^2``."""
     # With 12 of 24 bits in either half, products of halves are exact, and the three of them that
@@ -81,7 +82,7 @@ def times(w: jax.Array, x: jax.Array) -> jax.Array:
     return lax.complex(*_fast_sum(total, (rest + more) + (b * d + w * low)))
 
 
-@jax.jit
+@jit()
 def product(x: jax.Array, y: jax.Array) -> jax.Array:
     """Product of two double words, with a relative error of at most ``80 u^2``."""
     high, low = words(x)
@@ -89,7 +90,7 @@ def product(x: jax.Array, y: jax.Array) -> jax.Array:
     return lax.complex(*_fast_sum(total, rest + low * lax.real(y)))
 
 
-@jax.jit
+@jit()
 def reciprocal(x: jax.Array) -> jax.Array:
     """``1 / x`` with a relative error of at most ``128 u^2``, 0 where x is 0."""
     # One step of Newton's method squares the relative error u of the first guess.

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.array_types import Array
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, is_traced
 from jaxltl.core.models.ops.underflow import is_positive
 
 # Transitions of a state up to which sums over them are unrolled, so that XLA fuses them into one
@@ -104,7 +104,8 @@ def folded(
 
 def tree(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
     """Reduction along an axis by an operation with the neutral element 0."""
-    return lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
+    result: jax.Array = lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
+    return result
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:
@@ -135,7 +136,7 @@ def segment_ids(start: Array, total: int) -> jax.Array:
     """The segment of each position, ``int32[total]``, from the starts of nonempty segments."""
     count = start.shape[-1] - 1
     if not is_traced(start):
-        return to_jax(np.repeat(np.arange(count, dtype=np.int32), np.diff(np.asarray(start))))
+        return jax_array(np.repeat(np.arange(count, dtype=np.int32), np.diff(np.asarray(start))))
     # Segments are nonempty, so that each start begins one.
     begins = (
         jnp.zeros(total, jnp.int32)

@@ -177,7 +177,7 @@ def pushforward(model: Model, mass: jax.Array) -> jax.Array:
       [0.5, 2.5]
     """
     value = jax.ShapeDtypeStruct(model.state_shape, mass.dtype)
-    (result,) = jax.linear_transpose(lambda v: expectation(model, v), value)(mass)
+    result: jax.Array = jax.linear_transpose(lambda v: expectation(model, v), value)(mass)[0]
     return result
 
 
@@ -211,7 +211,8 @@ def is_representable(model: Model) -> jax.Array:
 
 @singledispatch
 def _representable(model: Model) -> jax.Array:
-    return jnp.bool_(True)
+    result: jax.Array = jnp.bool_(True)
+    return result
 
 
 @_representable.register(MDP)
@@ -409,7 +410,8 @@ def policy_distribution(model: Model, policy: Array) -> jax.Array:
             f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
             f"model has shape {pairs}."
         )
-    return policy
+    result: jax.Array = policy
+    return result
 
 
 class Policy(NamedTuple):
@@ -506,7 +508,8 @@ def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndar
         row = int(np.argmax(small))
         text = underflow_text(policy[row], policy.dtype)
         raise ValueError(f"the policy's weight of choice {row} {text}.")
-    return weight
+    result: np.ndarray = weight
+    return result
 
 
 def require_weights(

@@ -101,9 +101,10 @@ class ShardedSuccessorTable:
             pairs = zip(successor, probability, strict=True)
             return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
 
-        return over_devices(
+        result: list[jax.Array] = over_devices(
             self.model, one, self.successor, self.probability, self.model.sent, value
         )
+        return result
 
 
 @brief

@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core.pretty_print import brief, names_text, nested_repr
-from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 
@@ -194,9 +194,9 @@ def _check_shapes(
             raise ValueError(f"{name} of numbers have shape {shape}; expected {expected}.")
 
 
-@jax.jit
-def _evaluate(numbers: Callable[[jax.Array], PyTree], x: jax.Array) -> PyTree:
-    return numbers(x)
+@jit()
+def _evaluate(numbers: Callable[[jax.Array], PyTree], x: jax.Array | np.ndarray) -> PyTree:
+    return numbers(jnp.asarray(x))
 
 
 def _evaluated(

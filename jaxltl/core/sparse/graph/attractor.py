@@ -101,7 +101,7 @@ class _Search(NamedTuple):
             row = np.flatnonzero(mark & self.waiting)
         self.waiting[row] = False
         row = row[self.open[self.graph.state[row]]]
-        state = self.graph.state[row]
+        state: Integers = self.graph.state[row]
         all_rows = ~self.rule[state]
         decrement(self.left, state[all_rows])
         joins = ~all_rows | (self.left[state] == 0)

@@ -27,7 +27,8 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
     node = np.arange(num_nodes)
     smallest = np.zeros(num_nodes, np.int64)
     smallest[label[::-1]] = node[::-1]  # of the nodes with one label the first is written last
-    return smallest[label]
+    result: Integers = smallest[label]
+    return result
 
 
 def forward_reachable(source: Integers, target: Integers, start: Booleans) -> Booleans:

@@ -186,7 +186,8 @@ def elimination_order(
         if ((size > _SMALL) & ((mean * _SPREAD > size) | fills)).any():
             return None
     # An edge between components fills the one that is eliminated first.
-    return order[::-1] if out_of < into else order
+    result: Integers | None = order[::-1] if out_of < into else order
+    return result
 
 
 def _block(

@@ -211,7 +211,7 @@ class _Search:
     def images(self, i: int, value: Values) -> Values:
         """``c + P y`` of a block's rows; the worst for rows that are not allowed."""
         part, blocks = self.parts[i], self.problem.blocks
-        image = (blocks.single if value.dtype == np.float32 else blocks.double)[i] @ value
+        image: Values = (blocks.single if value.dtype == np.float32 else blocks.double)[i] @ value
         if part.cost is not None:
             image += part.cost
         if part.barred is not None:

@@ -54,6 +54,7 @@ def gth_solver(matrix: SparseMatrix, leaving: Floats) -> Solver | None:
             x[first[k] : k] += band[first[k] : k, k] * x[k]
         for k in range(size):
             x[k] = (x[k] + band[k, first[k] : k] @ x[first[k] : k]) / total[k]
-        return x[place]
+        result: Floats = x[place]
+        return result
 
     return solve

@@ -42,7 +42,8 @@ class OptimalityEquation:
 
     def backup(self, value: Floats) -> Floats:
         """``c + P x`` of each row."""
-        return self.cost + self.matrix @ value
+        result: Floats = self.cost + self.matrix @ value
+        return result
 
     def best(self, image: Floats) -> Floats:
         """The optimum over the rows of each unknown."""

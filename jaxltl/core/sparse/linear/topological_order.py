@@ -65,7 +65,8 @@ def ordered_components(edges: Edges) -> Integers:
     _, label = csgraph.connected_components(graph, connection="strong")
     source = np.repeat(np.arange(size), np.diff(graph.indptr))
     if (label[source] >= label[graph.indices]).all():
-        return label
+        result: Integers = label
+        return result
     return _sorted(label, label[source], label[graph.indices])
 
 

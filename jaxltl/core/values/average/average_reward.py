@@ -17,7 +17,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import pad_rows
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.mesh.sharded import refuse_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.operators import induced_chain
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
@@ -206,7 +206,7 @@ def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
     return _Graph(np.stack(columns, -1), weight, available, system), scale
 
 
-@jax.jit
+@jit()
 def _only_successor(game: Game, action: int) -> jax.Array:
     chain = induced_chain(game, jnp.full(game.state_shape, action, jnp.int32))
     slot = chain.successor_probability[:, 0].argmax(-1)
@@ -331,7 +331,7 @@ def _on_cycles(successor: Integers, used: Booleans) -> Booleans:
     target = successor[used]
     edges = sparse.coo_array((np.ones(len(source), bool), (source, target)), 2 * (len(used),))
     count, part = sparse.csgraph.connected_components(edges, connection="strong")
-    large = np.bincount(part, minlength=count)[part] > 1
+    large: Booleans = np.bincount(part, minlength=count)[part] > 1
     large[source[source == target]] = True
     return large
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core import validation
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
@@ -116,7 +117,7 @@ def boltzmann_value(
     )
 
 
-@partial(jax.jit, static_argnames=("options",))
+@jit("options")
 def _boltzmann_value(
     model: Model,
     reward: jax.Array,

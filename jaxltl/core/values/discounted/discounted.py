@@ -24,7 +24,7 @@ from jaxltl.core.values.interval.robust import refuse_nature, robust_discounted_
 from jaxltl.core import validation
 from jaxltl.core.models.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP
@@ -172,7 +172,8 @@ def solution_of(
         num_steps=num_steps,
         status=status_code(found.converged, found.finite, found.exhausted),
     )
-    return jax.tree.map(lax.stop_gradient, solution)
+    result: Solution = jax.tree.map(lax.stop_gradient, solution)
+    return result
 
 
 def differentiable(
@@ -249,7 +250,7 @@ def policy_value(
     )
 
 
-@jax.jit
+@jit()
 def _policy_value(
     model: PyTree, policy: Array, reward: Array, discount: Words, tolerance: Array, max_steps: Array
 ) -> Solution:
@@ -360,7 +361,7 @@ def optimal_value(
     )
 
 
-@partial(jax.jit, static_argnames=("method",))
+@jit("method")
 def _optimal_value(
     model: ActionModel,
     reward: jax.Array,
@@ -423,7 +424,8 @@ def _refined(
     found, action = in_turn(_newton_steps, model, reward, given, solution, policy)
     found = replace(found, policy=action if policy is None else solution.policy)
     ended = (solution.status <= Status.PRECISION) & jnp.isfinite(found.lower).all()
-    return jax.tree.map(partial(jnp.where, ended), found, solution)
+    result: Solution = jax.tree.map(partial(jnp.where, ended), found, solution)
+    return result
 
 
 # The last value with its image, greedy actions and residual; those of the least residual; steps.

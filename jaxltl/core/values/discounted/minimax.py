@@ -8,7 +8,6 @@ sparse model quantities on actions are ``[R]``, and an action is a row.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple, Unpack
 
 import chex
@@ -23,7 +22,7 @@ from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.game import Game, as_game
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jit, namespace, to_jax
 from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices
 from jaxltl.core.models.ops.operators import (
     Policy,
@@ -228,7 +227,7 @@ class _Problem(NamedTuple):
     discount: chex.Numeric
 
 
-@jax.jit
+@jit()
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
     """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
@@ -380,7 +379,7 @@ def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, 
 _FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far from the value
 
 
-@partial(jax.jit, static_argnames=("per", "method"))
+@jit("per", "method")
 def _solve(
     problem: _Problem,
     tolerance: chex.Numeric | None,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled import compiled_form, flatten_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
@@ -62,7 +63,7 @@ def occupancy_measure(
     return _occupancy(form, policy, discount, start, tolerance)
 
 
-@jax.jit
+@jit()
 def _occupancy(
     model: PyTree, policy: Array, discount: Array, start: Array, tolerance: Array | None
 ) -> Solution:
@@ -74,7 +75,8 @@ def _occupancy(
     start = jnp.broadcast_to(start, shape) if start.ndim < 2 else start.reshape(shape)
 
     def flow(d: jax.Array) -> jax.Array:
-        return start + discount * pushforward(model, over.spread(d) * policy)
+        result: jax.Array = start + discount * pushforward(model, over.spread(d) * policy)
+        return result
 
     system = System(sweep_operator(model), over.columns(policy), discount)
     linear = solver(system)

@@ -6,12 +6,12 @@ from typing import Unpack
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core import validation
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
@@ -77,7 +77,7 @@ def soft_value(
     )
 
 
-@partial(jax.jit, static_argnames=("method",))
+@jit("method")
 def _soft_value(
     model: Model,
     reward: jax.Array,
@@ -172,7 +172,8 @@ def soft_policy_adjoint(
     def push(before: PyTree, discount: jax.Array, mass: PyTree) -> jax.Array:
         """The discounted flow ``[N]`` of masses ``[N]`` of the actions."""
         if before is not None:
-            return discount * before.pushforward(jnp.concatenate(mass))
+            result: jax.Array = discount * before.pushforward(jnp.concatenate(mass))
+            return result
         return discount * pushforward(model, over.whole(mass)).ravel()
 
     def step(before: PyTree, carry: PyTree, given: PyTree) -> PyTree:
@@ -182,7 +183,8 @@ def soft_policy_adjoint(
         )
 
     def finished(carry: PyTree, given: PyTree) -> jax.Array:
-        return jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
+        result: jax.Array = jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
+        return result
 
     b = push(predecessors, discount, over.columns(g))
     target = float(jnp.finfo(b.dtype).eps) ** 0.8 * jnp.sum(jnp.abs(b), 0)

@@ -56,7 +56,10 @@ def span_iteration(
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
     discount, enough = (jnp.asarray(x, dtype) for x in (models.discount, models.enough))
     active = jnp.asarray(models.active)
-    return _iterate(graph, models._replace(discount=discount, enough=enough, active=active))
+    result: tuple[jax.Array, jax.Array, jax.Array] = _iterate(
+        graph, models._replace(discount=discount, enough=enough, active=active)
+    )
+    return result
 
 
 class _Sweeps(NamedTuple):
@@ -117,9 +120,10 @@ def _last_lanes(graph: _Graph, models: Models, found: _Sweeps, few: int) -> _Swe
     narrow = narrow._replace(active=jnp.arange(few) <= place[-1])
     last = _swept(graph, narrow, rest)
     place = jnp.maximum(place, 0)
-    return jax.tree.map(
+    result: _Sweeps = jax.tree.map(
         lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found
     )
+    return result
 
 
 def _beside(models: Models, x: jax.Array) -> jax.Array:

@@ -30,7 +30,7 @@ class Blocks:
     @property
     def size(self) -> int:
         """Number of places."""
-        return self.target.shape[0] * self.target.shape[3]
+        return int(self.target.shape[0] * self.target.shape[3])
 
     @property
     def last(self) -> int:

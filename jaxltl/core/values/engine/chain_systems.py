@@ -84,8 +84,9 @@ class ChainSystem(NamedTuple):
             eye = jnp.eye(b.size, dtype=b.dtype).reshape(b.size, *b.shape)
             matrix = lax.map(matvec, eye, batch_size=min(b.size, 32)).reshape(b.size, b.size).T
             inverted, right = in_turn(inverse, matrix), b.ravel()
-            x = inverted @ right
-            return (x + inverted @ (right - matrix @ x)).reshape(b.shape)
+            x: jax.Array = inverted @ right
+            x += inverted @ (right - matrix @ x)
+            return x.reshape(b.shape)
         result = jax.ShapeDtypeStruct(b.shape, b.dtype)
         x = host_callback(_eliminated(transposed), result, self, b)
         return _unless(jnp.all(jnp.isfinite(x)), x, lambda: krylov_refined(matvec, b))

@@ -159,7 +159,8 @@ def _weights(model: ActionModel, sparse: SparseMDP, policy: np.ndarray) -> np.nd
             f"or {actions} of their probabilities."
         )
     flat = policy.reshape(sparse.num_states, -1)
-    return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
+    result: np.ndarray = flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
+    return result
 
 
 def with_given_policy(solution: Solution, policy: Array) -> Solution:

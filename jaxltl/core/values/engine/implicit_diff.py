@@ -54,19 +54,21 @@ def implicit(
         return _traced_when_differentiated(operator, lax.stop_gradient(fixed_point), system)
 
     def solve_tangent(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return lax.custom_linear_solve(
+        result: jax.Array = lax.custom_linear_solve(
             jacobian,
             b,
             solve=lambda _, b: solve(b),
             transpose_solve=lambda _, b: transpose_solve(b),
         )
+        return result
 
-    return lax.custom_root(
+    result: jax.Array = lax.custom_root(
         lambda v: v - operator(v),
         lax.stop_gradient(fixed_point),
         solve=lambda _, start: start,
         tangent_solve=solve_tangent,
     )
+    return result
 
 
 def _traced_when_differentiated(
@@ -77,7 +79,8 @@ def _traced_when_differentiated(
     closed = jax.make_jaxpr(operator)(fixed_point)
 
     def image(constants: list[jax.Array], v: jax.Array) -> jax.Array:
-        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(v)[0]
+        result: jax.Array = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(v)[0]
+        return result
 
     @jax.custom_jvp
     def root(constants: list[jax.Array], system: LinearSystem, v: jax.Array) -> jax.Array:

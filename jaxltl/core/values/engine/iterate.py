@@ -70,7 +70,8 @@ def in_turn(function: Callable[..., Result], *arguments: object) -> Result:
     # trees of arrays and closes over no batched array.
 
     one = jax.custom_batching.sequential_vmap(lambda arguments: function(*arguments))
-    return one(lax.stop_gradient(jax.tree.map(jnp.asarray, arguments)))
+    result: Result = one(lax.stop_gradient(jax.tree.map(jnp.asarray, arguments)))
+    return result
 
 
 def side_by_side(function: Callable[..., Result], table: Table, *arguments: object) -> Result:
@@ -104,7 +105,8 @@ def side_by_side(function: Callable[..., Result], table: Table, *arguments: obje
         return found, jax.tree.map(lambda _: True, found)
 
     table, arguments = lax.stop_gradient((table, arguments))
-    return one(table, jax.tree.map(jnp.asarray, arguments))
+    result: Result = one(table, jax.tree.map(jnp.asarray, arguments))
+    return result
 
 
 def fill_row(x: jax.Array) -> jax.Array:

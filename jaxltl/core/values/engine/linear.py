@@ -63,7 +63,8 @@ class System(NamedTuple):
         """Its transpose applied to ``[N]``."""
         shape = jax.ShapeDtypeStruct(y.shape, y.dtype)
         (back,) = jax.linear_transpose(self.onward, shape)(y)
-        return y - back
+        result: jax.Array = y - back
+        return result
 
     def matrix(self) -> jax.Array:
         """The system as ``float[N, N]``."""
@@ -200,7 +201,8 @@ def inverse(matrix: jax.Array) -> jax.Array:
         rows = lax.dynamic_update_slice(rows, pivot, (0, start))
         return lax.dynamic_update_slice(a, rows, (start, 0))
 
-    return lax.fori_loop(0, padded // block, step, work)[:n, :n]
+    result: jax.Array = lax.fori_loop(0, padded // block, step, work)[:n, :n]
+    return result
 
 
 def _small_inverse(matrix: jax.Array) -> jax.Array:
@@ -210,7 +212,8 @@ def _small_inverse(matrix: jax.Array) -> jax.Array:
         x = (x - column[:, None] * row).at[:, k].set(-column / pivot)
         return x.at[k].set(row)
 
-    return lax.fori_loop(0, matrix.shape[0], step, matrix)
+    result: jax.Array = lax.fori_loop(0, matrix.shape[0], step, matrix)
+    return result
 
 
 # --- large systems ---------------------------------------------------------------------------
@@ -451,7 +454,8 @@ def krylov_refined(matvec: Operator, b: jax.Array) -> jax.Array:
 
     def unfinished(carry: PyTree) -> jax.Array:
         _, _, size, n = carry
-        return (size > goal) & (n < _KRYLOV_REFINEMENTS)
+        result: jax.Array = (size > goal) & (n < _KRYLOV_REFINEMENTS)
+        return result
 
     start = jnp.zeros_like(b), b, norm(b.ravel()), jnp.int32(0)
     return lax.while_loop(unfinished, body, start)[0]

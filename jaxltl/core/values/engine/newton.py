@@ -106,7 +106,8 @@ def solve(
             branches += [partial(_direct, table, given)]
         if len(branches) == 1:
             return branches[0](k, ahead)
-        return lax.switch(k.phase, branches, k, ahead)
+        result: _Search = lax.switch(k.phase, branches, k, ahead)
+        return result
 
     zero = jnp.zeros_like(value)
     weight: Quantity = over.spread(zero, backup.reward)

@@ -61,7 +61,8 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
                 valid = RANGES[name]
                 place = options if name in options else bound.arguments
                 place[name] = jnp.where(valid.contains(value), value, valid.low)
-            return invalidated(solve(*bound.args, **bound.kwargs), argument_status(traced))
+            result: R = invalidated(solve(*bound.args, **bound.kwargs), argument_status(traced))
+            return result
 
         return wrapper
 
@@ -83,7 +84,7 @@ def traced_arguments(arguments: Mapping[str, PyTree]) -> dict[str, jax.Array]:
 
 def argument_status(arguments: Mapping[str, ArrayLike]) -> jax.Array:
     """Status code of scalar arguments: CONVERGED, or the reason why one is out of range."""
-    status = jnp.int32(Status.CONVERGED)
+    status: jax.Array = jnp.int32(Status.CONVERGED)
     for name, value in arguments.items():
         reason = Status.INVALID_DISCOUNT if name == "discount" else Status.INVALID_OPTION
         invalid = jnp.where(RANGES[name].contains(value), Status.CONVERGED, reason)

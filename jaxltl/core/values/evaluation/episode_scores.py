@@ -149,4 +149,5 @@ def _of_one(score: Score, totals: EpisodeTotals) -> jax.Array:
         return jnp.asarray(totals.verdict == _VERDICTS[score])
     if score == "failure":
         return jnp.asarray(totals.verdict != Verdict.SATISFIED)
-    return getattr(totals, score)
+    result: jax.Array = getattr(totals, score)
+    return result

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import NamedSharding
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Environment,
@@ -64,7 +65,8 @@ def episode_totals(
 
     def going(carry: PyTree) -> jax.Array:
         now, time, *_ = carry
-        return (time < num_steps) & ~(now.terminated | now.truncated)
+        result: jax.Array = (time < num_steps) & ~(now.terminated | now.truncated)
+        return result
 
     def move(carry: PyTree) -> PyTree:
         now, time, paid, kept, sums = carry
@@ -221,7 +223,7 @@ def evaluate(
     return evaluation_of(totals, num_steps, confidence, threshold, discount, decision)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "batch"))
+@jit("num_steps", "batch")
 def _batch(
     key: chex.PRNGKey,
     players: tuple[Environment, Agent],
@@ -237,7 +239,10 @@ def _batch(
         return episode_totals(key, *players, num_steps=num_steps, discount=discount)
 
     keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch.size))
-    return vmap_split(one, batch.sharding, (0, None, None))(keys, players, discount)
+    result: EpisodeTotals = vmap_split(one, batch.sharding, (0, None, None))(
+        keys, players, discount
+    )
+    return result
 
 
 def _decided(success: int, count: int, threshold: float, failure: float) -> bool | None:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
@@ -137,10 +138,11 @@ def tabulate_policy(
     return np.concatenate(parts)
 
 
-@jax.jit
+@jit()
 def _acts(policy: PyTree, environment: Environment, memory: jax.Array, worlds: PyTree) -> jax.Array:
     def one(world: PyTree) -> jax.Array:
-        return jax.vmap(partial(policy, environment.observe(world)))(memory)
+        result: jax.Array = jax.vmap(partial(policy, environment.observe(world)))(memory)
+        return result
 
     return jax.vmap(one)(worlds)
 
@@ -320,8 +322,10 @@ def _mass(
 ) -> np.ndarray:
     """Weights of rows under the agent."""
     if is_deterministic(policy):
-        return (policy[state, memory] == action).astype(np.float64)
-    return policy[state, memory, action].astype(np.float64)
+        weight: np.ndarray = policy[state, memory] == action
+    else:
+        weight = policy[state, memory, action]
+    return weight.astype(np.float64)
 
 
 def _weights(
@@ -341,7 +345,8 @@ def _weights(
         mdp.over_choices(np.minimum, weight),
         lambda at: (int(base[at[0]]), int(memory[at[0]])),
     )
-    return weight / total[mdp.state]
+    result: np.ndarray = weight / total[mdp.state]
+    return result
 
 
 def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[int, int]]) -> None:

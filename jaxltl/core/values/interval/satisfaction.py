@@ -130,7 +130,8 @@ def robust_product_satisfaction(
     found = _solved(sides, host, verdicts, asked)
     if policy is not None:
         solution = solution_at(found, product.start, shape, np.asarray(policy), asked)
-        return solution.replace(nature=None)  # type: ignore[attr-defined]
+        result: Solution = solution.replace(nature=None)  # type: ignore[attr-defined]
+        return result
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     found = replace(found, probability=found.probability[: product.host.num_transitions])
     return solution_at(found, product.start, shape, policy, asked)

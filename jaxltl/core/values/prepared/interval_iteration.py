@@ -66,7 +66,7 @@ class State(NamedTuple):
 
 
 def enclose_cycles(
-    problem: Problem, low: jax.Array, high: jax.Array, max_steps: jax.Array
+    problem: Problem, low: jax.Array, high: jax.Array, max_steps: jax.Array | int
 ) -> State:
     """Encloses the values of the cyclic blocks."""
     none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
@@ -277,7 +277,10 @@ def _swept(
     """Greedy rows after some sweeps, which propagate improvements."""
     x = outer.at[problem.span].set(value)
     going: Sweep = partial(sweep, problem.core, rounding=(1.0, shift), **problem.given)
-    return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
+    result: jax.Array = lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[
+        1
+    ]
+    return result
 
 
 def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:

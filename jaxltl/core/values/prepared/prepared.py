@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from numpy.typing import ArrayLike
 from jax import lax
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core import validation
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
@@ -130,14 +131,14 @@ def _given_numbers(
     return p, r
 
 
-@jax.jit
+@jit()
 def _solve(
     prepared: Prepared,
     probability: _Maybe,
     reward: _Maybe,
     policy: _Maybe,
-    tolerance: jax.Array,
-    max_steps: jax.Array,
+    tolerance: jax.Array | float,
+    max_steps: jax.Array | int,
 ) -> Solution:
     tolerance = jnp.asarray(tolerance, prepared.probability.dtype)
     share, taken = _shares(prepared, policy)
@@ -294,7 +295,7 @@ def _rounding(prepared: Prepared) -> tuple[float, float]:
 
 
 def _enclosed(
-    prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: jax.Array
+    prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: jax.Array | int
 ) -> _Found:
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
@@ -320,7 +321,7 @@ def _solve_cyclic(
     start: jax.Array,
     given: dict[str, PyTree],
     tolerance: jax.Array,
-    max_steps: jax.Array,
+    max_steps: jax.Array | int,
 ) -> _Found:
     """Bounds from both sides where the system has cycles."""
     unit, least = _rounding(prepared)
@@ -496,7 +497,7 @@ def evaluate_prepared(
     return _evaluate(prepared, *_given_numbers(prepared, probability, reward))
 
 
-@jax.jit
+@jit()
 def _evaluate(
     prepared: Prepared, probability: _Maybe, reward: _Maybe
 ) -> tuple[jax.Array, jax.Array]:

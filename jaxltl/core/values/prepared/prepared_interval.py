@@ -13,7 +13,7 @@ from jaxltl.core import struct, validation
 from jax import lax
 
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.pretty_print import array_text, brief, count
 from jaxltl.core.sparse.interval.robust_values import Query
@@ -110,12 +110,12 @@ class PreparedInterval:
     @property
     def num_states(self) -> int:
         """S, of the model."""
-        return self.node.shape[-1]
+        return int(self.node.shape[-1])
 
     @property
     def size(self) -> int:
         """The number N of nodes."""
-        return self.first.shape[-1]
+        return int(self.first.shape[-1])
 
     def sum_rows(self, quantity: jax.Array) -> jax.Array:
         """Sums over the entries of each row, ``[R]`` from ``[T]``."""
@@ -223,7 +223,8 @@ def _prepared(
         num_rows=whole.num_rows,
         has_free_cycles=plan.has_free_cycles,
     )
-    return to_jax(found)
+    result: PreparedInterval = to_jax(found)
+    return result
 
 
 def require_prepared_reward(prepared: jax.Array | None, reward: jax.Array | None) -> None:
@@ -269,7 +270,7 @@ def solve_prepared_interval(
     return _solve(prepared, lower, upper, reward, tolerance, max_steps)
 
 
-@jax.jit
+@jit()
 def _solve(
     prepared: PreparedInterval,
     lower: Array,

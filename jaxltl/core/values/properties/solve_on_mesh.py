@@ -87,8 +87,10 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
 
         def advance(start: Bounds, half: float, steps: int) -> Solution:
             if reward is None:
-                return _reach_for(model, target, start, half, np.int32(steps), objective)
-            return _earn_until(model, reward, target, 2 * half, objective)
+                found: Solution = _reach_for(model, target, start, half, np.int32(steps), objective)
+            else:
+                found = _earn_until(model, reward, target, 2 * half, objective)
+            return found
 
         return Question(
             prop,
@@ -126,7 +128,8 @@ def _path(prop: Property) -> Formula:
 def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
     """On choices, ``float[N, A]``; where none is named the only one."""
     if prop.operator == "T":
-        return jax.jit(lambda x: jnp.ones(x.shape, model.dtype))(model.available)
+        result: jax.Array = jax.jit(lambda x: jnp.ones(x.shape, model.dtype))(model.available)
+        return result
     names = [prop.reward] if prop.reward is not None else list(model.rewards)
     if len(names) != 1 or names[0] not in model.rewards:
         asked = "" if prop.reward is None else f" {prop.reward!r}"
@@ -144,7 +147,8 @@ def first_bounds(model: ShardedMDP, question: Question) -> Bounds:
         make = jax.jit(
             lambda: jnp.full(question.shape, fill, model.dtype), out_shardings=model.sharding
         )
-        return make()
+        result: jax.Array = make()
+        return result
 
     return one(0.0), one(1.0)
 
@@ -167,7 +171,8 @@ def _starts(model: ShardedMDP) -> jax.Array:
         lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model)
     )(model.initial)
     order = np.argsort(on_host(_pick(model, found, model.number)), kind="stable")
-    return jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
+    result: jax.Array = jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
+    return result
 
 
 def _everywhere(model: ShardedMDP) -> NamedSharding:
@@ -175,14 +180,18 @@ def _everywhere(model: ShardedMDP) -> NamedSharding:
 
 
 def _pick(model: ShardedMDP, places: jax.Array, quantity: jax.Array) -> jax.Array:
-    return jax.jit(lambda x, i: x[i], out_shardings=_everywhere(model))(quantity, places)
+    result: jax.Array = jax.jit(lambda x, i: x[i], out_shardings=_everywhere(model))(
+        quantity, places
+    )
+    return result
 
 
 def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.Array:
     def one(both: Product, i: jax.Array, x: jax.Array) -> jax.Array:
         return x[i, both.initial_memory[i]]
 
-    return jax.jit(one, out_shardings=_everywhere(both.mdp))(both, places, quantity)
+    result: jax.Array = jax.jit(one, out_shardings=_everywhere(both.mdp))(both, places, quantity)
+    return result
 
 
 @partial(jax.jit, static_argnames="objective")

@@ -68,7 +68,8 @@ def at_starts(model: Product, value: Array, over: str) -> tuple[float, int]:
 def from_starts(model: Product, value: Array) -> np.ndarray:
     """The value ``[S]`` at the initial memory of each world state, from ``[S, Q]``."""
     memory = np.asarray(model.initial_memory)
-    return np.asarray(value)[np.arange(len(memory)), memory]
+    result: np.ndarray = np.asarray(value)[np.arange(len(memory)), memory]
+    return result
 
 
 def attained(model: Product, policy: Array, over: str, tolerance: float | None = None) -> float:

@@ -155,9 +155,10 @@ def _conserving(problem: Reaching, solution: Solution, objective: str) -> Boolea
     if problem.objective == "max":
         # The optimal probability is constant in an end component.
         keeps = keeps | components_within(graph, undecided).inside
-    return graph.available & (
+    result: Booleans = graph.available & (
         keeps | (~decided[..., None] & _by_bounds(problem.model, solution, objective))
     )
+    return result
 
 
 def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
@@ -180,7 +181,8 @@ def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
     ahead = on_actions(sparse, sparse.host.expectation(far.ravel()), model)
     # The model's probabilities may be rounded ones.
     slack = rounding_unit(model) * np.maximum(ahead, near[..., None])
-    return sign * ahead + slack >= sign * near[..., None]
+    result: Booleans = sign * ahead + slack >= sign * near[..., None]
+    return result
 
 
 def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:

@@ -21,7 +21,7 @@ from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.attractor import Sets, max_sets, min_sets, policy_sets
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
 from jaxltl.core.models.ops.double_word import double_word, normalised_rows
 from jaxltl.core.models.ops.operators import (
     combined,
@@ -50,7 +50,7 @@ _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that fa
 # --- a policy: a linear system with a certificate -------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("method",))
+@jit("method")
 def policy_reachability(
     model: ActionModel,
     policy: jax.Array,
@@ -135,11 +135,11 @@ def optimal_reachability(
     sets, components = _qualitative(model, target, objective=objective)
     if components is not None and not components.inside.any():
         components = None
-    arguments = to_jax((sets, components))
-    return _optimize(model, *arguments, (tolerance, max_steps, start), objective=objective)
+    sets, components = to_jax((sets, components))
+    return _optimize(model, sets, components, (tolerance, max_steps, start), objective=objective)
 
 
-@partial(jax.jit, static_argnames=("objective",))
+@jit("objective")
 def _inside_jit(
     model: ActionModel, target: jax.Array, *options: PyTree, objective: str
 ) -> Solution:
@@ -188,7 +188,10 @@ class _Search(NamedTuple):
     @property
     def leaving(self) -> jax.Array:
         available = self.model.available
-        return available if self.components is None else available & ~self.components.inside
+        result: jax.Array = (
+            available if self.components is None else available & ~self.components.inside
+        )
+        return result
 
     def best(self, sign: int, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         value, action = action_argmax(sign * expectation(self.model, y), self.leaving)
@@ -269,14 +272,15 @@ def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) ->
         image = onward(y.ravel()).reshape(y.shape)
         return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
 
-    return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
+    result: jax.Array = lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
+    return result
 
 
 def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
     return (carry.rests if finest else carry.half <= search.goal) | ~carry.moved
 
 
-@partial(jax.jit, static_argnames=("objective",))
+@jit("objective")
 def _optimize(
     model: PyTree, sets: Sets, components: EndComponents | None, options: PyTree, *, objective: str
 ) -> Solution:
@@ -297,7 +301,8 @@ def _optimize(
     solution = replace(solution, status=jnp.maximum(solution.status, code))
     solution = jax.tree.map(lax.stop_gradient, solution)
     chain = ChainSystem(model, solution.policy, undecided, row_of)
-    return replace(solution, value=with_derivative(solution.value, chain, outside=one))
+    result: Solution = replace(solution, value=with_derivative(solution.value, chain, outside=one))
+    return result
 
 
 def _by_policy_iteration(

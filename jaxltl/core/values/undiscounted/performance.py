@@ -22,7 +22,7 @@ from jax import lax
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.attractor import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, jit, namespace, to_jax
 from jaxltl.core.models.ops.double_word import normalised_rows
 from jaxltl.core.models.ops.operators import (
     action_mean,
@@ -120,7 +120,7 @@ def task_performance(
     return _task_performance(model, policy, tolerance, method=method)
 
 
-@partial(jax.jit, static_argnames=("method",))
+@jit("method")
 def _task_performance(
     model: Product, policy: jax.Array, tolerance: Array, *, method: str
 ) -> Performance:
@@ -158,11 +158,12 @@ def _task_performance(
         "value": jnp.nan,
         "status": Status.INVALID,
     }
-    return jax.tree.map(
+    result: Performance = jax.tree.map(
         lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
         found,
         replace(found, **unknown),
     )
+    return result
 
 
 def _summarize(
@@ -240,7 +241,8 @@ def _block_solver(
 
         def unfinished(carry: PyTree) -> jax.Array:
             _, moved, n = carry
-            return moved & (n < _MAX_SWEEPS)
+            result: jax.Array = moved & (n < _MAX_SWEEPS)
+            return result
 
         start = (jnp.zeros_like(b), jnp.bool_(True), jnp.int32(0))
         return lax.while_loop(unfinished, sweep, start)[0]
@@ -317,7 +319,8 @@ def task_performances(
     for w in redone:
         again = _on_host(models, policies, int(w), tolerance)
         jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, again)
-    return to_jax(columns)
+    result: Performance = to_jax(columns)
+    return result
 
 
 def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: int) -> Performance:
@@ -328,23 +331,25 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
     for first in range(0, count, size):
         # The last batch overlaps with the one before, so that all have one shape.
         begin = min(first, count - size)
-        lanes = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
-        found = jax.block_until_ready(_together(*lanes, tolerance))
+        some, chosen = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
+        found = jax.block_until_ready(_together(some, chosen, tolerance))
         parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], found))
-    return to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+    result: Performance = to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+    return result
 
 
 def _on_host(models: Product, policies: jax.Array, world: int, tolerance: Array) -> Performance:
     """Evaluation in one world by the sparse engine."""
     model, policy = jax.tree.map(lambda x: np.asarray(x)[world], (models, policies))
     found = satisfaction_probability(model, policy, tolerance=tolerance)
-    return _summarized(model, found.value, found.lower, found.upper, tolerance)
+    result: Performance = _summarized(model, found.value, found.lower, found.upper, tolerance)
+    return result
 
 
 _summarized = jax.jit(_summarize)
 
 
-@jax.jit
+@jit()
 def _together(models: Product, policies: jax.Array, tolerance: Array) -> Performance:
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
 
@@ -363,7 +368,7 @@ def infeasible_starts(model: Product) -> jax.Array:
         never = min_sets(graph, target).one
     xp, never, memory, initial = namespace(never, model.initial_memory, model.mdp.initial)
     here = xp.take_along_axis(never, memory[:, None], axis=1)[:, 0]
-    return to_jax((initial > 0) & here)
+    return jax_array((initial > 0) & here)
 
 
 @brief

@@ -278,7 +278,8 @@ def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
         keeps |= end_components(mdp, undecided).inside
     else:
         keeps = mdp.expectation(found.upper) * (1 + unit) <= found.upper[mdp.state]
-    return keeps & undecided[mdp.state]
+    result: Booleans = keeps & undecided[mdp.state]
+    return result
 
 
 def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosure | None:
@@ -379,4 +380,5 @@ def _normalised(weight: Floats) -> Floats:
     """Rows that sum to 1 in double precision."""
     weight = weight.astype(np.float64)
     total = weight.sum(-1, keepdims=True)
-    return np.divide(weight, total, out=weight, where=total > 0)
+    result: Floats = np.divide(weight, total, out=weight, where=total > 0)
+    return result

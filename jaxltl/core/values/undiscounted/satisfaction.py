@@ -25,7 +25,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
@@ -350,7 +350,7 @@ def _shifted(automaton: Automaton) -> Automaton:
 
 def _not_final(model: Product) -> jax.Array:
     _, final = namespace(model.final)
-    return to_jax(~final)
+    return jax_array(~final)
 
 
 def _one_hot(policy: Array, num_actions: int) -> Array:

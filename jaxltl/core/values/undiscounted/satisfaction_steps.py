@@ -179,7 +179,8 @@ class Clock:
     @cached_property
     def undecided(self) -> Booleans:
         """``bool[N]``: the states in which steps count."""
-        return ~(self.lost | np.asarray(self.problem.target).ravel())
+        result: Booleans = ~(self.lost | np.asarray(self.problem.target).ravel())
+        return result
 
     def steps(self, policy: Array) -> Steps:
         """:func:`satisfaction_steps` of a policy."""

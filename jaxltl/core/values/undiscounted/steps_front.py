@@ -195,4 +195,5 @@ class _Front:
         start = np.asarray(clock.model.initial, float).ravel()[inner]
         visits[inner] = transient_factors(chain.mdp, inner).solve(start, "T")
         rows = np.maximum(visits, 0)[clock.sparse.host.state] * chain.weight
-        return on_actions(clock.sparse, rows, clock.model)
+        result: np.ndarray = on_actions(clock.sparse, rows, clock.model)
+        return result

@@ -17,7 +17,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, make_sparse
@@ -188,7 +188,8 @@ def _earned(model: Model, sparse: SparseMDP, reward: Reward) -> Floats:
         return reward.ravel()[sparse.host.state]
     require_shape("reward", reward, (*states, cast(ActionModel, model).num_actions))
     flat = reward.reshape(sparse.num_states, -1)
-    return flat[sparse.host.state, np.asarray(sparse.action)]
+    result: Floats = flat[sparse.host.state, np.asarray(sparse.action)]
+    return result
 
 
 # --- inside jit and over a mesh -------------------------------------------------------------------
@@ -215,10 +216,10 @@ def _by_sweeps(
         )
     require_states("target", target, model.state_shape)
     padded = cast(ActionModel, model)
-    reward = _on_choices(padded, world, reward)
-    _require_rewards(padded, world, reward)
+    earned = _on_choices(padded, world, reward)
+    _require_rewards(padded, world, earned)
     asked = default_tolerance(model) if tolerance is None else tolerance
-    return total_reward_by_sweeps(padded, reward, target, policy, asked, objective=objective)
+    return total_reward_by_sweeps(padded, earned, target, policy, asked, objective=objective)
 
 
 def _on_choices(model: ActionModel, world: World, reward: Reward) -> Array:
@@ -249,7 +250,7 @@ def _require_rewards(model: ActionModel, world: World, reward: Array) -> None:
         )
 
 
-@jax.jit
+@jit()
 def _least_reward(model: ActionModel, world: World, reward: Array) -> tuple[jax.Array, jax.Array]:
     """The least reward of an available action, and its state; NaN if one is NaN."""
     least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)

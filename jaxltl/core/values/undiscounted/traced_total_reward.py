@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.colouring import state_numbers
 from jaxltl.core.graphs.end_components import EndComponents, components_within
@@ -119,7 +120,7 @@ class Found(NamedTuple):
     status: jax.Array
 
 
-@partial(jax.jit, static_argnames=("objective",))
+@jit("objective")
 def total_reward_by_sweeps(
     model: ActionModel,
     reward: jax.Array,
@@ -294,7 +295,10 @@ def _greatest(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Ar
 def _where_it_leaves(problem: Problem, at: _Point, x: jax.Array) -> jax.Array:
     if problem.circles is None:
         return x
-    return lax.cond(jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x)
+    result: jax.Array = lax.cond(
+        jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x
+    )
+    return result
 
 
 def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
@@ -445,7 +449,8 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(value), True))
 
     def kept(new: Tree, old: Tree, where: jax.Array) -> Tree:
-        return jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
+        result: Tree = jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
+        return result
 
     below = proven & ~above & (k.share <= k.shares[0])
     over = proven & above & (k.share <= k.shares[1])
