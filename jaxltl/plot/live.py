@@ -183,7 +183,7 @@ def live_map(
     font = 10.5 * zoom if large else 10.5
     beyond = max([0, *(-row for row, _, _ in ground.ring)]) * CELL
     margin = _MARGIN * zoom
-    names = [
+    names: list[tuple[str, float, float]] = [
         (marks[text], s % columns * CELL + 3, s // columns * CELL + font / 2 + 5.75)
         for s, text in enumerate(ground.names)
         if text
@@ -288,7 +288,7 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
         return [f"{a:.1f} {b:.1f}" for a, b in zip(across(x), down(value), strict=True)]
 
     edge = path(np.nanmax(scaled, axis=1)) + path(np.nanmin(scaled, axis=1))[::-1]
-    ticks = []
+    ticks: list[tuple[float | str, float | str, str, str]] = []
     for value in (low, (low + high_value) / 2, high_value):
         real = 10**value if logs else value
         text = f"{real:.4g}" if abs(real) >= 1000 else f"{real:.3g}"
