@@ -79,17 +79,17 @@ class Console:
 
 def job_of(task_file: Path) -> SomeJob:
     """The kind of job that a task file describes."""
-    from jaxltl.app.files.task import is_environment_task, is_grounding_task, method_of
+    from jaxltl.app.files.task import kind_of
 
-    if is_environment_task(task_file):
+    if (kind := kind_of(task_file)) == "environment":
         from jaxltl.app import learn_environment
 
         return learn_environment
-    if is_grounding_task(task_file):
+    if kind == "grounding":
         from jaxltl.app.grounding import job
 
         return job
-    if method_of(task_file) == "todirl":
+    if kind == "todirl":
         from jaxltl.app import learn_todirl
 
         return learn_todirl

@@ -74,28 +74,22 @@ def _read(
     action: Callable[..., SupportsIndex] | None,
 ) -> tuple[list[int], list[int]]:
     """The states and actions of an episode."""
-    for names in _NAMES:
-        if all(hasattr(episode, name) for name in names):
-            seen, done = (getattr(episode, name) for name in names)
-            break
-    else:
+    names = next((x for x in _NAMES if all(hasattr(episode, name) for name in x)), None)
+    if names is None:
         raise ValueError(
             f"episode {number} is {validation.shorten(episode)}; give objects with obs and acts, or "
             "with observations and actions."
         )
-    observed = _steps(seen)
-    acted = list(done)
+    observed, acted = _steps(getattr(episode, names[0])), list(getattr(episode, names[1]))
     if not acted or len(observed) != len(acted) + 1:
         raise ValueError(
             f"episode {number} has {len(observed)} observations and {len(acted)} actions; expected "
             "at least one action, and one observation more than actions."
         )
+    place = f"episode {number}, "
     return (
-        [
-            _index(x, state, f"episode {number}, observation {t}", "state")
-            for t, x in enumerate(observed)
-        ],
-        [_index(x, action, f"episode {number}, action {t}", "action") for t, x in enumerate(acted)],
+        [_index(x, state, f"{place}observation {t}", "state") for t, x in enumerate(observed)],
+        [_index(x, action, f"{place}action {t}", "action") for t, x in enumerate(acted)],
     )
 
 

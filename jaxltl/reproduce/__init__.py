@@ -1,5 +1,6 @@
 """Experiments of the dissertation: measured results compared with the published ones.
 
-One module for each experiment, with the interface :class:`~jaxltl.reproduce.experiment.Experiment`.
-Run in double precision (``with jax.enable_x64(True)``), as ``jaxltl reproduce`` does.
+One module for each experiment: ``figures(progress)`` measures, with ``seeds`` where learning is
+repeated; ``table(result)`` is the report, and ``pictures(result)`` yields names and files. Run in
+double precision (``with jax.enable_x64(True)``), as ``jaxltl reproduce`` does.
 """

@@ -1,10 +1,10 @@
-"""The interface of an experiment of the dissertation, and parts that several experiments share."""
+"""Parts that several experiments of the dissertation share."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import jax
 
@@ -12,22 +12,6 @@ from jaxltl.io.templates import render
 
 ResultT = TypeVar("ResultT")
 Figures = dict[str, Any]  # numbers, texts, and lists and dicts of them, as in JSON
-
-
-class Experiment(Protocol):
-    """A module of this package: measurements, a report, and pictures.
-
-    ``figures`` also takes ``seeds``, the repetitions of learning, if the experiment has any.
-    """
-
-    def figures(self, progress: Callable[[str], None]) -> Figures:
-        """Measured results; `progress` is called with a line of text before each part."""
-
-    def table(self, result: Figures) -> str:
-        """The published and the measured results side by side, and why they differ."""
-
-    def pictures(self, result: Figures) -> list[tuple[str, bytes]]:
-        """File names and contents of the pictures; absent if the experiment has none."""
 
 
 def run_seconds(job: Callable[[], ResultT]) -> tuple[ResultT, float]:

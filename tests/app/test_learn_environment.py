@@ -13,7 +13,7 @@ import jaxltl as jl
 from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
-from jaxltl.app.files.task import is_environment_task
+from jaxltl.app.files.task import kind_of
 from jaxltl.app.files.task_environment import read_task
 from jaxltl.cli import main
 from jaxltl.core.environments.task_environment import task_tables
@@ -422,7 +422,7 @@ def test_labels_and_limits_of_the_file(write):
         ),
         ("!pit U goal", "F goal & F one"),
     )
-    assert is_environment_task(path)
+    assert kind_of(path) == "environment"
     found = load_environment(read_task(path))
     assert found.propositions == ("goal", "one") and found.horizon == 5
 

@@ -10,7 +10,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.app import learn_todirl
 from jaxltl.app.files.scenes import cell_observations, load_automata, load_scenes
-from jaxltl.app.files.task import method_of
+from jaxltl.app.files.task import kind_of
 from jaxltl.app.files.task_todirl import read_task
 from jaxltl.app.reports import learn_todirl as report_todirl
 from jaxltl.core.models.construct.batch import stack_products
@@ -139,7 +139,7 @@ def write_files(place):
 def test_a_task_is_read(write):
     path = write()
     task = read_task(path)
-    assert method_of(path) == "todirl"
+    assert kind_of(path) == "todirl"
     assert task.label_on == "exit" and task.memory == task.formula and task.is_colored
     judge, memory = load_automata(task)
     assert memory is judge and judge.delta.shape[0] == 4

@@ -184,8 +184,7 @@ class World:
 def read_game(path: str | Path) -> GameFile:
     """Checked contents of a game file; ValueError names the key and the fix."""
     path = Path(path)
-    data, _ = schema.read_toml(path, GameFileSchema.KIND)
-    file = schema.convert(path, GameFileSchema, data)
+    file, _ = schema.read_file(path, GameFileSchema)
     return GameFile(
         path=path,
         name=file.name or path.stem,

@@ -36,6 +36,7 @@ import attrs
 from jaxltl.core.validation import errors_in
 
 _Table = TypeVar("_Table", bound="Table")
+_File = TypeVar("_File", bound="File")
 LARGEST_INT = 2**31 - 1  # int32 of compiled loops
 
 
@@ -133,7 +134,7 @@ class Table:
 class File(Table):
     """The tables of a file; a field that is a :class:`Table` is a table, others are keys."""
 
-    KIND: ClassVar[str] = "the file"  # begins the error if it cannot be read
+    KIND: ClassVar[str] = "the task file"  # begins the error if it cannot be read
     name: Key[
         Name | None, "Name of the results' folder; default the file's own name.", '"two goals"'
     ] = None
@@ -149,6 +150,12 @@ def read_toml(path: Path, kind: str, raw: bytes | None = None) -> tuple[dict[str
         return tomllib.loads(raw.decode()), raw
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: this is not TOML: {error}") from None
+
+
+def read_file(path: Path, schema: type[_File]) -> tuple[_File, bytes]:
+    """A file as an instance of its schema, and its bytes."""
+    data, raw = read_toml(path, schema.KIND)
+    return convert(path, schema, data), raw
 
 
 def read_bytes(path: Path, kind: str) -> bytes:

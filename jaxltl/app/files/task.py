@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 from typing import Annotated as Key
 
 
@@ -137,7 +137,6 @@ class OptimizerTable(Table):
 class TaskFile(File):
     """Tables common to task files of learning from demonstrations."""
 
-    KIND: ClassVar[str] = "the task file"
     task: Key[TaskTable, "The formula, and the guarantee."]
 
 
@@ -191,23 +190,13 @@ def common_fields(
     }
 
 
-def method_of(path: str | Path) -> object:
-    """``[learner] method`` of a task file, unchecked; None without one."""
-    learner = read_toml(Path(path), TaskFile.KIND)[0].get("learner")
-    return learner.get("method") if isinstance(learner, dict) else None
-
-
-def is_grounding_task(path: str | Path) -> bool:
-    """True if the symbols of a task file's formula have no meaning yet."""
-    return "grounding" in read_toml(Path(path), TaskFile.KIND)[0]
-
-
-ENVIRONMENT_METHODS = ("ppo", "cce", "cpo")
-
-
-def is_environment_task(path: str | Path) -> bool:
-    """True if a task file is of a simulated world, by its world or by its method."""
+def kind_of(path: str | Path) -> Literal["environment", "grounding", "todirl", "mlirl"]:
+    """The kind of a task file, unchecked: by its world, its tables or its method."""
     data = read_toml(Path(path), TaskFile.KIND)[0]
-    world, learner = (data.get(name) for name in ("world", "learner"))
-    simulated = isinstance(world, dict) and not world.keys().isdisjoint(("environment", "dynamics"))
-    return simulated or (isinstance(learner, dict) and learner.get("method") in ENVIRONMENT_METHODS)
+    world, learner = (x if isinstance(x := data.get(k), dict) else {} for k in ("world", "learner"))
+    method, simulated = learner.get("method"), world.keys() & {"environment", "dynamics"}
+    if simulated or method in ("ppo", "cce", "cpo"):
+        return "environment"
+    if "grounding" in data:
+        return "grounding"
+    return "todirl" if method == "todirl" else "mlirl"

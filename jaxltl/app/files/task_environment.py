@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 from typing import Annotated as Key
 
 import attrs
@@ -253,7 +253,6 @@ class ProofTable(Table):
 class EnvironmentFile(File):
     """Tables of a task file of a simulated world."""
 
-    KIND: ClassVar[str] = "the task file"
     world: Key[WorldTable, "The environment."]
     task: Key[TaskTable, "The formula and its reward."]
     learner: Key[LearnerTable, "The method."]

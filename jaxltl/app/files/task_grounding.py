@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 from typing import Annotated as Key
 
 from jaxltl.app.files import schema
@@ -85,7 +85,6 @@ class TestTable(Table):
 class GroundingFile(schema.File):
     """Tables of a task file with a table ``[grounding]``."""
 
-    KIND: ClassVar[str] = "the task file"
     world: Key[WorldTable, "The worlds with demonstrations."]
     task: Key[FormulaTable, "The formula over symbols."]
     grounding: Key[GroundingTable, "Observations, and how their meaning is learned."]
@@ -117,8 +116,7 @@ class GroundingTask:
 def read_task(path: str | Path) -> GroundingTask:
     """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
-    data, raw = schema.read_toml(path, GroundingFile.KIND)
-    file = schema.convert(path, GroundingFile, data)
+    file, raw = schema.read_file(path, GroundingFile)
     maps = [*file.world.maps, *(file.test.maps if file.test else ())]
     seen, shown = file.grounding.observations, file.demonstrations.files or []
     tables = [] if seen == "cells" else list(seen)

@@ -212,8 +212,7 @@ class MlirlTask(Task):
 def read_task(path: str | Path) -> MlirlTask:
     """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
-    data, raw = schema.read_toml(path, MlirlFile.KIND)
-    file = schema.convert(path, MlirlFile, data)
+    file, raw = schema.read_file(path, MlirlFile)
     world, learner = file.world, file.learner
     hidden = 'in = "world"' if learner.in_world else None
     digest = schema.digest(path, raw, _named_files(path, world, file.demonstrations))

@@ -202,8 +202,7 @@ class TodirlTask(Task):
 def read_task(path: str | Path) -> TodirlTask:
     """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
-    data, raw = schema.read_toml(path, TodirlFile.KIND)
-    file = schema.convert(path, TodirlFile, data)
+    file, raw = schema.read_file(path, TodirlFile)
     world, shown, test, learner = file.world, file.demonstrations, file.test, file.learner
     if shown.files is not None and len(shown.files) != len(world.maps):
         raise ValueError(

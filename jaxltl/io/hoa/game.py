@@ -26,7 +26,7 @@ from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priori
 from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
 from jaxltl.io.hoa.header import Header, read_header
 from jaxltl.io.hoa.table import by_number, guarded_edges, label_reader, marks_of, nondeterminism
-from jaxltl.io.hoa.hoa import parity_text, quoted
+from jaxltl.io.hoa.hoa import header_lines, parity_text
 from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of
 
 if TYPE_CHECKING:
@@ -389,15 +389,14 @@ def write_hoa_game(
     number, edges = arena.paired(int(starts[0])) or arena.plain()
     count = int(color.max()) + 1
     names = (*labels.inputs, *labels.outputs)
-    lines = ["HOA: v1", 'tool: "jaxltl"', *([f"name: {quoted(name)}"] if name else [])]
-    lines += [f"States: {len(edges)}", f"Start: {number[starts[0]]}"]
-    lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
-    lines.append(" ".join(["controllable-AP:", *map(str, range(len(labels.inputs), len(names)))]))
-    lines += [f"acc-name: parity max even {count}", f"Acceptance: {count} "
-              f"{parity_text(count, 'max')}"]  # fmt: skip
-    lines.append("properties: trans-labels explicit-labels trans-acc colored complete "
-                 "deterministic")  # fmt: skip
-    lines.append("--BODY--")
+    lines = [
+        *header_lines(name, len(edges), int(number[starts[0]]), names),
+        " ".join(["controllable-AP:", *map(str, range(len(labels.inputs), len(names)))]),
+        f"acc-name: parity max even {count}",
+        f"Acceptance: {count} {parity_text(count, 'max')}",
+        "properties: trans-labels explicit-labels trans-acc colored complete deterministic",
+        "--BODY--",
+    ]
     for i, leave in enumerate(edges):
         lines.append(f"State: {i}")
         lines += [f"[{label}] {target} {{{mark}}}" for label, target, mark in leave]

@@ -39,19 +39,8 @@ _TOKEN = re.compile(
 )
 
 
-KNOWN_HEADERS = {
-    "HOA:": "HOA",
-    "States:": "STATES",
-    "Start:": "START",
-    "AP:": "AP",
-    "Alias:": "ALIAS",
-    "Acceptance:": "ACCEPTANCE",
-    "acc-name:": "ACC_NAME",
-    "tool:": "TOOL",
-    "name:": "NAME",
-    "properties:": "PROPERTIES",
-    "State:": "STATE",
-}
+_HEADERS = "HOA States Start AP Alias Acceptance acc-name tool name properties State"
+KNOWN_HEADERS = {f"{name}:": name.upper().replace("-", "_") for name in _HEADERS.split()}
 
 
 # Lark omits terminals with a leading underscore from the trees.
@@ -62,15 +51,8 @@ _TERMINAL = {
     "--BODY--": "_BODY",
     "--END--": "_END",
     "--ABORT--": "ABORT",
-    "[": "_LEFT",
-    "]": "_RIGHT",
-    "(": "_OPEN",
-    ")": "_CLOSE",
-    "{": "_BEGIN",
-    "}": "_FINISH",
-    "&": "_AND",
-    "|": "_OR",
-    "!": "NOT",
+    **dict(zip("[](){}", ["_LEFT", "_RIGHT", "_OPEN", "_CLOSE", "_BEGIN", "_FINISH"], strict=True)),
+    **dict(zip("&|!", ("_AND", "_OR", "NOT"), strict=True)),
 }
 
 

@@ -5,7 +5,7 @@ https://adl.github.io/hoaf/ (Babiak et al. 2015, "The Hanoi omega-automata forma
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,11 +115,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       ['State:', '0', '"F', 'a"', '[!0]', '0']
     """
     names = automaton.propositions
-    lines = ["HOA: v1", 'tool: "jaxltl"']
-    if name:
-        lines.append(f"name: {quoted(name)}")
-    lines += [f"States: {len(automaton.delta)}", f"Start: {int(automaton.initial)}"]
-    lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
+    lines = header_lines(name, len(automaton.delta), int(automaton.initial), names)
     if automaton.is_parity:
         count = int(automaton.priority.max()) + 1
         lines += [f"acc-name: parity min even {count}", f"Acceptance: {count} {parity_text(count)}"]
@@ -198,6 +194,13 @@ def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]
         letters_of.setdefault(pair, set()).add(number)
     for pair, chosen in letters_of.items():
         yield *pair, prime_cover(chosen, set(numbers) - chosen, width)
+
+
+def header_lines(name: str, states: int, start: int, names: Sequence[str]) -> list[str]:
+    """The first lines of an automaton: its name, number of states, start and propositions."""
+    lines = ["HOA: v1", 'tool: "jaxltl"', *([f"name: {quoted(name)}"] if name else [])]
+    propositions = " ".join([f"AP: {len(names)}", *map(quoted, names)])
+    return [*lines, f"States: {states}", f"Start: {start}", propositions]
 
 
 def quoted(text: str) -> str:
