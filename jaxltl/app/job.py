@@ -9,7 +9,7 @@ import hashlib
 import inspect
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -172,6 +172,15 @@ def automaton_picture(automaton: Automaton, live: str) -> Picture:
         "named by the remaining formula.",
         live,
     )
+
+
+def learning_picture(
+    history: Mapping[str, np.ndarray], caption: str, show: Sequence[str]
+) -> Picture:
+    """The picture of some learning curves."""
+    shown = {k: history[k].T for k in show if k in history}
+    drawn = drawing("curves", shown, steps=history["step"])
+    return Picture("learning.svg", "Learning", drawn, caption, "learning")
 
 
 def over_seeds(count: int) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
 from jaxltl.app.environment_learners import Method, make_method
-from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.environment_source import load_environment, load_world
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_environment as report, proof as proofs  # noqa: F401 - part of the job
@@ -28,6 +28,7 @@ from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     about,
     automaton_picture,
+    learning_picture,
     over_seeds,
     plain,
     run_seeds,
@@ -350,16 +351,7 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """Pictures of learning curves and episodes."""
-    history, names = outcome.history, _drawn(outcome)
-    found = [
-        Picture(
-            "learning.svg",
-            "Learning",
-            drawing("curves", {k: history[k].T for k in names}, steps=history["step"], show=names),
-            "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations)),
-            "learning",
-        )
-    ]
+    found = [learning_picture(outcome.history, _caption(outcome), _drawn(outcome))]
     drawn = _pictured(outcome)
     found = found if drawn is None else [drawn, *found]
     dynamics, proof = outcome.setup.dynamics, outcome.proof
@@ -370,8 +362,12 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 def live(outcome: Outcome) -> list[Curves]:
     """Interactive learning curves."""
-    caption = "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
-    return [curves("learning", "Learning", caption, outcome.history, _drawn(outcome))]
+    names = _drawn(outcome)
+    return [curves("learning", "Learning", _caption(outcome), outcome.history, names)]
+
+
+def _caption(outcome: Outcome) -> str:
+    return "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
 
 
 def _pictured(outcome: Outcome) -> Picture | None:

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxltl.app.guarantee import left_out
-from jaxltl.app.job import automaton_picture, over_seeds, plain, short_name
+from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, plain, short_name
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import (
@@ -195,18 +195,7 @@ def pictures(outcome: Any) -> list[Picture]:
     return [
         *([] if cells is None else _maps(outcome, cells)),
         *steps.pictures(plain(outcome.expected_steps)),
-        Picture(
-            "learning.svg",
-            "Learning",
-            drawing(
-                "curves",
-                {k: v.T for k, v in history.items() if k != "step"},
-                steps=history["step"],
-                show=_FIGURES,
-            ),
-            _CURVES + over_seeds(len(outcome.learned.loss)),
-            "learning",
-        ),
+        learning_picture(history, _CURVES + over_seeds(len(outcome.learned.loss)), _FIGURES),
     ]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.job import automaton_picture, over_seeds, short_name
+from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import (
@@ -221,16 +221,7 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """Pictures of learning curves and of policies in worlds."""
-    history = outcome.learned.history
-    found = [
-        Picture(
-            "learning.svg",
-            "Learning",
-            drawing("curves", {k: history[k].T for k in _FIGURES}, steps=history["step"]),
-            _caption_of_curves(outcome),
-            "learning",
-        )
-    ]
+    found = [learning_picture(outcome.learned.history, _caption_of_curves(outcome), _FIGURES)]
     if time := summary(outcome)["training"].get("expected_steps"):
         found += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
@@ -240,23 +231,20 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
     """Interactive policies in worlds, and learning curves."""
-    found: list[Explorer | TooLarge | Curves] = [
-        _look_into(outcome, one) for one in _drawn_worlds(outcome)
+    caption, history = _caption_of_curves(outcome), outcome.learned.history
+    return [
+        *(_look_into(outcome, one) for one in _drawn_worlds(outcome)),
+        curves("learning", "Learning", caption, history, _FIGURES),
     ]
-    history = outcome.learned.history
-    return [*found, curves("learning", "Learning", _caption_of_curves(outcome), history, _FIGURES)]
 
 
 def _caption_of_curves(outcome: Outcome) -> str:
+    scores = outcome.learned.held_out
+    kept = ". The parameters with the least held-out figure are kept"
     return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
         "if there are any, and the norm of the gradient, before each step"
-        + (
-            ""
-            if np.isnan(outcome.learned.held_out).any()
-            else ". The parameters with the least held-out figure are kept"
-        )
-        + over_seeds(len(outcome.learned.held_out))
+        f"{'' if np.isnan(scores).any() else kept}{over_seeds(len(scores))}"
     )
 
 
@@ -275,6 +263,19 @@ class _Drawn:
     @property
     def live(self) -> str:
         return self.stem.replace("_", "-")
+
+    @property
+    def caption(self) -> str:
+        return (
+            "One map for each memory state; lengths of arrows are the probabilities of actions"
+            f"{'' if self.policy.ndim == 3 else ' at the first step'}. The title has the mean "
+            "satisfaction probability."
+        )
+
+    @property
+    def moving(self) -> np.ndarray:
+        """``[S, Q, A]``, the policy at the first step."""
+        return self.policy if self.policy.ndim == 3 else self.policy[0]
 
     @property
     def policy(self) -> np.ndarray:
@@ -305,21 +306,10 @@ def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
             yield _Drawn(test, outcome.test, w, f"test_{n + 1}", text, n == 0, None)
 
 
-_CAPTION = (
-    "One map for each memory state; lengths of arrows are the probabilities of actions{}. The "
-    "title has the mean satisfaction probability."
-)
-
-
 def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
-    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
-    stationary = policy.ndim == 3
-    moving = policy if stationary else policy[0]
-    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
-    layers = {
-        str(q): Layer(f"memory state {q}: {names[q]}", None, moving[:, q])
-        for q in _memory_shown(setup)
-    }
+    setup, scene = outcome.setup, one.worlds.scenes[one.w]
+    names = _memory_names(setup)
+    layers = {str(q): Layer(name, None, one.moving[:, q]) for q, name in names.items()}
     starts = np.asarray(scene.mdp.initial) > 0
     layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
     model = part_of(one.worlds.model, one.w)
@@ -329,7 +319,7 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
         View(
             name=one.live,
             title=one.title,
-            caption=_CAPTION.format("" if stationary else " at the first step"),
+            caption=one.caption,
             size=scene.mdp.num_states,
             place=place,
             actions=ACTIONS,
@@ -349,22 +339,17 @@ def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
     mean = np.asarray(judged.performance["learned"].mean)
     order = counted[np.argsort(mean[counted], kind="stable")]
     ranks = {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
-    found: dict[int, str] = {}
-    for rank, w in ranks.items():
-        found.setdefault(int(w), rank)
-    return [(rank, w) for w, rank in found.items()]
+    first = {int(w): rank for rank, w in reversed(ranks.items())}
+    return [(rank, int(w)) for rank, w in ranks.items() if first[int(w)] == rank]
 
 
 def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     """Pictures of a world: its policy, and trajectories."""
-    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
-    moving = policy if policy.ndim == 3 else policy[0]
-    shown = _memory_shown(setup)
-    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
+    setup, scene, caption = outcome.setup, one.worlds.scenes[one.w], one.caption
+    names, moving = _memory_names(setup), one.moving
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
-    titles = [short_name(f"memory state {q}: {names[q]}", width) for q in shown]
-    caption = _CAPTION.format("" if policy.ndim == 3 else " at the first step")
+    shown, titles = list(names), [short_name(name, width) for name in names.values()]
     if scene.colored is None:
         assert scene.cells is not None
         drawn = drawing(
@@ -385,7 +370,7 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
         )
         found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
-    if policy.ndim == 3 and any(pairs):
+    if one.policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
         found.append(
             Picture(
@@ -400,20 +385,18 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     return found
 
 
-def _memory_shown(setup: Setup) -> list[int]:
-    """The undecided memory states."""
-    undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
-    return [int(q) for q in undecided] or [0]
+def _memory_names(setup: Setup) -> dict[int, str]:
+    """The undecided memory states, with their names."""
+    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
+    undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED).tolist()
+    return {q: f"memory state {q}: {names[q]}" for q in undecided or [0]}
 
 
 def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
     setup, policy, count = outcome.setup, one.policy, 1
     if setup.memory is not setup.judge:
-        # The formula's automaton state varies fastest.
-        policy, count = (
-            np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge)),
-            len(setup.judge.delta),
-        )
+        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge))
+        count = len(setup.judge.delta)  # the formula's automaton state varies fastest
     found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)
     return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]
