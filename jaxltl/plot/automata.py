@@ -210,8 +210,8 @@ def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
         Circle(
             center,
             0.04 if mark == "●" else 0.078,
-            facecolor=ACCENT if filled else PAPER,
-            edgecolor=ACCENT if filled else MUTED,
+            fc=ACCENT if filled else PAPER,
+            ec=ACCENT if filled else MUTED,
             lw=0.8,
             zorder=4.5,
         )
@@ -248,12 +248,8 @@ def draw_state(
 ) -> None:
     """Draws a state: a circle with a text, double if final, grey if rejecting."""
     line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
-    axes.add_patch(
-        Circle(tuple(center), drawing.RADIUS, facecolor=fill, edgecolor=line, lw=1.3, zorder=5)
-    )
+    axes.add_patch(Circle(tuple(center), drawing.RADIUS, fc=fill, ec=line, lw=1.3, zorder=5))
     if final:
         inner = drawing.RADIUS - 0.05
-        axes.add_patch(
-            Circle(tuple(center), inner, facecolor="none", edgecolor=line, lw=1, zorder=5)
-        )
+        axes.add_patch(Circle(tuple(center), inner, fc="none", ec=line, lw=1, zorder=5))
     write(axes, center, text, 11, line, va="center_baseline", zorder=6)

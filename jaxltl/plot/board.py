@@ -100,11 +100,7 @@ def draw_moves(
         row, column = world.places[place]
         center, step = np.array([column + 0.5, row + 0.5]), np.array(DIRECTIONS[actions[a]], float)
         if not step.any():
-            axes.add_patch(
-                Circle(
-                    tuple(center), 0.09 * scale, facecolor=face, edgecolor=edge, lw=0.7, zorder=6
-                )
-            )
+            axes.add_patch(Circle(tuple(center), 0.09 * scale, fc=face, ec=edge, lw=0.7, zorder=6))
             continue
         corners = _triangle(center, step, 0.18, 0.18 + 0.24 * scale, 0.12 * scale)
         axes.add_patch(Polygon(corners, facecolor=face, edgecolor=edge, lw=0.7, zorder=6))

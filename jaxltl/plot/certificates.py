@@ -26,6 +26,7 @@ from jaxltl.plot.style import (
     note,
     plain_axes,
     scale_bar,
+    write,
 )
 
 _INITIAL = "#d99a00"
@@ -119,15 +120,7 @@ def _outline(
     """Outlines of the boxes of a region, projected on two coordinates and cut at a window."""
     for low, high in zip(region.low[:, axes], region.high[:, axes], strict=True):
         low, high = np.clip(low, *window), np.clip(high, *window)
-        width, height = (float(x) for x in high - low)
-        outline = Rectangle(
-            (float(low[0]), float(low[1])), width, height,
-            lw=1.6, ls="-" if name else "--", fill=False, ec=color, clip_on=False,
-        )  # fmt: skip
-        panel.add_patch(outline)
+        box, dashes = Rectangle(tuple(low), *(high - low), ec=color), "-" if name else "--"
+        panel.add_patch(box).set(lw=1.6, ls=dashes, fill=False, clip_on=False)
         halo = [withStroke(linewidth=2.0, foreground=PAPER)]
-        middle = (low + high) / 2
-        panel.text(
-            middle[0], middle[1], name, color=color, fontsize=8, ha="center", va="center",
-            path_effects=halo, parse_math=False, zorder=6,
-        )  # fmt: skip
+        write(panel, (low + high) / 2, name, 8, color, path_effects=halo, zorder=6)

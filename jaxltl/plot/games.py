@@ -201,9 +201,7 @@ def game_moves(
         if system is not None:
             row, column = world.places[system]
             axes.add_patch(
-                Circle(
-                    (column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6, edgecolor=ACCENT, zorder=6
-                )
+                Circle((column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6, ec=ACCENT, zorder=6)
             )
         head(axes, titles[m])
         keep_out_of_layout(axes)

@@ -171,9 +171,7 @@ def _cells(
         if blank and (values is not None or color != PAPER):
             # Hatched, since a plain colour could be taken for one of the scale.
             hatch = None if values is None else "/////"
-            axes.add_patch(
-                Rectangle((c, r), 1, 1, facecolor=color, edgecolor=_HATCH, hatch=hatch, lw=0)
-            )
+            axes.add_patch(Rectangle((c, r), 1, 1, fc=color, ec=_HATCH, hatch=hatch, lw=0))
         if kind in special:
             _name_cell(axes, (c, r), marks[str(kind)], color, blank=bool(blank), tiny=tiny)
         if numbers and not blank and not tiny:

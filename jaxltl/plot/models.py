@@ -357,8 +357,8 @@ def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> N
             tuple(center - half),
             2 * half,
             2 * half,
-            facecolor=GOOD if good else FAINT,
-            edgecolor=INK,
+            fc=GOOD if good else FAINT,
+            ec=INK,
             lw=1.3,
             zorder=5,
         )

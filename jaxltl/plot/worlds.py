@@ -182,7 +182,7 @@ def _name_kinds(axes: Axes, world: World) -> None:
                 1 - 2 * inset,
                 1 - 2 * inset,
                 fill=False,
-                edgecolor=SERIES[1],
+                ec=SERIES[1],
                 lw=0.9 if tiny else 1.6,
                 zorder=5,
             )
