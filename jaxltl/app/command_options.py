@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import IO
+from dataclasses import fields
+from typing import IO, Any
 
 import click
 
@@ -105,7 +106,6 @@ def over_devices(command: Callable[..., None]) -> Callable[..., None]:
     @click.option("--process", type=click.IntRange(0), metavar="I", help="Number of this process.")
     @click.option(
         "--processes",
-        "num_processes",
         type=click.IntRange(1),
         metavar="N",
         help="Number of processes.",
@@ -119,16 +119,9 @@ def over_devices(command: Callable[..., None]) -> Callable[..., None]:
         help="Time after which a silent process is reported, at the start and later.",
     )
     @functools.wraps(command)
-    def run(
-        *args: object,
-        mesh: int | None,
-        coordinator: str | None,
-        process: int | None,
-        num_processes: int | None,
-        wait: float,
-        **options: object,
-    ) -> None:
-        devices = processes.DeviceOptions(mesh, coordinator, process, num_processes, wait)
+    def run(*args: object, **options: Any) -> None:
+        names = [field.name for field in fields(processes.DeviceOptions)]
+        devices = processes.DeviceOptions(**{name: options.pop(name) for name in names})
         command(*args, devices=devices, **options)
 
     return run

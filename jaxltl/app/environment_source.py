@@ -103,19 +103,12 @@ def _made(
     if labels is None:
         return found
     with _user_errors("labels"):
+        names = ["actions", "allowed", "observations", "horizon", "starts", "outcomes", "ending"]
         return make_environment(
-            found.reset,
-            found.step,
-            found.observe,
-            actions=found.actions,
+            *(found.reset, found.step, found.observe),
+            **{name: getattr(found, name) for name in names},
             labels=labels,
             propositions=propositions,
-            allowed=found.allowed,
-            observations=found.observations,
-            horizon=found.horizon,
-            starts=found.starts,
-            outcomes=found.outcomes,
-            ending=found.ending,
         )
 
 

@@ -9,12 +9,13 @@ import jax
 import numpy as np
 
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.wording import Record, Result, many
+from jaxltl.app.wording import Record, Result
 from jaxltl.core.array_types import Floats
 from jaxltl.core.continuous.certificate import HOW, Certificate
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments.episodes import Episode
 from jaxltl.core.pretty_print import rounded_outward
+from jaxltl.io.templates import render
 
 _DIGITS = 7
 
@@ -51,21 +52,10 @@ def sentence(proof: Result) -> str:
     """The certified bounds of an entry, in lines, or the reason for which there is no proof."""
     if "reason" in proof:
         return f"no proof: {proof['reason']}"
-    shares = ", ".join(f"{count:,} {text}" for text, count in proof["how"].items() if count)
-    stages = ", ".join(f"{name} {x:.2g} s" for name, x in proof["seconds"].items())
     lower, upper = _bounds(proof)
-    lines = [
-        f"proven: probability at least {lower} from every initial state, at most {upper} from some "
-        f"({proof['status']}, policy without random actions)",
-        f"  {proof['initial_cells']:,} of {proof['cells']:,} cells are initial: "
-        f"{shares or 'no lower bound'}; {stages}",
-    ]
-    if run := proof["counterexample"]:
-        places = (", ".join(f"{x:.4g}" for x in run[i]) for i in (0, -1))
-        lines.append(
-            f"  a run violates it after {many(len(run) - 1, 'step')}: from {' to '.join(places)}"
-        )
-    return "\n".join(lines)
+    return render("jaxltl.app.reports", "proof.txt", proof=proof, lower=lower, upper=upper).rstrip(
+        "\n"
+    )
 
 
 def tiles(proof: Result) -> list[tuple[str, str]]:
