@@ -24,6 +24,7 @@ from typing import (
     NamedTuple,
     TypeVar,
     Union,
+    cast,
     dataclass_transform,
     get_args,
     get_origin,
@@ -305,7 +306,7 @@ def keys_of(schema: type[Table]) -> list[KeyHelp]:
     """
     entries = []
     for field in _fields(schema):
-        kind, default = field.type, field.default
+        kind, default = field.type, cast(Any, field.default)
         if default is attrs.NOTHING:
             default = ...
         elif hasattr(default, "factory"):

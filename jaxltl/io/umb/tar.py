@@ -210,8 +210,8 @@ def tar_pieces(contents: Sequence[tuple[str, NDArray[np.uint8] | bytes]]) -> Ite
         view = memoryview(content)  # type: ignore[arg-type]  # a Buffer since Python 3.12
         info = tarfile.TarInfo(name)
         info.size = len(view)
-        form = tarfile.USTAR_FORMAT if info.size < 8**11 else tarfile.GNU_FORMAT
-        yield memoryview(info.tobuf(form))
+        small = info.size < 8**11
+        yield memoryview(info.tobuf(tarfile.USTAR_FORMAT if small else tarfile.GNU_FORMAT))
         yield view
         yield memoryview(bytes(-len(view) % _BLOCK))
     yield memoryview(bytes(2 * _BLOCK))
