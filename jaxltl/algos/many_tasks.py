@@ -149,9 +149,8 @@ def make_plan(
     `depth` is D, as in training, and `most` is M, the number of sequences for each state. Not
     differentiable. Raises as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
-    automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
-        automaton,
+        task if isinstance(task, Automaton) else to_automaton(task),
         events,
         validation.distinct_names("propositions", propositions),
         depth=depth,

@@ -102,8 +102,7 @@ def _labels(
 def _holds_one_of(
     names: Collection[str], label: np.ndarray, propositions: tuple[str, ...], argument: str
 ) -> np.ndarray:
-    if isinstance(names, str):
-        names = (names,)
+    names = (names,) if isinstance(names, str) else names
     for name in names:
         if name not in propositions:
             raise ValueError(
@@ -116,9 +115,9 @@ def _holds_one_of(
 def _initial(
     formula: str | None, label: np.ndarray, propositions: tuple[str, ...], place: np.ndarray
 ) -> np.ndarray:
-    holds = place
-    if formula is not None:
-        holds = place & satisfying(label, propositions, formula, "initial")
+    holds = (
+        place if formula is None else place & satisfying(label, propositions, formula, "initial")
+    )
     if not place.any():
         raise ValueError(
             "all cells of the map are walls; give at least one other cell, such as '.'."

@@ -46,8 +46,7 @@ def from_gymnasium(
     env = _made(env)
     table = _read(env)
     count = table.num_states
-    if initial is None:
-        initial = getattr(env, "initial_state_distrib", None)
+    initial = getattr(env, "initial_state_distrib", None) if initial is None else initial
     start = np.full(count, 1 / count) if initial is None else np.asarray(initial, np.float64)
     if start.shape != (count,):
         raise ValueError(f"initial has shape {start.shape}; expected ({count},).")
@@ -58,7 +57,6 @@ def from_gymnasium(
     )
     choices = np.append(np.bincount(table.state, minlength=count), np.ones(ended.size, int))
     entries = np.append(np.bincount(table.row), np.ones(ended.size, int))
-    reward = Rewards(transition=np.append(table.reward, np.zeros(ended.size)))
     return make_sparse(
         np.append(0, choices.cumsum()),
         np.append(0, entries.cumsum()),
@@ -66,7 +64,7 @@ def from_gymnasium(
         np.append(table.probability, np.ones(ended.size)),
         initial=np.append(start, np.zeros(ended.size)),
         label=_labels(labels or {}, ended, count),
-        rewards={"reward": reward},
+        rewards={"reward": Rewards(transition=np.append(table.reward, np.zeros(ended.size)))},
         action=np.append(table.action, np.zeros(ended.size, int)),
         valuation={"state": np.append(np.arange(count), ended)},
     )

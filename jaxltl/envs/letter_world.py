@@ -221,8 +221,7 @@ def is_connected(used: np.ndarray) -> np.ndarray:
 
 def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Letter slots of the cells (the last number: none) and empty cells, of all symmetric maps."""
-    grids = maps.reshape(-1, size, size)
-    turned = [np.rot90(grids, k, (1, 2)) for k in range(4)]
+    turned = [np.rot90(maps.reshape(-1, size, size), k, (1, 2)) for k in range(4)]
     every = np.concatenate(turned + [x.transpose(0, 2, 1) for x in turned]).reshape(-1, size * size)
     slot = np.where(every, np.cumsum(every, axis=1) - 1, maps[0].sum())
     return slot.astype(np.uint8), np.nonzero(~every)[1].reshape(len(every), -1).astype(np.uint8)

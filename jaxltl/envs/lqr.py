@@ -384,9 +384,8 @@ def optimum(world: LQR) -> Optimum:
         if not found.success:
             raise ValueError(f"the best controls were not found: {found.message}")
         u[free] = found.x
-    gradient = 2 * matrix.T @ (matrix @ u + offset)
     # At an optimum a step down the gradient is undone by the bounds.
-    residual = np.abs(u - np.clip(u - gradient, *bounds)).max()
+    residual = np.abs(u - np.clip(u - (2 * matrix.T @ (matrix @ u + offset)), *bounds)).max()
     controls = u.reshape(world.horizon, -1)
     states = [start]
     for control in controls:

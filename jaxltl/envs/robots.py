@@ -351,10 +351,9 @@ def _labels(
     label[..., 1, 2] = True
     label[..., 3 : 3 + each] = mark[:, None, None]
     label[..., 3 + each :] = mark[None, :, None]
-    robots = ("environment", "system")
     return label, (
         "collision",
         "diagonal",
         "system_turn",
-        *(f"{robot}_{p}" for robot in robots for p in names),
+        *(f"{robot}_{p}" for robot in ("environment", "system") for p in names),
     )

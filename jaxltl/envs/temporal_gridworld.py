@@ -294,10 +294,9 @@ def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
 def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
     flat, task = kind.ravel(), family.automaton
     if not task.is_cosafe:
-        label = flat[:, None] == np.arange(len(family.kinds))
         world = replace(
             family.blank,
-            label=to_jax(label),
+            label=to_jax(flat[:, None] == np.arange(len(family.kinds))),
             initial=to_jax(flat < 0),
             propositions=tuple(name for name, _ in family.kinds),
         )

@@ -234,7 +234,6 @@ def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
 
 
 def _see(n: _Numbers, world: ZoneState) -> jax.Array:
-    walls = jnp.exp(-n.gain * jnp.concatenate([n.extent - world.place, n.extent + world.place]))
     return jnp.concatenate(
         [
             _lidar(n, world).ravel(),
@@ -242,7 +241,7 @@ def _see(n: _Numbers, world: ZoneState) -> jax.Array:
             _own_frame(world.heading, world.velocity),
             world.turning[None],
             _ahead(world.heading),
-            walls,
+            jnp.exp(-n.gain * jnp.concatenate([n.extent - world.place, n.extent + world.place])),
         ]
     ).astype(jnp.float32)
 

@@ -149,11 +149,10 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     pool = fresh
     if hparams.elite_reuse:
         pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
-    limit = problem.limit - hparams.margin
     chosen = select(
         jnp.where(pool.active, pool.objective, jnp.inf),
         pool.cost,
-        limit,
+        problem.limit - hparams.margin,
         num=num_elites(hparams.rho, hparams.population),
         count=count,
         scale=problem.scale,

@@ -62,9 +62,8 @@ def evaluate_all(
     """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
     keys = jax.random.split(key, len(samples))
     samples, keys = lanes.split_axis((samples, keys), hparams.sharding)
-    found = jax.vmap(partial(scores, problem))(samples, keys)
     # Every device ranks them all, in one order of operations.
-    return lanes.replicate(found, hparams.sharding)
+    return lanes.replicate(jax.vmap(partial(scores, problem))(samples, keys), hparams.sharding)
 
 
 def scores(problem: PyTree, parameters: jax.Array, key: Key) -> tuple[jax.Array, jax.Array]:

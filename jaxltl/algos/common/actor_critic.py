@@ -298,8 +298,7 @@ def require_network(
         return jax.tree.map(lambda x: x.shape, tree)
 
     expected: PyTree = (space.shape if finite else (space.shape, space.shape), ())
-    if recurrent:
-        expected = (shapes(memory), expected)
+    expected = (shapes(memory), expected) if recurrent else expected
     if shapes(found) != expected:
         raise ValueError(
             f"network returns shapes {shapes(found)} for one observation; expected {expected}, "

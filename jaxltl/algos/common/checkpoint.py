@@ -122,8 +122,7 @@ def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: parts.Par
             f"{path!r} does not belong to this run: {name} is {is_}, expected "
             f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
         )
-    over = isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1
-    if over:
+    if isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1:
 
         def block(index: tuple[slice, ...] | None) -> np.ndarray:
             stored = isinstance(found, parts.Stored)
@@ -223,8 +222,7 @@ def _described(name: str, value: PyTree) -> Iterator[tuple[str, str]]:
 
 def _array(value: object) -> str:
     """Shape, dtype and a hash of the bytes; small arrays also as text."""
-    if isinstance(value, jax.Array):
-        value = _data(value)
+    value = _data(value) if isinstance(value, jax.Array) else value
     array = np.asarray(value)
     digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
     shown = f" = {array.tolist()}" if array.size <= 4 else ""

@@ -43,9 +43,7 @@ def uniform_rows(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 def check_reward(game: Game, reward: ArrayLike) -> jax.Array:
     """The checked reward; zero where there is no action, averaged over equal successors."""
     reward = np.asarray(reward, float)
-    used = np.asarray(game.mdp.probability) > 0
-    if reward.ndim == 2:
-        used = np.asarray(game.available)
+    used = np.asarray(game.available) if reward.ndim == 2 else np.asarray(game.mdp.probability) > 0
     require_shape("reward", reward, used.shape)
     wrong = np.argwhere(used & ~np.isfinite(reward))
     if wrong.size:

@@ -369,9 +369,9 @@ def _search(
     until = Partial(_met, problem.sign * goal, problem.sign)
 
     def one(key: jax.Array, point: jax.Array | None) -> loops.Learned:
-        state = init(key, problem, hparams)
-        if point is not None:
-            state = start_at(point, key, problem, hparams)
+        state = (
+            init(key, problem, hparams) if point is None else start_at(point, key, problem, hparams)
+        )
         return run_until(state, problem, hparams, until=until, num_steps=most)
 
     prepared = problem.prepared
@@ -392,8 +392,7 @@ def _prove(problem: Problem, threshold: float, learned: loops.Learned, budget: B
     best = learned.state.best
     value = np.asarray(best.value, np.float64)
     slack = max(1e-6, 1e4 * float(jnp.finfo(best.value.dtype).eps))
-    if problem.reward is None:
-        value = np.clip(value, 0, 1)
+    value = np.clip(value, 0, 1) if problem.reward is None else value
     size = value.size
     last = np.maximum(learned.metrics.status, Status.NONFINITE)
     found = Feasible(

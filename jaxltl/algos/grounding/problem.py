@@ -145,8 +145,7 @@ def make_problem(
     model = stack_products(blank, automaton, label_on="entry")
     observation = stack_observations(model, _padded(observation, worlds))
     world, state, action, length = joined_demonstrations(worlds, several)
-    if network is None:
-        network = LinearGrounding(len(automaton.propositions))
+    network = LinearGrounding(len(automaton.propositions)) if network is None else network
     logits = (*observation.shape[:-1], len(automaton.propositions))
     what = "the grounding's logits have"
     require_output(what, network, (observation,), logits, "one for each symbol.")

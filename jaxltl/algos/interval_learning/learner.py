@@ -174,10 +174,9 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
             "that make_problem returned."
         )
     world = problem.model.mdp
-    counts = np.asarray(state.counts)[support(world)]
     return learn_guarantee(
         world,
-        counts,
+        np.asarray(state.counts)[support(world)],
         problem.model.automaton,
         confidence,
         graph="given",
@@ -221,8 +220,7 @@ def _value_iteration(state: State, problem: Problem, hparams: Hparams) -> State:
         moves = _expectations(problem, values, lower, upper, nature)
         bounds = jax.vmap(partial(_backup, problem))(moves[:2])
         speed, best = _soonest(problem, hparams, moves[1], bounds[1], moves[2])
-        change = jnp.max(jnp.abs(bounds - values[:2]))
-        return jnp.concatenate([bounds, speed[None]]), best, change
+        return jnp.concatenate([bounds, speed[None]]), best, jnp.max(jnp.abs(bounds - values[:2]))
 
     # The speed restarts from zero: a value that was too high would decay slowly in end components.
     values = jnp.stack([state.pessimistic, state.optimistic, problem.winning.astype(nature.dtype)])

@@ -376,8 +376,7 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
         gradient_norm=optax.tree.norm(before.gradient),
         status=before.parts.status,
     )
-    after = State(state.key, state.step + 1, parameters, value, optimizer)
-    return after, metrics
+    return State(state.key, state.step + 1, parameters, value, optimizer), metrics
 
 
 def _usable(parts: Objective) -> jax.Array:

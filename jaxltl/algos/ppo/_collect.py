@@ -173,9 +173,8 @@ def _walk(
         walkers, used = carry
         start, *chance = given
         walkers, row = jax.vmap(one)(walkers, *chance)
-        ended = row.of.terminated | row.of.truncated
         if pool is not None:
-            number, last = lanes.running_sum(ended, rank, sharding)
+            number, last = lanes.running_sum(row.of.terminated | row.of.truncated, rank, sharding)
             start = jax.tree.map(lambda x: x[(used + number - 1) % hparams.num_resets], pool)
             used = (used + last) % hparams.num_resets
         elif hparams.num_resets == 0:

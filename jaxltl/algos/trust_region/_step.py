@@ -85,8 +85,7 @@ def cpo_weights(
 
 def _floats(*numbers: Numeric) -> tuple[jax.Array, ...]:
     plain = [] if any(isinstance(x, jax.Array) for x in numbers) else [float]
-    dtype = jnp.result_type(*plain, *numbers)
-    return tuple(jnp.asarray(x, dtype) for x in numbers)
+    return tuple(jnp.asarray(x, jnp.result_type(*plain, *numbers)) for x in numbers)
 
 
 def ratio(x: jax.Array, y: jax.Array) -> jax.Array:

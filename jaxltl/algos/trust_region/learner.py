@@ -150,9 +150,8 @@ def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
     mean_key, value_key, first_key = jax.random.split(learner.init_key(key), 3)
     mean = mean_network(hparams, num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
     log_deviation = jnp.full(num_actions, jnp.log(hparams.initial_deviation), dtype)
-    keys = jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
     values = jax.vmap(lambda k: value_network(hparams, dtype).init(k, jnp.zeros(size + 1, dtype)))(
-        keys
+        jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
     )["params"]
     state = State(
         key=key,

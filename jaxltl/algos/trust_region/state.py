@@ -63,8 +63,7 @@ def make_problem(
             f"the environment's actions are {actions}; trust-region search draws from a Gaussian: "
             "give a box of floats, or learn finitely many actions with ppo."
         )
-    if horizon is None:
-        horizon = environment.horizon
+    horizon = environment.horizon if horizon is None else horizon
     if horizon is None:
         raise ValueError(
             "episodes that never end: neither the environment nor horizon says after how many "

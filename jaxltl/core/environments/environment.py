@@ -287,8 +287,7 @@ def make_environment(
     horizon, observations = options.get("horizon"), options.get("observations")
     if horizon is not None:
         horizon = validation.integer("horizon", horizon, least=1)
-    if isinstance(actions, int | np.integer):
-        actions = Finite(int(actions))
+    actions = Finite(int(actions)) if isinstance(actions, int | np.integer) else actions
     if not isinstance(actions, Finite | Box):
         raise ValueError(f"actions={actions!r}; give Finite(number), or make_box(low, high).")
     if isinstance(actions, Finite) and actions.num < 1:

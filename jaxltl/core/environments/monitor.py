@@ -183,8 +183,7 @@ def _check_range(
     monitor: Monitor, letters: jax.Array, length: jax.Array, counts: jax.Array
 ) -> None:
     """Raises ValueError for letters and lengths out of range, which indexing would clip."""
-    traced = (jax.core.Tracer,)
-    if any(isinstance(x, traced) for x in (monitor.delta, letters, length, counts)):
+    if any(isinstance(x, jax.core.Tracer) for x in (monitor.delta, letters, length, counts)):
         return
     steps, width = letters.shape[-1], monitor.delta.shape[-1]
     lengths = np.asarray(length)

@@ -161,8 +161,7 @@ def sequence_sampler(
             f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
             "Booleans, a row for each set and a column for each event."
         )
-    if groups.ndim == 1:
-        groups = np.eye(groups.size, dtype=bool)[groups]
+    groups = np.eye(groups.size, dtype=bool)[groups] if groups.ndim == 1 else groups
     for row in np.flatnonzero(~groups.any(-1))[:1]:
         raise ValueError(f"sets: row {row} has no event; leave it out.")
     most = int(np.flatnonzero(found["reach"])[-1]) + 1 + int(np.flatnonzero(found["avoid"])[-1])
@@ -312,11 +311,10 @@ def _step(
         + violation * (after.verdict == Verdict.VIOLATED)
         + progress * (after.stage - state.stage) / state.sequence.length
     )
-    decided = after.verdict != Verdict.UNDECIDED
     return Timestep(
         world=after,
         reward=reward.astype(jnp.result_type(float)),
-        terminated=jnp.asarray(found.terminated, bool) | decided,
+        terminated=jnp.asarray(found.terminated, bool) | (after.verdict != Verdict.UNDECIDED),
         truncated=found.truncated,
         cost=found.cost,
         discount=found.discount,

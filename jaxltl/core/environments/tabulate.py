@@ -138,9 +138,8 @@ def tabulate(
     initial = np.zeros(len(listed.ended))
     np.add.at(initial, listed.start, probability)
     world = _joined(listed.world)
-    model = _model(kind, listed, initial, _labels(kind, world, listed.ended.size))
     return Table(
-        model,
+        _model(kind, listed, initial, _labels(kind, world, listed.ended.size)),
         _typed(kind, world),
         listed.start,
         listed.ended == _TERMINATED,
@@ -571,7 +570,6 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
     rewards = {"reward": Rewards(transition=reward)}
     if cost.any():
         rewards["cost"] = Rewards(transition=cost)
-    number = np.concatenate([action, np.zeros(len(over), np.int64)])[order]
     return make_sparse(
         offsets_from_counts(np.bincount(owner, minlength=num_states)),
         np.arange(len(owner) + 1) * width,
@@ -581,5 +579,5 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
         label=label,
         propositions=environment.propositions,
         rewards=rewards,
-        action=number,
+        action=np.concatenate([action, np.zeros(len(over), np.int64)])[order],
     )

@@ -105,7 +105,6 @@ def _table(arrays: Arrays) -> FiniteMemoryPolicy:
     for name in ("policy", "initial_memory", "next_memory", "label_on"):
         if name not in arrays:
             raise ValueError(f"the array {name} is missing; write the file by save_policy.")
-    names = {x: tuple(map(str, arrays[x])) for x in ("actions", "states") if x in arrays}
     policy = FiniteMemoryPolicy(
         arrays["policy"],
         arrays["initial_memory"],
@@ -113,7 +112,7 @@ def _table(arrays: Arrays) -> FiniteMemoryPolicy:
         str(arrays["label_on"]),
         automaton_of(arrays),
         arrays.get("letter"),
-        **names,
+        **{x: tuple(map(str, arrays[x])) for x in ("actions", "states") if x in arrays},
     )
     _check(policy)
     return policy

@@ -203,8 +203,7 @@ def _reset(held: Held, key: Key) -> Seen:
 def _step(
     held: Held, endless: Held, parts: Held, world: Seen, action: PyTree, key: Key
 ) -> Timestep:
-    if parts.it:
-        action = jnp.stack(jnp.unravel_index(action, parts.it))
+    action = jnp.stack(jnp.unravel_index(action, parts.it)) if parts.it else action
     return _moved(held, endless, world, action, key)
 
 

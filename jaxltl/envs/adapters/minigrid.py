@@ -135,6 +135,5 @@ def from_navix(
 
 def _step_navix(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
     del key  # the state has one
-    running = copied(world).replace(step_type=jnp.zeros_like(world.step_type))
-    found = held.it.step(running, action)
+    found = held.it.step(copied(world).replace(step_type=jnp.zeros_like(world.step_type)), action)
     return timestep(found, world, found.reward, found.is_termination(), found.is_truncation())

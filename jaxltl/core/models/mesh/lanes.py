@@ -141,10 +141,9 @@ def require_split(name: str, sharding: NamedSharding | None, **sizes: int) -> No
     devices = _count(sharding.mesh, axes)
     for what, size in sizes.items():
         if size % devices:
-            more = devices - size % devices
             raise ValueError(
                 f"{name} splits over {devices} devices, but {what} is {size}; choose a multiple, "
-                f"such as {size + more}."
+                f"such as {size - size % devices + devices}."
             )
 
 
@@ -263,8 +262,7 @@ def _number(lanes: tuple[bool, ...], arguments: PyTree) -> int:
 def _placed(
     arguments: PyTree, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
 ) -> PyTree:
-    if jax.sharding.get_abstract_mesh().empty:
-        mesh = automatic(mesh)
+    mesh = automatic(mesh) if jax.sharding.get_abstract_mesh().empty else mesh
     even = number % _count(mesh, axes) == 0
     own, all_ = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
 

@@ -62,12 +62,11 @@ class StateLayout(NamedTuple):
         return int(self.starts[d]), int(self.starts[d + 1])
 
     def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
-        here = jax.process_index()
         found = [
             jax.device_put(piece, device)
             for d, piece in pieces.items()
             for device in self.devices(d)
-            if device.process_index == here
+            if device.process_index == jax.process_index()
         ]
         some = next(iter(pieces.values()))
         shape = (some.shape[0] * self.parts, *some.shape[1:])

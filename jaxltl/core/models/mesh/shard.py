@@ -401,7 +401,6 @@ _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
 def _facts(part: _Range) -> np.ndarray:
     """Actions, widest row, transitions, initial mass, and the number of rows of each width."""
     width = np.diff(part.entry_start)
-    rows = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
     return np.concatenate(
         [
             [
@@ -410,7 +409,7 @@ def _facts(part: _Range) -> np.ndarray:
                 part.successor.size,
                 part.initial.sum(),
             ],
-            rows,
+            np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size),
         ]
     )[None]
 
