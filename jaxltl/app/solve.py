@@ -245,20 +245,14 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
 def result_entry(result: Result) -> Record:
     """Answer to a property, as a JSON object."""
     found = result.answer
-    entry: Record = {
-        "property": result.query.text,
-        "value": None,
-        "lower": None,
-        "upper": None,
-        "status": "INVALID",
-    }
+    none = dict.fromkeys(("value", "lower", "upper"))
+    entry: Record = {"property": result.query.text, **none, "status": "INVALID"}
     if result.query.parsed is not None and result.query.parsed.name is not None:
         entry["name"] = result.query.parsed.name
     if isinstance(found, Answer):
         entry |= {
             "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
-            "lower": _over_states(found.lower.tolist()),
-            "upper": _over_states(found.upper.tolist()),
+            **{key: _over_states(getattr(found, key).tolist()) for key in ("lower", "upper")},
             "status": found.status.name,
             "method": found.method,
         }
@@ -279,20 +273,12 @@ def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> Record:
     if isinstance(found, Pareto):
         return entry | {"value": found.points.tolist(), "gap": _number(float(found.gap))}
     if found.nearest is not None:
-        near = found.nearest
-        entry["nearest"] = {
-            "lower": _over_states(near.lower.tolist()),
-            "upper": _over_states(near.upper.tolist()),
-            "gap": _over_states(near.gap.tolist()),
-        }
+        near = {key: getattr(found.nearest, key).tolist() for key in ("lower", "upper", "gap")}
+        entry["nearest"] = {key: _over_states(values) for key, values in near.items()}
     if isinstance(found, Achievable):
         return entry | {"value": found.holds}
-    return entry | {
-        "value": _number(found.value),
-        "lower": _number(found.lower),
-        "upper": _number(found.upper),
-        "achievable": found.holds,
-    }
+    numbers = {key: _number(getattr(found, key)) for key in ("value", "lower", "upper")}
+    return entry | numbers | {"achievable": found.holds}
 
 
 def _over_states(values: list[Any]) -> Any:

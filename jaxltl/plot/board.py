@@ -102,7 +102,7 @@ def draw_moves(
         if not step.any():
             axes.add_patch(Circle(tuple(center), 0.09 * scale, fc=face, ec=edge, lw=0.7, zorder=6))
             continue
-        corners = _triangle(center, step, 0.18, 0.18 + 0.24 * scale, 0.12 * scale)
+        corners = triangle(center, step, 0.18, 0.18 + 0.24 * scale, 0.12 * scale)
         axes.add_patch(Polygon(corners, facecolor=face, edgecolor=edge, lw=0.7, zorder=6))
 
 
@@ -138,7 +138,7 @@ def draw_arrows(
                 continue
             center, step = np.array([column + 0.5, row + 0.5]), np.array(STEPS[actions[a]], float)
             tip, width = 0.1 + 0.34 * chance, 0.045 + 0.075 * chance
-            shapes.append(_triangle(center, step, 0.03, tip, width))
+            shapes.append(triangle(center, step, 0.03, tip, width))
             colors.append(PAPER if dark else INK)
     axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
 
@@ -155,7 +155,7 @@ def shade_cells(axes: Axes, values: NDArray[np.float64], limits: tuple[float, fl
     )
 
 
-def _triangle(
+def triangle(
     center: NDArray[np.float64], step: NDArray[np.float64], base: float, tip: float, width: float
 ) -> list[NDArray[np.float64]]:
     """Corners of an arrow head; `base` and `tip` are distances from the centre."""

@@ -18,7 +18,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.io.templates import render
 from jaxltl.plot import layout
 from jaxltl.plot.automata import edge_texts, on_the_host
-from jaxltl.plot.board import STEPS
+from jaxltl.plot.board import STEPS, triangle
 from jaxltl.plot.maps import kind_colors, kind_marks
 from jaxltl.plot.style import SCALE, MapOptions
 from jaxltl.plot.worlds import TINTS
@@ -244,14 +244,8 @@ def _layer(
 
 def _triangle(row: int, column: int, action: str, chance: float) -> str:
     """SVG of an arrow head with a length proportional to the probability of its action."""
-    step = np.array(STEPS[action], float)
-    side = step[::-1] * (0.055 + 0.085 * chance)
-    middle = np.array([column + 0.5, row + 0.5])
-    corners = (
-        middle + step * 0.03 + side,
-        middle + step * (0.12 + 0.34 * chance),
-        middle + step * 0.03 - side,
-    )
+    middle, step = np.array([column + 0.5, row + 0.5]), np.array(STEPS[action], float)
+    corners = triangle(middle, step, 0.03, 0.12 + 0.34 * chance, 0.055 + 0.085 * chance)
     return "M" + "L".join(f"{x * CELL:.1f} {y * CELL:.1f}" for x, y in corners) + "Z"
 
 
@@ -268,10 +262,9 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
       True
     """
     wide, high, left, below = 320.0, 180.0, 64.0, 26.0
-    shown, x = np.asarray(values, float), np.asarray(steps, float)
-    shown = np.where(np.isfinite(shown), shown, np.nan)
+    shown = np.where(np.isfinite(values), values, np.nan)
     kept = np.isfinite(shown).any(axis=1)
-    shown, x = shown[kept], x[kept]
+    shown, x = shown[kept], np.asarray(steps, float)[kept]
     least, most = float(np.nanmin(shown)), float(np.nanmax(shown))
     logs = least > 0 and most > 100 * least
     scaled = np.log10(shown) if logs else shown
