@@ -24,8 +24,17 @@ from jaxltl.app.reports.explorer import (
     explorer,
     learned_runs,
 )
-from jaxltl.app.reports.figures import Remark, certified, number, probability, rounded_down
-from jaxltl.app.reports.page import Part, render_page, render_remarks, render_table
+from jaxltl.app.reports.page import (
+    Part,
+    Remark,
+    certified,
+    number,
+    probability,
+    render_page,
+    render_remarks,
+    render_table,
+    rounded_down,
+)
 from jaxltl.app.wording import Result, many, place
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict

@@ -6,8 +6,15 @@ from collections.abc import Sequence
 
 from jaxltl.app.reports import proof
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.figures import Remark, number, probability
-from jaxltl.app.reports.page import Part, render_page, render_remarks, render_table
+from jaxltl.app.reports.page import (
+    Part,
+    Remark,
+    number,
+    probability,
+    render_page,
+    render_remarks,
+    render_table,
+)
 from jaxltl.app.wording import Result, many
 
 _PROBABILITIES = ("success", "violation", "undecided")

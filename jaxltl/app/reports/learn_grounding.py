@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.figures import (
+from jaxltl.app.reports.page import (
+    Part,
     Remark,
     aligned,
     certified,
     number,
     probability,
     remark_lines,
+    render_page,
+    render_remarks,
     rounded_down,
 )
-from jaxltl.app.reports.page import Part, render_page, render_remarks
 from jaxltl.app.wording import Result, many
 
 _HEADER = ("symbol", "meaning", "weight", "alternatives", "decisive steps")

@@ -25,8 +25,16 @@ from jaxltl.app.reports.explorer import (
     explorer,
     learned_runs,
 )
-from jaxltl.app.reports.figures import Remark, certified, number, probability
-from jaxltl.app.reports.page import Part, render_page, render_remarks, render_table
+from jaxltl.app.reports.page import (
+    Part,
+    Remark,
+    certified,
+    number,
+    probability,
+    render_page,
+    render_remarks,
+    render_table,
+)
 from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.todirl.results import summary
 from jaxltl.app.wording import Result, many

@@ -1,25 +1,28 @@
-"""Reports as HTML pages: jinja2 templates, and the data of their interactive parts."""
+"""Reports as pages and texts: jinja2 templates, formats of numbers, and interactive parts."""
 
 from __future__ import annotations
 
 import base64
 import functools
 import json
+import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import click
 import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from jaxltl.app.reports import figures
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.explorer import START, Curves, Explorer, Layer, TooLarge
+from jaxltl.app.wording import Record, Result, many, place, where
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.io import templates
-from jaxltl.app.wording import Record, Result, many, place, where
+
 
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
 
@@ -77,12 +80,12 @@ def render_text(template: str, **values: object) -> list[str]:
     return [line.rstrip() for line in text.splitlines()]
 
 
-def render_table(template: str, remarks: Iterable[figures.Remark], **values: object) -> str:
+def render_table(template: str, remarks: Iterable[Remark], **values: object) -> str:
     """A report for the terminal, with its remarks at the end."""
-    return "\n".join([*render_text(template, **values), *figures.remark_lines(remarks)])
+    return "\n".join([*render_text(template, **values), *remark_lines(remarks)])
 
 
-def render_remarks(template: str, **values: object) -> list[figures.Remark]:
+def render_remarks(template: str, **values: object) -> list[Remark]:
     """Remarks of a template whose lines are ``kind: text``."""
     lines = (line.partition(": ") for line in render_text(template, **values) if line)
     return [(kind, text) for kind, _, text in lines]
@@ -91,9 +94,8 @@ def render_remarks(template: str, **values: object) -> list[figures.Remark]:
 @functools.cache
 def _environment() -> jinja2.Environment:
     found = templates.environment("jaxltl.app.reports")
-    names = ("number", "probability", "certified", "mean_deviation", "rounded_down")
-    functions = [getattr(figures, name) for name in names]
-    found.filters |= {function.__name__: function for function in (*functions, place, many)}
+    functions = (number, probability, certified, mean_deviation, rounded_down, place, many)
+    found.filters |= {function.__name__: function for function in functions}
     return found
 
 
@@ -204,7 +206,7 @@ def _layer_table(part: Explorer, key: str, layer: Layer) -> Record:
         chances = None if layer.policy is None else layer.policy[state]
         text = [name] if name else []
         if value is not None:
-            text.append(figures.probability(value))
+            text.append(probability(value))
         if chances is not None and np.isfinite(chances).all():
             best = part.actions[int(np.argmax(chances))]
             text.append(_ARROWS.get(best, best))
@@ -252,7 +254,7 @@ def _curves_view(part: Curves, drawn: Mapping[str, str]) -> Record:
         "plots": [(name.replace("_", " "), Markup(svg)) for name, svg in drawn.items()],
         "header": ("step", *names),
         "rows": [
-            (int(part.steps[t]), *(figures.number(_median(x[t])) for x in part.figures.values()))
+            (int(part.steps[t]), *(number(_median(x[t])) for x in part.figures.values()))
             for t in shown
         ],
     }
@@ -261,3 +263,64 @@ def _curves_view(part: Curves, drawn: Mapping[str, str]) -> Record:
 def _median(values: np.ndarray) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else None
+
+
+# --- formats ---------------------------------------------------------------------------------
+
+
+Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
+
+
+def remark_lines(remarks: Iterable[Remark]) -> list[str]:
+    """Remarks as paragraphs for the terminal, warnings in red."""
+    return [
+        "\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text)
+        for kind, text in remarks
+    ]
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table of texts."""
+    width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, width)).rstrip() for row in rows]
+
+
+def mean_deviation(values: Iterable[float | None]) -> str:
+    """Mean and standard deviation of the finite values."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "unknown"
+    deviation = statistics.stdev(known) if len(known) > 1 else 0.0
+    return f"{number(statistics.fmean(known))} ± {deviation:.2g}"
+
+
+def probability(value: float | None) -> str:
+    """A probability to four places; a small one with its exponent."""
+    if value is None:
+        return "unknown"
+    return f"{value:.4f}" if value >= 0.00095 or value == 0 else f"{value:.1e}"
+
+
+def rounded_down(value: float) -> str:
+    """A lower bound, rounded down to four places."""
+    return f"{math.floor(value * 1e4) / 1e4:.4f}"
+
+
+def certified(entry: Result) -> str:
+    """The certificate of a value: exact, an error bound, or the interval if it is wide."""
+    value, lower, upper = entry["value"], entry["lower"], entry["upper"]
+    if value is None or lower is None or upper is None:
+        return "no bounds"
+    width = max(value - lower, upper - value)
+    if width <= 0:
+        return "exact"
+    if width < 5e-4:
+        return f"within {width:.1e}"
+    return f"in [{rounded_down(lower)}, {math.ceil(upper * 1e4) / 1e4:.4f}]"
+
+
+def number(value: float | None) -> str:
+    """A number in four digits, or "unknown"."""
+    if value is None:
+        return "unknown"
+    return f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.figures import Remark, number, probability
+from jaxltl.app.reports.page import Remark, number, probability
 from jaxltl.app.wording import Result
 
 _PRINTED = 5  # vertices of the front in the terminal

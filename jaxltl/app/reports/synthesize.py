@@ -16,8 +16,7 @@ from jaxltl.app.files.game import task_text
 from jaxltl.app.job import plain, took
 from jaxltl.app.reports.drawing import Picture, draw
 from jaxltl.app.reports.explorer import Explorer, Run, TooLarge, View, explorer
-from jaxltl.app.reports.figures import Remark, aligned, number
-from jaxltl.app.reports.page import render_page, render_text
+from jaxltl.app.reports.page import Remark, aligned, number, render_page, render_text
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.files import atomic_write

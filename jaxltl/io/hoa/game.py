@@ -22,9 +22,8 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformu
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
-from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priority
+from jaxltl.io.hoa.header import Header, condition_given, decisive_sets, edge_priority, read_header
 from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.header import Header, read_header
 from jaxltl.io.hoa.table import by_number, guarded_edges, label_reader, marks_of, nondeterminism
 from jaxltl.io.hoa.hoa import header_lines, parity_text
 from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of

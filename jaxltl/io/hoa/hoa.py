@@ -17,15 +17,17 @@ from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.logic.diagram import Cube
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.io.hoa.acceptance import (
+from jaxltl.io.hoa.header import (
+    MAX_PRIORITIES,
+    Header,
     acceptance_of,
     colors_of,
     condition_given,
     decisive_sets,
     edge_priority,
+    read_header,
 )
 from jaxltl.io.hoa.grammar import error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.header import MAX_PRIORITIES, Header, read_header
 from jaxltl.io.hoa.table import Table, alphabet_of, by_number, read_table
 
 if TYPE_CHECKING:
