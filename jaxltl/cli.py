@@ -29,7 +29,6 @@ from jaxltl.app.wording import Record
 if TYPE_CHECKING:
     from jaxltl.core.automata.automaton import Automaton
 
-
 _PATH = click.Path(path_type=Path)
 _task_file = click.argument("task_file", metavar="TASK.toml", type=_PATH)
 _out = click.option("--out", type=_PATH, help="Directory for the results.  [default: out/NAME]")

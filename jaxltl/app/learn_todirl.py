@@ -80,9 +80,7 @@ from jaxltl.io.learned_reward import LearnedReward, save_reward
 
 DOUBLE = True
 
-
 _BATCH = 64  # worlds in a batch of planning
-
 
 _EXPERT_DISCOUNT = 0.99  # largest default
 

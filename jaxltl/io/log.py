@@ -19,7 +19,6 @@ from jaxltl.core.models import MDP, DenseMDP, SparseMDP, TransitionCounts, make_
 from jaxltl.core.models.construct.counts import Places, in_order, listed, merged, place_of, places
 from jaxltl.io.files import streamed
 
-
 _COUNT = re.compile(r"[0-9]{1,16}")
 _MOST = 2**53  # transitions
 _HELD = 2**16  # distinct lines buffered before equal ones are merged

@@ -29,7 +29,6 @@ SCALE = LinearSegmentedColormap.from_list(
     "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
 )
 
-
 Point: TypeAlias = Sequence[float] | NDArray[np.float64]
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 from typing import Annotated as Key
 
-
 from jaxltl.app.files.schema import (
     Count,
     Discount,

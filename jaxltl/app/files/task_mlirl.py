@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 from typing import Annotated as Key
 
-
 from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
     Confidence,

@@ -40,7 +40,6 @@ from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict
 from jaxltl.core.values.undiscounted.mixture import from_starts
 
-
 _OPTIMAL = 1e-6  # certified loss up to which a policy is reported as optimal
 _NEGLIGIBLE = 0.05  # weight without a reported meaning
 

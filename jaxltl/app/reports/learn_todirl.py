@@ -42,7 +42,6 @@ from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
 
-
 _POLICIES = {
     "learned": "learned reward",
     "expert": "expert, who knows the formula",
@@ -201,7 +200,6 @@ def remarks(result: Result) -> list[Remark]:
 
 
 _PICTURES = 3  # worlds that are drawn, of each kind
-
 
 _END = {
     "cosafe": "is satisfied or violated",

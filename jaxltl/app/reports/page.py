@@ -23,7 +23,6 @@ from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.io import templates
 
-
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
 
 _NARROW = 24  # columns of the widest map that is shown next to the automaton

@@ -23,7 +23,6 @@ from jaxltl.core.types import Status
 from jaxltl.core.values import OptimalActions, Performance
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
 
-
 TreeT = TypeVar("TreeT")
 
 LENGTH = 100  # limit of a demonstration of a soft-optimal expert

@@ -38,10 +38,8 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 
-
 _HEADERS = "HOA States Start AP Alias Acceptance acc-name tool name properties State"
 KNOWN_HEADERS = {f"{name}:": name.upper().replace("-", "_") for name in _HEADERS.split()}
-
 
 # Lark omits terminals with a leading underscore from the trees.
 _TERMINAL = {

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Integers
 from jaxltl.io.hoa.grammar import FALSE, KNOWN_HEADERS, TRUE, Item, Tree, error_at, unquoted
 
-
 if TYPE_CHECKING:
     from lark import Token
 

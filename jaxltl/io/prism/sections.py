@@ -26,7 +26,6 @@ from jaxltl.io.tokens import (
     truncated,
 )
 
-
 _REWARD_NAME = re.compile(rb'^#[ \t]*Reward structure[ \t]+"([^"\n]*)"', re.MULTILINE)
 _LABEL = re.compile(rb'\s*(\d+)\s*=\s*"([^"]*)"')
 

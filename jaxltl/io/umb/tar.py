@@ -23,7 +23,6 @@ _REGULAR = b"0\x007"
 _RECORD = re.compile(rb"([0-9]{1,6}) ([^=\n]{1,200})=")
 _NO_DATA = b"123456"  # links, devices and directories
 
-
 _STEP = 2**20  # bytes of a file that are read at a time
 
 
