@@ -105,7 +105,7 @@ class SweepSettings:
     tolerance: float  # the width of the bounds beyond that of the known values
     relative: bool  # True if the tolerance is a share of the value
     unit: float  # the relative rounding of one backup
-    max_sweeps: int = 150
+    max_sweeps: int = 200
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,9 @@ _SWEEPS = 12  # after each linear system, which propagate improvements
 _SWEPT_ROUNDS = 12  # after which improvements are strict, so that policy iteration ends
 _KEPT = 0.75  # of the extra cost: smaller gains are ignored, and the rest proves the bound
 _MAX_ROUNDS = 300
+# Unknowns from which value iteration is tried, its sweeps, and a change at its end, in tolerances;
+# elimination takes longer in cores of zeroconf with 120,000 unknowns.
+_LARGE_CORE, _MOST_SWEEPS, _CONVERGED = 50_000, 400, 0.01
 _USEFUL = 0.1  # bounds of this width give a start policy for extended precision
 
 
@@ -209,10 +212,12 @@ class _CoreSolver:
 
     def solve(self) -> _CoreValues:
         """Bounds, by double precision if that suffices."""
-        equation = self.equation
-        num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
-        first = self._made_proper(equation.greedy_policy(np.zeros(equation.size), num_sweeps))
-        best, rounds, last = self._iterate(first)
+        equation, rounds = self.equation, 0
+        value, converged = self._value_iteration()
+        last = first = self._made_proper(equation.greedy_policy(value, 1))
+        best = self._by_sweeps(value, first) if converged else None
+        if best is None or not self._is_narrow(best, self.tolerance):
+            best, rounds, last = self._iterate(first)
         for method in (self._by_refinement, self._by_gth_refinement, self._by_fractions):
             if best is not None and self._is_narrow(best, self.tolerance):
                 break
@@ -226,6 +231,62 @@ class _CoreSolver:
             attained, outer = (low, high) if equation.sign > 0 else (high, low)
             best = _CoreValues(attained, outer, low, last, rounds, "nothing proven")
         return replace(best, policy=self.row[best.policy])
+
+    def _value_iteration(self) -> tuple[Floats, bool]:
+        """A value after a few sweeps, in large cores more while states converge; True if all do."""
+        equation, large = self.equation, self.equation.size > _LARGE_CORE
+        value, left = np.zeros(equation.size), np.inf
+        if equation.is_chain and not large:
+            return value, False
+        num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
+        for k in range(1, _MOST_SWEEPS):
+            before, value = value, equation.best(equation.backup(value))
+            if k < num_sweeps or k % _SWEEPS:
+                continue
+            if not large:
+                break
+            least = _CONVERGED * self.tolerance / k * self._weight(value)
+            # Orders of magnitude by which a state changes too much, in the mean.
+            last, left = left, float(np.log(np.maximum(np.abs(value - before) / least, 1)).mean())
+            if not left:
+                return value, True
+            # The rate varies, so that it may predict more sweeps.
+            if left * _SWEEPS > (last - left) * (2 * _MOST_SWEEPS):
+                break
+        return value, False
+
+    def _by_sweeps(self, value: Floats, policy: Integers) -> _CoreValues | None:
+        """Bounds from a converged value, by sweeps with the extra cost instead of linear systems."""
+        equation, sign, weight = self.equation, self.equation.sign, self._weight(value)
+        time = self._truncated_time(policy, weight)
+        if time is None:
+            return None
+        extra = self._extra_cost(time, value, _MARGIN)
+        value, rounds = value + sign * extra * time, 0
+        while rounds < _MOST_SWEEPS:
+            rounds += 1
+            image = equation.backup(value)
+            best = equation.best(image)
+            before, value = value, best + sign * extra * weight
+            if (8 * np.abs(value - before) <= extra * weight).all():
+                break
+        last, policy = policy, equation.choices.first(image, best)
+        if (policy != last).any():
+            time = self._truncated_time(policy, weight)
+        found = None if time is None else self._certified(policy, value, extra, weight, time)
+        if found is None or time is None:
+            return None
+        middle = value - sign * extra * time
+        return _CoreValues(found, value, middle, policy, rounds, "value iteration")
+
+    def _truncated_time(self, policy: Integers, weight: Floats) -> Floats | None:
+        """A policy's expected sum of weights but for an eighth of them; None if that takes long."""
+        rows, stays, time = self.equation.matrix[policy], weight, np.zeros(policy.size)
+        for _ in range(_MOST_SWEEPS):
+            if (8 * stays <= weight).all():
+                return time
+            time, stays = time + stays, rows @ stays
+        return None
 
     def _iterate(self, policy: Integers) -> tuple[_CoreValues | None, int, Integers]:
         """Policy iteration with an extra cost per step: the best bounds, rounds, last policy."""
@@ -263,19 +324,18 @@ class _CoreSolver:
                     break  # the gains are rounding
                 solver = solver.other(policy)
                 continue
-            found = self._certified(solver, policy, value, extra, weight)
+            time = solver.solve(weight)
+            found = self._certified(policy, value, extra, weight, time)
             if found is not None:
-                attained, outer, time = found
-                best = _CoreValues(
-                    attained, outer, value - sign * extra * time, policy, rounds, solver.method
-                )
+                middle = value - sign * extra * time
+                best = _CoreValues(found, value, middle, policy, rounds, solver.method)
                 if self._is_narrow(best, self.tolerance / 2):
                     break
             else:
                 margin = _MARGIN
             old, weight = weight, self._weight(value)
             same = bool((np.abs(weight - old) <= old / 2).all())
-            if found is None or not same:
+            if not same:
                 time = solver.solve(weight)
             other = self._extra_cost(time, value, margin)
             # The value of a better policy may need a larger extra for its rounding.
@@ -321,9 +381,9 @@ class _CoreSolver:
         return max(aim * share, margin * (self.unit + self.outer_error) * max(largest, 1e-300))
 
     def _certified(
-        self, solver: Factors, policy: Integers, value: Floats, extra: float, weight: Floats
-    ) -> tuple[Floats, Floats, Floats] | None:
-        """The attained bound, the bound that is not exceeded, and the policy's expected time.
+        self, policy: Integers, value: Floats, extra: float, weight: Floats, time: Floats
+    ) -> Floats | None:
+        """The attained bound, if the value is the bound that is not exceeded; t is the time.
 
         Backups of a value that is not carried away from the optimum, or towards it by the policy
         alone, each with a slack for rounding; and ``t - P t >= w / 2`` shows that the policy leaves.
@@ -333,7 +393,6 @@ class _CoreSolver:
         slack = unit * (equation.cost + equation.matrix @ np.abs(value))
         if not (sign * equation.backup(value) + slack <= sign * value[equation.owner]).all():
             return None
-        time = solver.solve(weight)
         rows, cost = equation.matrix[policy], equation.cost[policy]
         if not ((time >= 0) & (time - rows @ time >= np.maximum(weight / 2, unit * time))).all():
             return None
@@ -341,7 +400,7 @@ class _CoreSolver:
         slack = unit * (cost + rows @ np.abs(attained))
         if not (sign * attained <= sign * (cost + rows @ attained) - slack).all():
             return None
-        return attained, value, time
+        return attained
 
     def _is_narrow(self, found: _CoreValues, tolerance: float) -> bool:
         sign = self.equation.sign

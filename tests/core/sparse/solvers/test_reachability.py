@@ -121,7 +121,15 @@ def best_of(values, *, maximize):
     return [min((x for x in c if x is not None), default=None) for c in columns]
 
 
-WAYS = ["as it is", "in the core", "by sweeps", "contracted", "refined", "eliminated at last"]
+WAYS = [
+    "as it is",
+    "in the core",
+    "by value iteration",
+    "by sweeps",
+    "contracted",
+    "refined",
+    "eliminated at last",
+]
 
 
 @pytest.fixture(params=WAYS)
@@ -135,6 +143,8 @@ def way(request, monkeypatch):
     if request.param in ("by sweeps", "eliminated at last"):
         monkeypatch.setattr(elimination, "_SMALL", 0)
         monkeypatch.setattr(elimination, "_SPREAD", 10**9)
+    if request.param == "by value iteration":
+        monkeypatch.setattr(transient, "_LARGE_CORE", 0)
     if request.param == "eliminated at last":
         monkeypatch.setattr(elimination, "_swept", lambda _, b: np.full(b.size, np.nan))
     if request.param == "refined":
