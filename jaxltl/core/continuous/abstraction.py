@@ -22,6 +22,9 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
 
 TAIL = 1e-15  # probability of unbounded noise outside its box, for which nothing is assumed
+# Below this mean of the lower probabilities of successors value iteration gives hardly more than sets do
+# (benchmarks/continuous.py, triple integrator), and is left to finer grids.
+CERTAIN_SHARE = 0.01
 _ROWS = 2**16  # handled at once, which bounds the memory
 UNPROVEN, ITERATED, ALMOST_SURE, SURE = range(4)  # how the lower bound of a state was found
 
@@ -51,6 +54,7 @@ class Bounds:
       how: ``int8[Q, C]``, how the lower bound was found.
       action: ``int[Q, C]``, which attains the lower bound.
       initial: ``bool[C]``, cells that meet the initial states.
+      needed: ``bool[C]``, cells on whose bounds those of the initial cells may depend.
       seconds: wall time by stage.
     """
 
@@ -61,6 +65,7 @@ class Bounds:
     how: Integers
     action: Integers
     initial: Booleans
+    needed: Booleans
     seconds: dict[str, float] = field(default_factory=dict)
 
     def initial_bounds(self) -> tuple[Floats, Floats]:
@@ -163,10 +168,18 @@ def bound_satisfaction(
             f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "
             f"{lower.min():.6g}, at most {upper.min():.6g}"
         )
-        cells = bounds.grid.num_cells * 2**bounds.grid.num_axes
-        if _finished(lower, upper, limits) or cells > limits.max_cells:
+        finer = _finer(bounds.grid, bounds.needed, limits)
+        if _finished(lower, upper, limits) or finer is None:
             return replace(bounds, seconds=seconds)
-        refined = _refined(dynamics, formula, bounds)
+        refined = _refined(dynamics, formula, bounds, *finer)
+
+
+def _finer(
+    grid: Grid, needed: Booleans, limits: Limits
+) -> tuple[Grid, tuple[Integers, ...]] | None:
+    """The refined grid and the parents of its intervals, or None if it has too many cells."""
+    finer, parents = grid.halve(needed)
+    return (finer, parents) if grid.num_cells < finer.num_cells <= limits.max_cells else None
 
 
 def _finished(lower: Floats, upper: Floats, limits: Limits) -> bool:
@@ -204,15 +217,20 @@ def _first(dynamics: Dynamics, formula: str | Formula, grid: Grid) -> Bounds:
         np.where(decided == 1, SURE, UNPROVEN).astype(np.int8),
         np.zeros(shape, np.int32),
         initial,
+        np.ones(grid.num_cells, bool),
     )
 
 
-def _refined(dynamics: Dynamics, formula: str | Formula, bounds: Bounds) -> Bounds:
-    """The same bounds on cells of half the size along each axis."""
-    grid = bounds.grid.refine((2,) * bounds.grid.num_axes)
+def _refined(
+    dynamics: Dynamics,
+    formula: str | Formula,
+    bounds: Bounds,
+    grid: Grid,
+    parents: tuple[Integers, ...],
+) -> Bounds:
+    """The same bounds on a finer grid with the parents of its intervals."""
     task, initial = _product(dynamics, formula, grid)
-    parent = np.stack(np.unravel_index(np.arange(grid.num_cells), grid.shape)) // 2
-    cell = np.ravel_multi_index(tuple(parent), bounds.grid.shape)
+    cell = np.ravel_multi_index(np.ix_(*parents), bounds.grid.shape).reshape(-1)
     if not _same_memory(task, bounds.task):  # fewer labels are uncertain: other memory states occur
         fresh = _first(dynamics, formula, grid)
         return replace(fresh, seconds=bounds.seconds)
@@ -224,6 +242,7 @@ def _refined(dynamics: Dynamics, formula: str | Formula, bounds: Bounds) -> Boun
         bounds.how[:, cell],
         bounds.action[:, cell],
         initial,
+        bounds.needed[cell],
     )
 
 
@@ -244,9 +263,9 @@ def _improve(
     clock = _Clock(seconds)
     box = noise_box(dynamics)
     open_cells = _open(bounds.lower, bounds.upper, bounds.task)
-    cells = np.flatnonzero(open_cells.any(0))
+    cells = np.flatnonzero(open_cells.any(0) & bounds.needed)
     if not len(cells):
-        return bounds
+        return replace(bounds, needed=np.zeros(bounds.grid.num_cells, bool))
     report(f"{bounds.grid.num_cells:,} cells: images of {len(cells):,} cells")
     images = image_boxes(control.step, bounds.grid, cells, control.actions, box)
     rows = _successors(dynamics, bounds.grid, images, control, box)
@@ -265,7 +284,11 @@ def _improve(
         upper = np.minimum(upper, 1 - found.value)
     # Each bound is sound; where rounding makes them cross, the probability is between both.
     upper = np.maximum(upper, lower.value)
-    return replace(bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action)
+    active = problem.active(bounds.task, lower.value, upper)
+    return replace(
+        bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action,
+        needed=problem.needed(active),
+    )  # fmt: skip
 
 
 def _open(lower: Floats, upper: Floats, task: TaskProduct) -> Booleans:
@@ -327,6 +350,15 @@ class _Problem:
     limits: Limits
     initial: Booleans
 
+    def refinable(self, active: Integers) -> bool:
+        """True if the grid refined at rows' positions has few enough cells."""
+        return _finer(self.grid, self.needed(active), self.limits) is not None
+
+    def needed(self, active: Integers) -> Booleans:
+        """Cells ``bool[C]`` at rows' positions."""
+        found: Booleans = np.isin(np.arange(self.grid.num_cells), self.rows.cells[active])
+        return found
+
     def lower_bounds(
         self, task: TaskProduct, before: _Lower, upper: Floats, maximize: bool, clock: _Clock
     ) -> _Lower:
@@ -342,14 +374,15 @@ class _Problem:
         if not self.rows.outside.all() or task.outside.any():
             prove(self.rows, SURE)
         clock.stage("sets")
-        active = self._active(task, value, upper)
+        active = self.active(task, value, upper)
         if not len(active) or not any(j >= 0 for j in self.images.noise_of):
             return _Lower(value, how, action)
         rows, bounds = self._part(active)
         prove(replace(rows, certain=bounds.certain()), ALMOST_SURE)
         clock.stage("sets")
-        active = self._active(task, value, upper)
-        if len(active):
+        active = self.active(task, value, upper)
+        coarse = bounds.certain_share() < CERTAIN_SHARE and self.refinable(active)
+        if len(active) and not coarse:
             if len(active) < len(rows.cells):
                 rows, bounds = self._part(active)
             before_sweeps = value
@@ -359,7 +392,7 @@ class _Problem:
         clock.stage("value iteration")
         return _Lower(value, how, action)
 
-    def _active(self, task: TaskProduct, value: Floats, upper: Floats) -> Integers:
+    def active(self, task: TaskProduct, value: Floats, upper: Floats) -> Integers:
         """Rows' positions of cells that matter for initial states and are not decided."""
         finished = (value >= 1) | (upper <= 0)
         met = reachable(task, self.rows, self.initial, finished)

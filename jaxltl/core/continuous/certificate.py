@@ -224,8 +224,13 @@ def first_grid(
     if cells is None:
         side = max(int(FIRST_CELLS ** (1 / n)), 2)
         cells = (side,) * n
-    regions = [*dynamics.labels.values(), dynamics.initial]
-    breakpoints = [np.unique(np.concatenate([r.breakpoints(i) for r in regions])) for i in range(n)]
+    breakpoints = []
+    for axis in range(n):
+        edges = np.concatenate([[], *(r.breakpoints(axis) for r in dynamics.labels.values())])
+        # Initial boxes are closed: an edge beyond the upper one saves the cells behind it.
+        ends = dynamics.initial.high[:, axis]
+        ends = np.nextafter(ends[~np.isin(ends, edges)], np.inf)
+        breakpoints.append(np.unique([*edges, *dynamics.initial.low[:, axis], *ends]))
     shape = tuple(int(k) for k in np.atleast_1d(cells))
     count = int(np.prod([float(k) for k in shape]))
     most = min(max_cells, PAIRS // num_actions)

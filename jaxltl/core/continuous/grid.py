@@ -81,14 +81,18 @@ class Grid:
             stop.append(np.where(a > e[-1], start[-1], np.maximum(end, 0)))
         return np.stack(start, -1).astype(np.int32), np.stack(stop, -1).astype(np.int32), outside
 
-    def refine(self, factor: Sequence[int]) -> Grid:
-        """The grid with each cell cut into ``factor[i]`` equal parts along axis i."""
-        parts = []
-        for e, k in zip(self.edges, factor, strict=True):
-            steps = np.arange(k) / k
-            fine = (e[:-1, None] + np.diff(e)[:, None] * steps).reshape(-1)
-            parts.append(np.append(fine, e[-1]))
-        return Grid(tuple(parts))
+    def halve(self, cells: Booleans) -> tuple[Grid, tuple[Integers, ...]]:
+        """The grid with all intervals halved that contain a cell of ``bool[C]``, along each axis; and for
+        each axis the interval of this grid that contains each new one.
+        """
+        chosen, edges, parents = cells.reshape(self.shape), [], []
+        for axis, e in enumerate(self.edges):
+            cut = chosen.any(tuple(i for i in range(self.num_axes) if i != axis))
+            middle = e[:-1] + np.diff(e) / 2
+            cut &= (e[:-1] < middle) & (middle < e[1:])
+            edges.append(np.sort(np.concatenate([e, middle[cut]])))
+            parents.append(np.repeat(np.arange(len(cut)), 1 + cut))
+        return Grid(tuple(edges)), tuple(parents)
 
 
 def make_grid(

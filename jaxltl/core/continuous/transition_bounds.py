@@ -97,6 +97,11 @@ class TransitionBounds:
             source = _contract(stage, self.factors[stage.axis], source, outside)
         return np.maximum(source - self.lost, 0)
 
+    def certain_share(self) -> float:
+        """Mean over the rows of the probability that their lower factors assign to cells."""
+        shares = [x.low.sum(-1)[i] for x, i in zip(self.factors, self.ids, strict=True)]
+        return float(np.prod(shares, 0).mean())
+
     def part(self, rows: Integers) -> TransitionBounds:
         """The transition probabilities of some rows."""
         ids = tuple(x[rows] for x in self.ids)

@@ -36,12 +36,16 @@ def test_ranges_are_the_cells_that_a_box_meets(shape):
 def test_edges_are_moved_to_breakpoints_and_cells_are_halved():
     grid = make_grid(np.zeros(2), np.ones(2), (3, 4), [[0.3, 0.31], [0.25]])
     assert 0.3 in grid.edges[0] and 0.31 in grid.edges[0] and grid.shape == (4, 4)
-    fine = grid.refine((2, 1))
-    assert fine.shape == (8, 4) and set(grid.edges[0]) <= set(fine.edges[0])
+    chosen = np.zeros(16, bool)
+    chosen[[0, 12]] = True  # two intervals along the first axis, one along the second
+    fine, parents = grid.halve(chosen)
+    assert fine.shape == (6, 5) and set(grid.edges[0]) <= set(fine.edges[0])
+    for e, finer, parent in zip(grid.edges, fine.edges, parents, strict=True):
+        assert (e[parent] <= finer[:-1]).all() and (finer[1:] <= e[parent + 1]).all()
     states = np.random.default_rng(1).random((50, 2))
     low, high = fine.boxes(fine.locate(states))
     assert ((low <= states) & (states < high)).all()
-    assert fine.locate(np.array([1.0, 1.0])) == 31 and fine.locate(np.array([1.0, 1.1])) == -1
+    assert fine.locate(np.array([1.0, 1.0])) == 29 and fine.locate(np.array([1.0, 1.1])) == -1
 
 
 def test_shapes_that_do_not_fit_are_refused():
