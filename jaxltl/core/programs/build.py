@@ -27,6 +27,7 @@ from jaxltl.core.programs.weights import Functions, Intervals, Numbers, Weight
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 MAX_STATES = 10_000_000
+_Part = tuple[NDArray[Any] | None, NDArray[Any] | None]  # rewards of states and of choices
 _PART = 2**17  # states on which labels and rewards are evaluated together
 
 
@@ -53,7 +54,7 @@ class Rows:
     action: Integers
     action_names: tuple[str, ...]
     valuation: dict[str, NDArray[Any]]
-    rewards: dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]
+    rewards: dict[str, _Part]
     functions: tuple[Expression, ...] = ()
     owner: Integers | None = None
 
@@ -142,7 +143,7 @@ def build_rows(
 
 def _rows(program: Program, found: Explored, weights: Numbers) -> Rows:
     size = found.words[0].size
-    rewards = {r.name: _reward_parts(program, found, weights, r.items) for r in program.rewards}
+    rewards = {r.name: _reward_parts(found, weights, r.items) for r in program.rewards}
     owner = _owners(program, found) if program.kind == "smg" else None
     deadlock = found.row_count == 0
     if deadlock.any():
@@ -225,42 +226,31 @@ def _label_columns(
 # --- rewards ----------------------------------------------------------------------------------
 
 
-def _reward_parts(
-    program: Program, found: Explored, weights: Numbers, items: Sequence[RewardItem]
-) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+def _reward_parts(found: Explored, weights: Numbers, items: Sequence[RewardItem]) -> _Part:
     """Rewards of states and of choices; numbers of functions in a program with parameters."""
-    states = [i for i in items if i.action is None]
     size = found.words[0].size
-    state = None
-    if states:
-        state = _earned(program, found, weights, states, np.arange(size))
-    choices: NDArray[Any] | None = None
+    by_action: dict[str | None, list[RewardItem]] = {}
+    for i in items:
+        by_action.setdefault(i.action, []).append(i)
+    state = choices = None
     of_row = np.repeat(np.arange(size), found.row_count)
-    for action in dict.fromkeys(i.action for i in items if i.action is not None):
-        if action not in found.actions:
-            continue
-        rows = np.flatnonzero(found.action == found.actions.index(action))
-        if not rows.size:
-            continue
-        some = [i for i in items if i.action == action]
-        earned = _earned(program, found, weights, some, of_row[rows])
-        choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
-        choices[rows] = earned
+    for action, some in by_action.items():
+        if action is None:
+            state = _earned(found, weights, some, np.arange(size))
+        elif action in found.actions:
+            rows = np.flatnonzero(found.action == found.actions.index(action))
+            if rows.size:
+                earned = _earned(found, weights, some, of_row[rows])
+                choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
+                choices[rows] = earned
     return state, choices
 
 
 def _earned(
-    program: Program,
-    found: Explored,
-    weights: Numbers,
-    items: Sequence[RewardItem],
-    states: Integers,
+    found: Explored, weights: Numbers, items: Sequence[RewardItem], states: Integers
 ) -> NDArray[Any]:
     """The sum of some items in some states."""
-    if states.size == found.words[0].size:
-        words = found.words
-    else:
-        words = tuple(w[states] for w in found.words)
+    words = tuple(w[states] for w in found.words)
     if isinstance(weights, Functions):
         terms = [Expression("?:", (i.guard, i.value, literal(0))) for i in items]
         total = Expression("+", (literal(0), *terms))
@@ -277,12 +267,10 @@ def _earned(
 
 # --- deadlocks and overlapping commands -------------------------------------------------------
 
-_Parts = Mapping[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]
-
 
 def with_loops(
-    found: Explored, weights: Numbers, states: Integers, rewards: _Parts
-) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
+    found: Explored, weights: Numbers, states: Integers, rewards: Mapping[str, _Part]
+) -> tuple[Explored, dict[str, _Part]]:
     """The model with a self-loop in each of some states without choices, and its rewards."""
     row = offsets_from_counts(found.row_count)[states]
     entry = offsets_from_counts(found.entry_count)[row]
@@ -304,8 +292,8 @@ def with_loops(
 
 
 def as_chain(
-    found: Explored, weights: Numbers, rewards: _Parts
-) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
+    found: Explored, weights: Numbers, rewards: Mapping[str, _Part]
+) -> tuple[Explored, dict[str, _Part]]:
     """The Markov chain that picks each enabled command with the same probability."""
     starts = offsets_from_counts(found.row_count)[:-1]
     share = np.repeat(found.row_count, found.row_count)
@@ -323,7 +311,7 @@ def as_chain(
         entry_count=np.add.reduceat(found.entry_count, starts),
         weight=weight,
     )
-    means: dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]] = {}
+    means: dict[str, _Part] = {}
     for name, (state, choice) in rewards.items():
         if choice is not None and isinstance(weights, Functions):
             raise LanguageError(

@@ -84,16 +84,12 @@ def find_orbits(program: Program, conditions: Sequence[Expression]) -> tuple[Orb
                 runs[-1].append(slot)
             else:
                 runs.append([slot])
-        found += [_orbit(run) for run in runs if len(run) > 1]
+        found += [orbit for run in runs if len(run) > 1 for orbit in _orbit(run)]
     slots = [n for o in found for slot in o.slots for n in slot]
     selectors = {n for o in found for n in o.selectors}
     # Exchanges of different orbits commute if no selector is in a slot.
     separate = len(set(slots)) == len(slots) and not selectors & set(slots)
-    return tuple(found) if separate and all(map(_is_named, found)) else ()
-
-
-def _is_named(orbit: Orbit) -> bool:
-    return all(len(set(values)) == len(orbit.slots) for values in orbit.selectors.values())
+    return tuple(found) if separate else ()
 
 
 @dataclass(frozen=True)
@@ -116,30 +112,29 @@ def _slot(names: tuple[str, ...], commands: Sequence[Command], actions: tuple[st
 
 def _chains(program: Program, live: Sequence[Sequence[Command]]) -> Iterator[list[_Slot]]:
     """Candidates: modules of equal shape, then variables of equal range in one module."""
-    chains: dict[object, list[_Slot]] = {}
-    own = [[v for v in program.variables if v.module == i] for i in range(len(live))]
-    for variables, commands in zip(own, live, strict=True):
-        shape = len(commands), *((v.type, v.low, v.high) for v in variables)
-        slot = _slot(tuple(v.name for v in variables), commands, tuple(c.action for c in commands))
-        if variables:
-            chains.setdefault(shape, []).append(slot)
-    modules = [chain for chain in chains.values() if len(chain) > 1]
-    chains = {}
+    modules: dict[object, list[_Slot]] = {}
+    for i, commands in enumerate(live):
+        own = [v for v in program.variables if v.module == i]
+        slot = _slot(tuple(v.name for v in own), commands, tuple(c.action for c in commands))
+        shape = len(commands), *((v.type, v.low, v.high) for v in own)
+        modules.setdefault(shape if own else i, []).append(slot)
+    copies = [chain for chain in modules.values() if len(chain) > 1]
+    taken = {n for chain in copies for slot in chain for n in slot.names}
+    single: dict[object, list[_Slot]] = {}
     for v in program.variables:
-        using = [
-            c for some in live for c in some if v.name in c.assigned or v.name in names_in(c.guard)
-        ]
-        if not any((v.name,) == s.names or v.name in s.names for x in modules for s in x):
-            shape = v.type, v.low, v.high, v.module, len(using)
-            chains.setdefault(shape, []).append(_slot((v.name,), using, ()))
-    yield from modules
-    yield from chains.values()
+        if v.name not in taken:
+            using = [c for x in live for c in x if v.name in c.assigned | names_in(c.guard)]
+            key = v.type, v.low, v.high, v.module, len(using)
+            single.setdefault(key, []).append(_slot((v.name,), using, ()))
+    yield from (*copies, *single.values())
 
 
-def _orbit(run: Sequence[_Slot]) -> Orbit:
+def _orbit(run: Sequence[_Slot]) -> list[Orbit]:
+    """The orbit of some slots; none if a selector does not name each of them."""
     selectors = {v for a, b in pairwise(run) for v in _differing(a, b)}
-    values = {v: tuple(s.selected.get(v, -1) for s in run) for v in sorted(selectors)}
-    return Orbit(tuple(s.names for s in run), values)
+    values = {v: tuple(s.selected[v] for s in run if v in s.selected) for v in sorted(selectors)}
+    named = all(len(set(x)) == len(x) == len(run) for x in values.values())
+    return [Orbit(tuple(s.names for s in run), values)] if named else []
 
 
 def _differing(a: _Slot, b: _Slot) -> list[str]:
