@@ -376,10 +376,8 @@ def _pictured(outcome: Outcome) -> Picture | None:
     from jaxltl.plot.episodes import draw_episodes
     from jaxltl.plot.style import to_bytes
 
-    titles = []
-    for one in outcome.episodes:
-        verdict = Verdict(int(np.asarray(one.world.verdict)[int(one.valid.sum())]))
-        titles.append(f"{verdict.name.lower()} after {many(int(one.valid.sum()), 'step')}")
+    ends = [(int(np.sum(one.valid)), np.asarray(one.world.verdict)) for one in outcome.episodes]
+    titles = [f"{Verdict(int(v[t])).name.lower()} after {many(t, 'step')}" for t, v in ends]
     try:
         figure = draw_episodes(outcome.setup.environment, outcome.episodes, titles=titles)
     except ValueError:

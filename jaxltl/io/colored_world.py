@@ -40,12 +40,12 @@ def write_world(world: World) -> str:
     slip = 0.0
     if world.mdp.num_successors > 1:
         slip = 1 - float(world.mdp.probability[0, 0, 0])
-    head = [f"margin: {world.margin}", f"slip: {slip:.6g}"]
-    for name, counts in world.kinds:
-        counts_of_kind = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
-        head.append(f"{name}: {', '.join(counts_of_kind)}")
-    letters = np.array(list(LETTERS))[np.asarray(world.colors)]
-    return "\n".join([*head, "", *("".join(row) for row in letters), ""])
+    kinds = [
+        f"{name}: {', '.join(f'{n} {c}' for c, n in zip(COLORS, counts, strict=True) if n)}"
+        for name, counts in world.kinds
+    ]
+    rows = map("".join, np.array(list(LETTERS))[np.asarray(world.colors)])
+    return "\n".join([f"margin: {world.margin}", f"slip: {slip:.6g}", *kinds, "", *rows, ""])
 
 
 def read_world(text: str) -> World:

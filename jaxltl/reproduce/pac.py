@@ -165,14 +165,13 @@ def _single_run_seconds(
 ) -> tuple[float, float]:
     """Median seconds of single runs, until they end and until their last update."""
     most = jnp.full_like(found.state.last_update, loops.MAX_STEPS)
-    medians = []
-    for limits in (most, found.state.last_update):
-        runs = [
-            run_seconds(partial(_learn, key, problem, hparams, limit))[1]
-            for key, limit in zip(keys, limits, strict=True)
-        ]
-        medians.append(float(np.median(runs)))
-    return medians[0], medians[1]
+
+    def median(limits: jax.Array) -> float:
+        pairs = zip(keys, limits, strict=True)
+        runs = [run_seconds(partial(_learn, k, problem, hparams, limit))[1] for k, limit in pairs]
+        return float(np.median(runs))
+
+    return median(most), median(found.state.last_update)
 
 
 def _evaluated(

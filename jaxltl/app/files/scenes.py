@@ -235,8 +235,7 @@ def _translate(
 
 def load_demonstrations(task: TodirlTask, scenes: Sequence[Scene]) -> list[Trajectories]:
     """The demonstrations in each of the training worlds, from their files."""
-    found = []
-    for name, scene in zip(task.demonstrations.files or (), scenes, strict=True):
-        cells = np.arange(scene.mdp.num_states).reshape(scene.shape).astype(str)
-        found.append(read_demonstrations(task.path.parent / name, World(scene.mdp, cells, ACTIONS)))
-    return found
+    blank = (np.arange(x.mdp.num_states).reshape(x.shape).astype(str) for x in scenes)
+    worlds = (World(x.mdp, cells, ACTIONS) for x, cells in zip(scenes, blank, strict=True))
+    files = (task.path.parent / name for name in task.demonstrations.files or ())
+    return [read_demonstrations(file, world) for file, world in zip(files, worlds, strict=True)]

@@ -78,10 +78,10 @@ class Outcome:
 def prepare(task: GroundingTask, seed: int) -> Setup:
     """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
     file, path = task.file, task.path
-    texts = []
-    for entry in task.maps:
-        name = map_file(entry)
-        texts.append(read_map(path, {"file": name} if name is not None else str(entry)))
+    names = zip(map(map_file, task.maps), task.maps, strict=True)
+    texts = [
+        read_map(path, str(entry) if name is None else {"file": name}) for name, entry in names
+    ]
     options = grid_options(file.world)
     wall = file.world.wall or "#"
     with errors_in(f"{path}: [world] "):

@@ -197,6 +197,25 @@ def summary(outcome: Outcome) -> Record:
         "test": outcome.test
         and setup.test
         and _about_worlds(setup.test, outcome.test, infeasible[count:], leave_out, bounds[count:]),
+        **_about_learning(outcome),
+        "network": {
+            "file": "network.npz",
+            "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
+            "hidden": task.learner.hidden,
+        },
+        **took(outcome.seconds),
+    }
+    time: Record | None = result["training"].get("expected_steps")
+    if time and setup.judge.is_cosafe:  # in the world of the largest multiple
+        scene = setup.worlds.scenes[setup.worlds.names.index(time["worst_world"])]
+        time["front"] = front(product(scene.mdp, setup.judge, label_on=task.label_on))
+    return plain(result)
+
+
+def _about_learning(outcome: Outcome) -> Record:
+    """The final figures and the history of the kept seed, and figures of all."""
+    learned, history, i = outcome.learned, outcome.learned.history, outcome.chosen
+    return {
         "learning": {
             **{k: history[k][-1][i] for k in ("loss", "neg_log_likelihood", "gradient_norm")},
             "held_out": learned.held_out[i],
@@ -205,7 +224,7 @@ def summary(outcome: Outcome) -> Record:
             "steps": learned.num_steps,
             "solver": Status(int(history["status"][:, i].max())).name,
             "solver_error": history["error"][:, i].max(),
-            "hyperparameters": task.learner.hyperparameters(),
+            "hyperparameters": outcome.setup.task.learner.hyperparameters(),
         },
         "history": {
             "step": history["step"],
@@ -219,21 +238,10 @@ def summary(outcome: Outcome) -> Record:
             "best_step": learned.best_step,
             "training_mean": outcome.training.seeds.mean(axis=1),
             "test_mean": (
-                outcome.test and outcome.test.seeds[:, counted_worlds(setup)].mean(axis=1)
+                outcome.test and outcome.test.seeds[:, counted_worlds(outcome.setup)].mean(axis=1)
             ),
         },
-        "network": {
-            "file": "network.npz",
-            "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
-            "hidden": task.learner.hidden,
-        },
-        **took(outcome.seconds),
     }
-    time: Record | None = result["training"].get("expected_steps")
-    if time and setup.judge.is_cosafe:  # in the world of the largest multiple
-        scene = setup.worlds.scenes[setup.worlds.names.index(time["worst_world"])]
-        time["front"] = front(product(scene.mdp, setup.judge, label_on=task.label_on))
-    return plain(result)
 
 
 def _about_worlds(

@@ -276,10 +276,10 @@ class _Reader:
         # The environment's states precede the system's, both in the order of the automaton.
         number = {entry: i for i, entry in enumerate(entries)}
         first = len(entries) + np.concatenate([[0], np.cumsum([len(c) for c in classes])])
-        rows: list[list[tuple[int, str]]] = []
-        for q, _ in entries:
-            leave = enumerate(classes[q].values(), int(first[q]))
-            rows.append([(i, self._text(guard)) for i, guard in leave])
+        rows = [
+            [(i, self._text(guard)) for i, guard in enumerate(classes[q].values(), int(first[q]))]
+            for q, _ in entries
+        ]
         for to, parts in zip(moves, classes, strict=True):
             targets = [number[entry] for entry in to]
             for rest in parts:
