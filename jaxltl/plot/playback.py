@@ -18,6 +18,8 @@ from jaxltl.plot.live import CELL, live_automaton, live_map
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
 
 _RUN, _GAP, _REST = "#c2571a", 24.0, 2.0
+_COLORS = {"run": _RUN, "ink": INK, "faint": FAINT, "paper": PAPER, "muted": MUTED}
+_COLORS |= {"accent": ACCENT, "good": GOOD}
 
 
 class _Playing(TypedDict, total=False):
@@ -114,13 +116,7 @@ def playback(
         seconds=(len(run) - 1) * wait + _REST,
         times=times,
         length=max(done[-1], 1),
-        run=_RUN,
-        ink=INK,
-        faint=FAINT,
-        paper=PAPER,
-        muted=MUTED,
-        accent=ACCENT,
-        good=GOOD,
+        **_COLORS,
     )
 
 

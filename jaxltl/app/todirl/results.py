@@ -157,8 +157,7 @@ def counted_worlds(setup: Setup) -> np.ndarray:
 
 def summary(outcome: Outcome) -> Record:
     """The result as a JSON object."""
-    setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
-    task, history, count = setup.task, learned.history, setup.num_training
+    setup, task, count = outcome.setup, outcome.setup.task, outcome.setup.num_training
     bounds, leave_out = setup.bounds or [], task.left_out
     infeasible = np.array(
         [
@@ -179,7 +178,7 @@ def summary(outcome: Outcome) -> Record:
             "left_out": setup.left_out,
             "unused": setup.unused and {"steps": setup.unused, "of": setup.unused + sum(pairs)},
             "loss": setup.loss,
-            "weight": learned.weight,
+            "weight": outcome.learned.weight,
         },
         "trivial": setup.trivial,
         "acceptance": setup.judge.acceptance,
