@@ -1,4 +1,4 @@
-"""Interval syntax in text formats: probabilities ``[0.4, 0.6]`` and point rewards ``[1, 1]``."""
+"""Parsing of interval probabilities ``[0.4, 0.6]`` and point rewards ``[1, 1]`` in text formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of policies, read without JAX where they are tables."""
+"""Reading and writing of policy files; tabular policies need no JAX."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of models and solutions: grid maps, or graphs of small models.
+"""Plots of models and solutions: grid maps, small transition graphs, and sorted values.
 
 Models are recognised by their fields, since importing their types would load JAX.
 """

@@ -1,4 +1,4 @@
-"""Section 2.5: maximum-likelihood inverse RL with temporal-logic side information."""
+"""Experiment of section 2.5: maximum-likelihood inverse RL with an LTL task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PAC constants, error bounds and epsilon-optimal strategies for stochastic Buchi games.
+"""PAC bounds for discounted rewards in stochastic games with an almost-sure Buchi objective.
 
 The theory of R-max (Brafman and Tennenholtz 2002) for turn-based stochastic games with an
 almost-sure Buchi objective (dissertation, chapter 6). Throughout, `epsilon` is the loss of value

@@ -1,4 +1,4 @@
-"""A trust-region step: its direction, by CPO's dual in closed form, and the line search."""
+"""Policy updates of TRPO and CPO: direction from the dual in closed form, and line search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Game files: a game, and the objective of the system player.
+"""Game files: a two-player game, the objective of the system player, and the synthesis.
 
 A game file is TOML with the tables ``[game]``, ``[task]`` and optionally ``[strategy]``; see
 ``examples/robots.toml`` and ``examples/patrol.toml``. Names of files are relative to it.

@@ -1,4 +1,4 @@
-"""Task files of simulated worlds, for ``method = "ppo"``, ``"cce"`` or ``"cpo"``.
+"""Task files of learning in environments by PPO, constrained cross-entropy or CPO.
 
 Tables ``[world]``, with ``[world.arguments]``, ``[task]``, ``[learner]``, one of the method's name
 for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` shows them.

@@ -1,4 +1,4 @@
-"""Deterministic parity automata made small, with the simplest acceptance that the language has.
+"""State reduction of deterministic parity automata, to (co-)safety or Buchi where possible.
 
 States with the same language need not stand side by side: of all that have it, those lowest in
 the order of strongly connected components suffice, because a run can move down only finitely

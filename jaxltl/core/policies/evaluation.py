@@ -1,4 +1,4 @@
-"""Statistics of simulated episodes: frequencies and means with confidence intervals."""
+"""Statistics of simulated episodes: success frequencies and means with confidence intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs in the PRISM language as simulated environments; no state is explored."""
+"""Programs in the PRISM language as simulated environments, without exploring their states."""
 
 from __future__ import annotations
 

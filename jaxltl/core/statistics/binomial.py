@@ -1,4 +1,4 @@
-"""Confidence intervals of binomial proportions, rounded outwards.
+"""Confidence intervals of binomial proportions and of means of bounded variables.
 
 Each function takes ``count`` of ``total`` and the chance `failure` of a miss, and gives ends
 ``(lower, upper)`` in double precision. Rounding is accounted for: what an end excludes is excluded

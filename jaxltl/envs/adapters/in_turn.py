@@ -1,4 +1,4 @@
-"""Sequential choice of the components of factored actions.
+"""Environment adapter that chooses the components of a factored action one at a time.
 
 A step of the package's environment is N steps here, each with a choice of one component; the last
 one moves the environment. For N components with too many combinations.

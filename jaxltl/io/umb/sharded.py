@@ -1,4 +1,4 @@
-"""Sharded reading of UMB archives, by ranges of states of a device mesh.
+"""Reads UMB models onto a device mesh; each process reads the states of its own devices.
 
 The choices of a range of states and their branches are known from offset members, so a compressed
 archive is read again if these come later; of a plain archive only the ranges are read.

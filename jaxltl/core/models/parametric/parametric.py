@@ -1,4 +1,4 @@
-"""Parametric Markov models: probabilities and rewards as differentiable functions on a box."""
+"""Parametric MDPs: probabilities and rewards as differentiable functions on a box."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encodes the choices of a second player, or of a mixed policy, in uncertainty sets.
+"""Encodes a second player or a randomized policy as choices of nature in an uncertain MDP.
 
 A player that optimises in nature's direction is part of nature: its choice among rows is a
 distribution with ends 0 and 1 over auxiliary states that have one of the rows each. The rows of a

@@ -1,4 +1,4 @@
-"""Linear systems ``(I - c P_w) x = b`` and their transposes, inside ``jit``.
+"""Linear solvers of policy evaluation ``(I - c P_w) x = b`` and its transpose, inside ``jit``.
 
 Small systems are inverted by elimination, so that the number of expected steps does not matter; not
 by LAPACK, which serialises batches of small systems by its threads. Large systems are

@@ -1,4 +1,4 @@
-"""Expected number of steps to satisfaction, and the quickest optimal policy, on the host.
+"""Expected number of steps until a task is decided, or between acceptances; fastest policies.
 
 Stochastic shortest paths (Bertsekas and Tsitsiklis 1991) to a decision, and long-run rates of
 acceptance (Puterman 1994, chapters 8 and 9). docs/optimal-actions.md has the proofs.

@@ -1,4 +1,4 @@
-"""Optimal probability of an LTL formula on a sparse model."""
+"""Maximal or minimal satisfaction probability of an LTL task on a sparse MDP, with a policy."""
 
 from __future__ import annotations
 
