@@ -28,7 +28,7 @@ from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.core.statistics.binomial import bounded_mean
 from jaxltl.core.statistics.confidence_sets import samples_needed
-from jaxltl.core.values.evaluation.evaluation import share_estimate
+from jaxltl.core.values.evaluation.evaluation import frequency_estimate
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.multi_objective.multi_objective import multi_objective
 from jaxltl.core.values.multi_objective.objectives import Objective
@@ -379,7 +379,7 @@ def simulated():
                 "batch": 2,
             },
         ),
-        (share_estimate, {"count": 1, "total": 2, "failure": 0.05}),
+        (frequency_estimate, {"count": 1, "total": 2, "failure": 0.05}),
         (
             jl.values.episode_evaluator,
             {

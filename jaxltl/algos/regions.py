@@ -240,7 +240,7 @@ def prove_around(
         validation.integer("num_halvings", num_halvings, most=1000),
     )
     model = problem.model
-    (point,) = model.inside_of("point", validation.float_array("point", point)[None])
+    (point,) = model.valid_points("point", validation.float_array("point", point)[None])
     sides = model.high - model.low
     found, share, move = None, 1.0, 0.5
     for _ in range(num_halvings):

@@ -10,7 +10,7 @@ from jaxltl.app.wording import Record, enclosure
 from jaxltl.core.models.product import Product
 from jaxltl.core.values.undiscounted.mixture import Mixture, least_mixture
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Quickest
+from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis, Quickest
 from jaxltl.core.values.undiscounted.steps_front import meeting, steps_front
 
 _SHARES = np.linspace(0, 0.9, 7)  # of the quickest policy, in the trade-off with the likelihood
@@ -52,7 +52,7 @@ def step_bound(
                 "satisfied: leave steps out."
             )
         return None
-    quickest = Clock(model).quickest(actions)
+    quickest = StepAnalysis(model).quickest(actions)
     anchor, least = np.eye(model.num_actions)[quickest.policy], quickest.steps.upper
     probability = 0.0 if isinstance(asked, str) else float(asked)
     if steps is None:
@@ -92,7 +92,7 @@ def about_steps(
       before: ``float[S, Q, A]``, the policy before mixing.
       counts: ``float[S, Q, A]``, of demonstrated pairs.
     """
-    clock = Clock(model)
+    clock = StepAnalysis(model)
     learned = kept.steps or clock.steps(kept.policy)
     found: Record = {
         "until": "the formula is decided" if model.automaton.is_cosafe else "acceptance",

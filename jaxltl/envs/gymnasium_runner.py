@@ -10,7 +10,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata.automaton import letter_index
 from jaxltl.core.automata.runs import Verdict, lasso_verdicts, verdicts
-from jaxltl.core.policies.evaluation import EpisodeTotals, Evaluation, evaluation_of
+from jaxltl.core.policies.episode_statistics import EpisodeTotals, Evaluation, evaluation_of
 from jaxltl.core.policies.finite_memory import Controller, FiniteMemoryPolicy, Policy
 
 TERMINATED = "terminated"
@@ -43,7 +43,7 @@ def run_policy(
         observation, as a number for a finite-memory policy, and None.
 
     Returns:
-      :class:`~jaxltl.core.policies.evaluation.Evaluation`; `reward` is the environment's.
+      :class:`~jaxltl.core.policies.episode_statistics.Evaluation`; `reward` is the environment's.
 
     Raises:
       ValueError: an environment without a limit of steps, or a state that the policy does not have.

@@ -29,7 +29,7 @@ def has_bracket(block: Block, token: Integers) -> bool:
     return bool((block.data[block.start[token]] == ord("[")).any())
 
 
-def with_whole_brackets(block: Block, column: int, lines: Booleans | None = None) -> Block:
+def joined_brackets(block: Block, column: int, lines: Booleans | None = None) -> Block:
     """Merges the tokens of each bracketed interval in a column; `lines` restricts the lines."""
     looked_at = block.count > column
     if lines is not None:
@@ -122,7 +122,7 @@ def _number(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes
     )
 
 
-def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
+def first_invalid_sum(total: Floats) -> tuple[int, str, str] | None:
     """First choice with an infeasible sum ``[R]`` or ``[R, 2]``, subject and problem; or None."""
     ends = total.reshape(len(total), -1)
     above, below = ends[:, 0] > 1 + NEAR, ends[:, -1] < 1 - NEAR

@@ -16,7 +16,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.algos import ppo
 from jaxltl.algos.common.actor_critic import ActorCritic
-from jaxltl.core.policies.evaluation import share_estimate
+from jaxltl.core.policies.episode_statistics import frequency_estimate
 
 EPISODES = 2000
 pytestmark = pytest.mark.slow
@@ -167,7 +167,7 @@ def compare(folder, agent, task, automaton, program, name):
     here = jl.evaluate(jax.random.key(1), agent, task, num_episodes=500, confidence=0.999)
     expected = getattr(here, name)
     count = run_fresh(program, path)
-    found = share_estimate(count, EPISODES, 0.001)
+    found = frequency_estimate(count, EPISODES, 0.001)
     print(name, expected, found)
     assert expected.lower <= found.upper and found.lower <= expected.upper
     assert (found.mean > 0.9) if name == "success" else (found.mean < 0.1)

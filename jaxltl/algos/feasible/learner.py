@@ -347,7 +347,7 @@ def feasible(
             key, validation.integer("starts", starts, least=1, most=loops.MAX_STEPS)
         )
     else:
-        points = problem.model.inside_of("start", starts).astype(problem.low.dtype)
+        points = problem.model.valid_points("start", starts).astype(problem.low.dtype)
         keys = jax.random.split(key, len(points))
     # Only what the search reads, so that other models of the same shape do not recompile it.
     nothing: PyTree = None

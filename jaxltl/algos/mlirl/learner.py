@@ -59,7 +59,7 @@ from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.validation import Range
 from jaxltl.core.values import boltzmann_value, satisfaction_probability
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 
 __all__ = [
     "Features",
@@ -353,7 +353,7 @@ def _evaluate(
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One step of the optimiser on :func:`objective`; deterministic given the state."""
-    return in_turn(_update, state, problem, hparams)
+    return sequential_vmap(_update, state, problem, hparams)
 
 
 @jax.jit

@@ -141,7 +141,7 @@ def surrogate(
 
 
 def direction(
-    judged: Callable[[jax.Array], Surrogate],
+    surrogate_of: Callable[[jax.Array], Surrogate],
     product: Callable[[jax.Array], jax.Array],
     flat: jax.Array,
     excess: jax.Array,
@@ -162,11 +162,11 @@ def direction(
         return found, damped(found)
 
     if hparams.method == "trpo":
-        natural, times_fisher = solved(jax.grad(lambda x: judged(x).reward)(flat))
+        natural, times_fisher = solved(jax.grad(lambda x: surrogate_of(x).reward)(flat))
         q = natural @ times_fisher
         dual = Dual(jnp.sqrt(q / (2 * delta)), jnp.zeros((), flat.dtype), jnp.int32(Case.FREE))
         return natural * jnp.sqrt(ratio(2 * delta, q)), dual
-    gradients = jax.jacrev(lambda x: jnp.stack(judged(x)[:2]))(flat)
+    gradients = jax.jacrev(lambda x: jnp.stack(surrogate_of(x)[:2]))(flat)
     natural, times_fisher = jax.vmap(solved)(gradients)
     # With H x for the gradients that conjugate gradients did not quite solve for, the step's
     # divergence is as promised.
@@ -177,7 +177,7 @@ def direction(
 
 
 def line_search(
-    judged: Callable[[jax.Array], Surrogate],
+    surrogate_of: Callable[[jax.Array], Surrogate],
     flat: jax.Array,
     change: jax.Array,
     excess: jax.Array,
@@ -200,7 +200,7 @@ def line_search(
     def search(carry: PyTree) -> PyTree:
         count, scale, _, _ = carry
         scale = jnp.where(count == 0, jnp.ones_like(scale), scale * ratio)
-        after = judged(flat + scale * change)
+        after = surrogate_of(flat + scale * change)
         return count + 1, scale, after, good(after)
 
     def searching(carry: PyTree) -> jax.Array:

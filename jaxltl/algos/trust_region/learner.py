@@ -267,7 +267,7 @@ def _improved(
     flat, unravel = ravel_pytree(parameters)
     old = gaussian(parameters, hparams, samples[0])
 
-    def judged(flat: jax.Array) -> Surrogate:
+    def surrogate_of(flat: jax.Array) -> Surrogate:
         new = gaussian(unravel(flat), hparams, samples[0])
         gains, kl = surrogate(new, old, samples[1], weighted.reshape(len(weighted), -1), samples[2])
         return Surrogate(gains[0], gains[1] if constrained else jnp.zeros((), dtype), kl)
@@ -280,8 +280,8 @@ def _improved(
 
     product = fisher_product(divergence, flat)
     delta = jnp.asarray(hparams.delta, dtype)
-    change, dual = direction(judged, product, flat, excess, delta, hparams)
-    scale, after = line_search(judged, flat, change, excess, delta, hparams)
+    change, dual = direction(surrogate_of, product, flat, excess, delta, hparams)
+    scale, after = line_search(surrogate_of, flat, change, excess, delta, hparams)
     accepted = scale > 0
     new = jnp.where(accepted, flat + scale * change, flat)
     nonfinite = jnp.sum(~batch.finite).astype(jnp.int32)

@@ -25,7 +25,7 @@ from jaxltl.core.values.undiscounted.mixture import (
     reaching,
     require_attainable,
 )
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock
+from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis
 
 _AIM = WINDOW / 4  # margin of the certified probability over the asked one
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
@@ -84,7 +84,7 @@ def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> l
     for w, bound in enumerate(bounds):
         model = part_of(setup.worlds.model, w)
         kept = bound.keep(model, policy[w])
-        found.append(kept._replace(steps=kept.steps or Clock(model).steps(kept.policy)))
+        found.append(kept._replace(steps=kept.steps or StepAnalysis(model).steps(kept.policy)))
     return found
 
 

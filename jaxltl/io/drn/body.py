@@ -10,7 +10,7 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.io.intervals import intervals, point_rewards, with_whole_brackets
+from jaxltl.io.intervals import intervals, point_rewards, joined_brackets
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.io.tokens import (
     Block,
@@ -181,7 +181,7 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
         at = block.first[:-1]
         is_state, is_action = _begins(block, at, b"state"), _begins(block, at, b"action")
         if is_interval:
-            block = with_whole_brackets(block, 2, ~is_state & ~is_action)
+            block = joined_brackets(block, 2, ~is_state & ~is_action)
             at = block.first[:-1]
         order = _order(block, body, is_state, is_action)
         state = body.num_states - 1 + np.cumsum(is_state)

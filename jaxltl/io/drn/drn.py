@@ -21,7 +21,7 @@ from jaxltl.io.drn.body import (
     rewards_of,
 )
 from jaxltl.io.files import read_bytes, write_bytes
-from jaxltl.io.intervals import first_without_distribution
+from jaxltl.io.intervals import first_invalid_sum
 from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
 from jaxltl.io.tokens import Text, as_double, refuse
 
@@ -96,7 +96,7 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
     probability = np.concatenate(body.value)
     start = np.concatenate([[0], np.bincount(row, minlength=body.num_rows).cumsum()])
-    if (bad := first_without_distribution(np.add.reduceat(probability, start[:-1]))) is not None:
+    if (bad := first_invalid_sum(np.add.reduceat(probability, start[:-1]))) is not None:
         action, subject, problem = bad
         raise text.error(
             int(line[action]), f"{subject} of this action of state {state[action]} {problem}."

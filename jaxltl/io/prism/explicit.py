@@ -16,10 +16,10 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Annotations, SparseMDP, make_sparse
 from jaxltl.io.files import read_bytes, write_bytes
 from jaxltl.io.intervals import (
-    first_without_distribution,
+    first_invalid_sum,
     has_bracket,
     intervals,
-    with_whole_brackets,
+    joined_brackets,
 )
 from jaxltl.io.prism.sections import Section, read_labels, read_rewards, read_valuation
 from jaxltl.io.prism.sections import written_sections
@@ -270,7 +270,7 @@ def _read_rows(text: Text) -> _Rows:
     kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
     is_interval = kind is not None and kind[1].startswith(b"I")
     for block in rest.blocks(b"#"):
-        block = with_whole_brackets(block, width - 1)
+        block = joined_brackets(block, width - 1)
         at = block.columns(width, 1, f"{form}, and an action or none")
         is_interval |= has_bracket(block, at + width - 1)
         for part, column in zip(
@@ -368,7 +368,7 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
     new[1:] = (rows.state[1:] != rows.state[:-1]) | (rows.choice[1:] != rows.choice[:-1])
     start = np.flatnonzero(new)
     total = np.add.reduceat(rows.probability, start)
-    if (bad := first_without_distribution(total)) is not None:
+    if (bad := first_invalid_sum(total)) is not None:
         row, subject, problem = bad
         raise text.error(
             int(rows.line[start[row]]),

@@ -139,7 +139,7 @@ class _Archive:
         stream = self.stream()
         for member, size in known_members(stream, index):
             if member == name:
-                return _taken(stream, member, [(0, size)]).arrays[0]
+                return _read_spans(stream, member, [(0, size)]).arrays[0]
         raise AssertionError(name)
 
 
@@ -159,7 +159,7 @@ class _Runs:
         return self.arrays[i][begin - self.spans[i][0] : end - self.spans[i][0]]
 
 
-def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
+def _read_spans(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
     """Reads byte ranges of the current member of a stream; adjacent ranges are merged."""
     runs: list[_Span] = []
     for begin, end in sorted(x for x in spans if x[0] < x[1]):
@@ -181,7 +181,7 @@ def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
 
 
 @dataclass(frozen=True)
-class _Held:
+class _ReadData:
     """Data read for ranges of states."""
 
     spans: dict[str, list[_Span]]  # ranges of states, choices and branches
@@ -189,10 +189,10 @@ class _Held:
     found: dict[str, _Runs]  # bytes of the other members
 
 
-def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
+def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _ReadData:
     """Reads all members of some ranges of states, with as few passes as possible."""
-    items, held = index.items(), _Held({"states": ranges}, {}, {})
-    _presume(index, held)
+    items, held = index.items(), _ReadData({"states": ranges}, {}, {})
+    _infer_one_to_one(index, held)
     goes_on = True
     while goes_on or "branches" not in held.spans:
         goes_on, previous = False, set(held.spans)
@@ -201,16 +201,16 @@ def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
             if member in held.found:
                 continue
             if member in _WHOLE:
-                held.found[member] = _taken(stream, member, [(0, size)])
+                held.found[member] = _read_spans(stream, member, [(0, size)])
             elif member in items and items[member].part not in held.spans:
                 goes_on = True
             elif member in items:
                 ranges_of_bytes = [items[member].span(*x) for x in held.spans[items[member].part]]
                 if items[member].more:
                     ranges_of_bytes += [(0, 8), (size - 8, size)]
-                held.found[member] = _taken(stream, member, ranges_of_bytes)
+                held.found[member] = _read_spans(stream, member, ranges_of_bytes)
                 if items[member].more:
-                    goes_on |= _lead_on(archive, index, held, items, member)
+                    goes_on |= _set_child_ranges(archive, index, held, items, member)
         for part, (member, ahead) in _AHEAD.items():
             if (
                 part in previous and member not in held.found
@@ -219,14 +219,14 @@ def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
     return held
 
 
-def _presume(index: Index, held: _Held) -> None:
+def _infer_one_to_one(index: Index, held: _ReadData) -> None:
     for part, (_, ahead) in _AHEAD.items():
         if part in held.spans and index.counts[part] == index.counts[ahead]:
             held.spans.setdefault(ahead, held.spans[part])
 
 
-def _lead_on(
-    archive: _Archive, index: Index, held: _Held, items: dict[str, Items], member: str
+def _set_child_ranges(
+    archive: _Archive, index: Index, held: _ReadData, items: dict[str, Items], member: str
 ) -> bool:
     """Sets the ranges of the choices (branches) of a part; True if members must be read again."""
     part = items[member].part
@@ -247,7 +247,7 @@ def _lead_on(
             del held.found[other]
         if ahead == "choices":
             held.spans.pop("branches", None)
-    _presume(index, held)
+    _infer_one_to_one(index, held)
     return in_vain
 
 

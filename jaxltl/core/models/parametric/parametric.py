@@ -72,7 +72,7 @@ class ParametricMDP:
             )
         return self._at(point)
 
-    def inside_of(self, name: str, points: ArrayLike) -> np.ndarray:
+    def valid_points(self, name: str, points: ArrayLike) -> np.ndarray:
         """Validated points of the box, ``float64[N, D]``."""
         found, names = validation.float_array(f"{name}s", points), self.parameters
         if found.ndim != 2 or found.shape[1] != len(names) or not len(found):

@@ -45,7 +45,7 @@ class EncodedChoices:
         return found
 
 
-def let_nature_choose(
+def choices_as_nature(
     model: UncertainMDP, states: Booleans, lower: Floats, upper: Floats
 ) -> EncodedChoices:
     """The model in which nature chooses the rows of some states between ends ``float64[R]``."""

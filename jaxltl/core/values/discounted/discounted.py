@@ -50,7 +50,7 @@ from jaxltl.core.values.engine.certificates import (
 )
 from jaxltl.core.values.engine.host_solution import discounted, is_sparse
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn, iterate
+from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
 
 MAX_STEPS = 100_000
@@ -421,7 +421,7 @@ def _refined(
         return solution
     found: Solution
     reward = jnp.asarray(reward, model.dtype)
-    found, action = in_turn(_newton_steps, model, reward, given, solution, policy)
+    found, action = sequential_vmap(_newton_steps, model, reward, given, solution, policy)
     found = replace(found, policy=action if policy is None else solution.policy)
     ended = (solution.status <= Status.PRECISION) & jnp.isfinite(found.lower).all()
     result: Solution = jax.tree.map(partial(jnp.where, ended), found, solution)

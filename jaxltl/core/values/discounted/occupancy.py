@@ -20,7 +20,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import System, solver
 
 
@@ -80,7 +80,7 @@ def _occupancy(
 
     system = System(sweep_operator(model), over.columns(policy), discount)
     linear = solver(system)
-    visits, n = in_turn(_visits, model, policy, discount, start, linear)
+    visits, n = sequential_vmap(_visits, model, policy, discount, start, linear)
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
     # The operator is a contraction in the sum norm, and a state's inflow sums what all pairs that

@@ -24,7 +24,7 @@ from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import (
     DENSE_LIMIT,
     Inverse,
@@ -83,7 +83,7 @@ class ChainSystem(NamedTuple):
         if b.size <= DENSE_LIMIT:
             eye = jnp.eye(b.size, dtype=b.dtype).reshape(b.size, *b.shape)
             matrix = lax.map(matvec, eye, batch_size=min(b.size, 32)).reshape(b.size, b.size).T
-            inverted, right = in_turn(inverse, matrix), b.ravel()
+            inverted, right = sequential_vmap(inverse, matrix), b.ravel()
             x: jax.Array = inverted @ right
             x += inverted @ (right - matrix @ x)
             return x.reshape(b.shape)

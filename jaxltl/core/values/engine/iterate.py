@@ -60,11 +60,11 @@ def iterate(
     most = jnp.maximum(jnp.asarray(max_steps, jnp.int32), 1)
     if lanes == "mapped":
         return loop(*start, most)
-    run = side_by_side if lanes == "side by side" else in_turn
+    run = side_by_side if lanes == "side by side" else sequential_vmap
     return run(loop, *start, most)
 
 
-def in_turn(function: Callable[..., Result], *arguments: object) -> Result:
+def sequential_vmap(function: Callable[..., Result], *arguments: object) -> Result:
     """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable."""
     # For work that depends on the data, or is slower in a batch. The function takes
     # trees of arrays and closes over no batched array.

@@ -24,7 +24,7 @@ from jaxltl.core.models.ops.successor_tables import (
     SuccessorTable,
 )
 from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.values.engine.iterate import in_turn, iterate
+from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
 
@@ -158,7 +158,7 @@ def solver(
     small = is_small(system.table, system.num_states)
     if method == "iterative" or (method == "auto" and not small):
         return Krylov(system, max_steps=max_steps)
-    return Inverse(system, in_turn(inverse, system.matrix()))
+    return Inverse(system, sequential_vmap(inverse, system.matrix()))
 
 
 def is_small(table: SweepOperator, num_states: int) -> bool:
@@ -321,7 +321,7 @@ def _krylov(
     def step(table: PyTree, k: _Search, given: PyTree) -> _Search:
         given, goal = given
         image = matvec(table, given, k.z)
-        branches = [partial(f, goal) for f in (_richardson, _first, _second, _look)]
+        branches = [partial(f, goal) for f in (_richardson, _first, _second, _check_residual)]
         k = lax.switch(k.phase, branches, k, image)
         return k._replace(num_steps=k.num_steps + 1)
 
@@ -383,7 +383,7 @@ def _second(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
     )
 
 
-def _look(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
+def _check_residual(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
     """Computes the true residual of x, and returns to the best x after a failure."""
     r = goal.b - image
     error = norm(r)

@@ -31,13 +31,13 @@ from jaxltl.core.environments.episodes import Agent, begin_episode, continue_epi
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.models.mesh.lanes import on_host, require_split, vmap_split
 from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.policies.evaluation import (
+from jaxltl.core.policies.episode_statistics import (
     ESTIMATES as ESTIMATES,
     EpisodeTotals as EpisodeTotals,
     Estimate as Estimate,
     Evaluation as Evaluation,
     evaluation_of,
-    share_estimate as share_estimate,
+    frequency_estimate as frequency_estimate,
 )
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.binomial import anytime

@@ -16,7 +16,7 @@ from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
-from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, let_nature_choose
+from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, choices_as_nature
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
 from jaxltl.core.sparse.interval.total_reward import total_reward
@@ -401,7 +401,7 @@ def host_sides(
         return Sides(None, host, maximize, helpful, None, None)
     # The player with nature's objective becomes nature, and the other one is the policy.
     rows = np.ones(host.mdp.num_rows)
-    parted = let_nature_choose(host, system if maximize == helpful else ~system, 0 * rows, rows)
+    parted = choices_as_nature(host, system if maximize == helpful else ~system, 0 * rows, rows)
     return Sides(None, parted.model, not helpful, helpful, parted, None)
 
 
@@ -421,4 +421,4 @@ def _under(model: IntervalMDP, policy: np.ndarray, where: Array) -> EncodedChoic
     weight = row_weights(model.nominal, policy, where)
     total = host.mdp.over_choices(np.add, weight)
     weight = weight / np.where(total > 0, total, 1)[host.mdp.state]
-    return let_nature_choose(host, np.broadcast_to(where, (model.num_states,)), weight, weight)
+    return choices_as_nature(host, np.broadcast_to(where, (model.num_states,)), weight, weight)

@@ -17,7 +17,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.sparse.interval.game_encoding import let_nature_choose
+from jaxltl.core.sparse.interval.game_encoding import choices_as_nature
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.parity import parity_against_nature
 from jaxltl.core.sparse.interval.qualitative import joint_accepting_region
@@ -202,7 +202,7 @@ def _fixed(
     dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
     require_weights(host.mdp, weight, row_tolerance(dtype))
     weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
-    parted = let_nature_choose(host, np.ones(host.mdp.num_states, bool), weight, weight)
+    parted = choices_as_nature(host, np.ones(host.mdp.num_states, bool), weight, weight)
     return Sides(None, parted.model, helpful, helpful, parted, policy)
 
 

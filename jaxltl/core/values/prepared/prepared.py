@@ -21,7 +21,7 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
 from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, chosen_names, meets, sweep
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import inverse
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, State, enclose_cycles
@@ -338,7 +338,7 @@ def _solve_cyclic(
         return enclose_cycles(problem, low, high, most)
 
     # How much work it is depends on the lane.
-    s = in_turn(
+    s = sequential_vmap(
         enclosed,
         core,
         arrays,

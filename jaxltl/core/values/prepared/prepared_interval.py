@@ -28,7 +28,7 @@ from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.interval.contest import (
     Bounds,
     Contest,
@@ -286,7 +286,7 @@ def _solve(
     contest = _contest(prepared, lower, upper, reward)
     tolerance = jnp.asarray(tolerance, lower.dtype)
     if prepared.size:
-        found = in_turn(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
+        found = sequential_vmap(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
     else:
         none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
         found = Bounds(none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0))

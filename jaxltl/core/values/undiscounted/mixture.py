@@ -18,7 +18,7 @@ from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Steps
+from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis, Steps
 
 WINDOW = 0.02  # maximal excess of the certified probability over the required one
 _AIM = WINDOW / 4  # excess at which a search ends
@@ -136,7 +136,7 @@ def least_mixture(
         found = probable_mixture(model, policy, sure, probability, over)
         close = attained(model, found.policy, over, _FINE)
         return found._replace(attained=max(found.attained, close))
-    clock, tolerance = Clock(model), None
+    clock, tolerance = StepAnalysis(model), None
 
     def judged(share: float) -> Mixture:
         mixed = (policy, sure)[int(share)] if share in (0, 1) else _mixed(policy, sure, share)
@@ -254,7 +254,7 @@ def practical_policy(
       >>> round(found.steps.value, 1), round(found.share, 1)
       (2.0, 0.5)
     """
-    quickest = Clock(model).quickest(optimal_actions(model) if actions is None else actions)
+    quickest = StepAnalysis(model).quickest(optimal_actions(model) if actions is None else actions)
     one_hot = np.eye(model.num_actions)[quickest.policy]
     limit = np.inf if np.isinf(factor) else quickest.steps.upper * factor
     return least_mixture(model, policy, one_hot, probability, over=over, steps=limit)

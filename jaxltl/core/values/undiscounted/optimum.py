@@ -37,7 +37,7 @@ from jaxltl.core.models.protocols import ActionModel, Array, PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
 from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
-from jaxltl.core.values.engine.iterate import in_turn, iterate
+from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
 from jaxltl.core.values.engine.linear import MOST_PRODUCTS, Inverse, System, is_small, solver
 from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
 
@@ -143,7 +143,7 @@ def optimal_reachability(
 def _inside_jit(
     model: ActionModel, target: jax.Array, *options: PyTree, objective: str
 ) -> Solution:
-    sets, components = in_turn(partial(_qualitative, objective=objective), model, target)
+    sets, components = sequential_vmap(partial(_qualitative, objective=objective), model, target)
     return _optimize(model, sets, components, options, objective=objective)
 
 
@@ -293,7 +293,7 @@ def _optimize(
     if small:
         run = partial(_by_policy_iteration, objective=objective)
         asked = 2 * _half_width(model, tolerance)
-        solution, row_of = in_turn(run, model, sets, components, asked)
+        solution, row_of = sequential_vmap(run, model, sets, components, asked)
     else:
         row_of = None
         solution = _by_intervals(model, sets, components, options, objective=objective)

@@ -103,7 +103,7 @@ class Quickest(NamedTuple):
 
 @validated()
 def satisfaction_steps(model: Product, policy: Array) -> Steps:
-    """Expected number of steps of a policy until its task is satisfied, with certified bounds.
+    """Expected number of steps of a policy until its task is decided, with certified bounds.
 
     Args:
       model: a concrete product.
@@ -125,7 +125,7 @@ def satisfaction_steps(model: Product, policy: Array) -> Steps:
     """
     if is_traced((model, policy)):
         raise ValueError("satisfaction_steps works on the host; call it outside jit and vmap.")
-    return Clock(model).steps(policy)
+    return StepAnalysis(model).steps(policy)
 
 
 @validated()
@@ -153,11 +153,11 @@ def quickest_policy(model: Product, actions: OptimalActions | None = None) -> Qu
     """
     if is_traced((model, actions)):
         raise ValueError("quickest_policy works on the host; call it outside jit and vmap.")
-    return Clock(model).quickest(optimal_actions(model) if actions is None else actions)
+    return StepAnalysis(model).quickest(optimal_actions(model) if actions is None else actions)
 
 
 @dataclass(frozen=True)
-class Clock:
+class StepAnalysis:
     """The expected number of steps to satisfaction of a product's policies."""
 
     model: Product

@@ -21,7 +21,11 @@ from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.undiscounted.policy_gradient import transient_factors
 from jaxltl.core.values.undiscounted.reachability import on_actions
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Quickest, quickest_policy
+from jaxltl.core.values.undiscounted.satisfaction_steps import (
+    StepAnalysis,
+    Quickest,
+    quickest_policy,
+)
 
 _NEAR = 1e-6  # distance in probability up to which a vertex is on a line
 _CLOSE = 1e-3  # the same, in a front of few points
@@ -133,7 +137,7 @@ def meeting(model: Product, probability: float, steps: float, quickest: Quickest
 
 @dataclass(frozen=True)
 class _Front:
-    clock: Clock
+    clock: StepAnalysis
     ends: tuple[Vertex, Vertex]  # the quickest optimal policy, and the earliest decision
 
     @staticmethod
@@ -146,7 +150,7 @@ class _Front:
                 f"{model.automaton.acceptance}; quickest_policy has the steps of any task."
             )
         quickest = quickest_policy(model) if quickest is None else quickest
-        clock = Clock(model)
+        clock = StepAnalysis(model)
         front = _Front(clock, ())  # type: ignore[arg-type]
         ends = front.vertex(quickest.policy), front.vertex(front.cheapest(1.0, _NEAR)[0])
         return _Front(clock, ends)

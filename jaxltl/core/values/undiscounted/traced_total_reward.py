@@ -52,7 +52,7 @@ from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse
 from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
-from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import System, bicgstab, inverse, is_small, norm
 
 _FORCING = 1e-2  # relative residual of a linear system
@@ -138,7 +138,7 @@ def total_reward_by_sweeps(
     reward = jnp.where(model.available & earns, reward, 0)
     checked = None if policy is None else valid_policy(model, policy)
     weight = None if checked is None else checked.distribution
-    found: Found = in_turn(
+    found: Found = sequential_vmap(
         partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
     )
     chosen = found.policy if weight is None else weight

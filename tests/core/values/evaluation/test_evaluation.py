@@ -241,7 +241,7 @@ def test_exact_intervals_cover(chance, confidence):
     for total in (1, 10, 137):
         count = np.arange(total + 1)
         mass = scipy.stats.binom(total, chance).pmf(count)
-        ends = [evaluation.share_estimate(k, total, 1 - confidence) for k in count.tolist()]
+        ends = [evaluation.frequency_estimate(k, total, 1 - confidence) for k in count.tolist()]
         held = [x.lower <= chance <= x.upper for x in ends]
         assert mass @ held >= confidence - 1e-12
         assert held[round(total * chance)]
@@ -304,7 +304,7 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
         return jax.tree.map(lambda x: x[seed, begin : begin + batch.size], every)
 
     monkeypatch.setattr(evaluation, "_batch", handed)
-    for name in ("share_estimate", "_decided"):  # of few counts, many times
+    for name in ("frequency_estimate", "_decided"):  # of few counts, many times
         monkeypatch.setattr(evaluation, name, cache(getattr(evaluation, name)))
     covered = wrong = decided = spent = 0
     for seed in range(number):

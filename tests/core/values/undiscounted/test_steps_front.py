@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxltl as jl
-from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, quickest_policy
+from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis, quickest_policy
 from jaxltl.core.values.undiscounted.steps_front import meeting, steps_front
 
 S, A, GOAL, TRAP = 7, 3, 5, 6
@@ -43,7 +43,7 @@ def test_fronts_and_required_points_agree_with_linear_programs(count):
     rng = np.random.default_rng(0)
     for _ in range(count):
         model, *facts = risky(rng)
-        clock, quickest = Clock(model), quickest_policy(model)
+        clock, quickest = StepAnalysis(model), quickest_policy(model)
         front = steps_front(model, quickest, max_points=20)
         assert front[0].probability[0] == pytest.approx(clock.probability(quickest.policy)[0])
         for one in front:

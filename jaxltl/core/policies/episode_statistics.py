@@ -75,7 +75,7 @@ class Estimate:
       error: the standard error of the mean.
       method: the statistical method of the interval.
 
-    >>> found = share_estimate(8, 10, 0.05)
+    >>> found = frequency_estimate(8, 10, 0.05)
     >>> found.mean, round(found.lower, 3), round(found.upper, 3)
     (0.8, 0.444, 0.975)
     """
@@ -186,7 +186,7 @@ def evaluation_of(
     shares: dict[str, Estimate | None] = dict.fromkeys(_SHARES)
     if totals.verdict is not None:
         shares = {
-            name: share_estimate(int((totals.verdict == code).sum()), total, failure, fixed)
+            name: frequency_estimate(int((totals.verdict == code).sum()), total, failure, fixed)
             for name, code in _SHARES.items()
         }
 
@@ -224,7 +224,7 @@ def evaluation_of(
     )
 
 
-def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
+def frequency_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
     """Frequency with its interval: exact for a fixed number of trials, or anytime-valid."""
     total = validation.integer("total", total, least=1, most=2**53)
     count = validation.integer("count", count, most=total)
@@ -255,7 +255,7 @@ def _bounded_estimate(
     mean, error = _mean_error(x)
     size = high - low
     if not size:
-        return Estimate(mean, low, high, error, "there is no other")
+        return Estimate(mean, low, high, error, "exact")
     lower, upper = bounded_mean((np.asarray(x, np.float64) - low) / size, failure, planned=planned)
     method = "empirical Bernstein" + (", at any time" if planned is None else "")
     return Estimate(mean, low + size * lower, low + size * upper, error, method)
