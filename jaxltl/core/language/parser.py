@@ -93,6 +93,13 @@ class ExpressionParser(TokenReader):
         self.nesting -= 1
         return found
 
+    def whole(self) -> Expression:
+        """The expression that is the rest of the text."""
+        found = self.expression()
+        if self.kinds[self.at] != "end":
+            self.fail("an operator or the end")
+        return found
+
     def _climb(self, level: int) -> Expression:
         left = self._prefix(level)
         while True:
@@ -175,9 +182,7 @@ class ExpressionParser(TokenReader):
         return self._call(name, place)
 
     def _call(self, name: str, place: int) -> Expression:
-        operands = [self.expression()]
-        while self.accept(","):
-            operands.append(self.expression())
+        operands = self.separated(self.expression)
         self.expect(")", " or ','")
         least, most = FUNCTIONS[name]
         if len(operands) < least or (most is not None and len(operands) > most):
@@ -201,11 +206,7 @@ def parse_expression(text: str) -> Expression:
       '((!(x = 1) | a) => b)'
     """
     try:
-        parser = ExpressionParser(text)
-        found = parser.expression()
-        if parser.kinds[parser.at] != "end":
-            parser.fail("an operator or the end")
-        return found
+        return ExpressionParser(text).whole()
     except LanguageError as error:
         raise Source(text, "expression").located(error) from None
 
@@ -390,20 +391,21 @@ class _ProgramParser(ExpressionParser):
 
     def renaming(self) -> list[tuple[str, str]]:
         self.expect("[")
-        found: list[tuple[str, str]] = []
-        while True:
+        found: dict[str, str] = {}
+
+        def pair() -> None:
             place = self.place
             old = self.word("a name to be replaced")
             self.expect("=")
             new, _ = self.name("a new name")
-            if old in dict(found):
+            if old in found:
                 raise LanguageError(place, f"{old} is renamed twice.")
-            found.append((old, new))
-            if not self.accept(","):
-                break
+            found[old] = new
+
+        self.separated(pair)
         self.expect("]", " or ','")
         self.expect("endmodule")
-        return found
+        return list(found.items())
 
     def command(self) -> Command:
         place = self.place
@@ -412,9 +414,7 @@ class _ProgramParser(ExpressionParser):
         self.expect("]", " after the action")
         guard = self.expression()
         self.expect("->", " after the guard")
-        outcomes = [self.outcome()]
-        while self.accept("+"):
-            outcomes.append(self.outcome())
+        outcomes = self.separated(self.outcome, "+")
         self.expect(";", " or '+' after an update")
         if outcomes[0].probability is TRUE and len(outcomes) == 1:
             outcomes = [Outcome(literal(1), None, outcomes[0].assignments)]
@@ -439,17 +439,19 @@ class _ProgramParser(ExpressionParser):
         return Outcome(lower, upper, self.update())
 
     def update(self) -> tuple[Assignment, ...]:
-        found: list[Assignment] = []
-        while True:
-            if not self.accept("true"):
-                self.expect("(", " before an assignment, such as (x'=1), or true")
-                name, place = self.name("a variable")
-                self.expect("'", " after the variable that is assigned")
-                self.expect("=")
-                found.append(Assignment(name, self.expression(), place))
-                self.expect(")", " or an operator")
-            if not self.accept("&"):
-                return tuple(found)
+        found = self.separated(self.assignment, "&")
+        return tuple(a for a in found if a is not None)
+
+    def assignment(self) -> Assignment | None:
+        if self.accept("true"):
+            return None
+        self.expect("(", " before an assignment, such as (x'=1), or true")
+        name, place = self.name("a variable")
+        self.expect("'", " after the variable that is assigned")
+        self.expect("=")
+        found = Assignment(name, self.expression(), place)
+        self.expect(")", " or an operator")
+        return found
 
     def reward_structure(self) -> None:
         place = self.place
@@ -484,13 +486,14 @@ class _ProgramParser(ExpressionParser):
         name = self.quoted("a name") if quoted else self.name("the name of a player")[0]
         modules: list[str] = []
         actions: list[str] = []
-        while True:
+
+        def controlled() -> None:
             if self.accept("["):
                 actions.append(self.name("an action")[0])
                 self.expect("]")
             else:
                 modules.append(self.name("a module or an action in brackets")[0])
-            if not self.accept(","):
-                break
+
+        self.separated(controlled)
         self.expect("endplayer", " or ','")
         self.players.append(Player(name, tuple(modules), tuple(actions), place))

@@ -78,10 +78,7 @@ def constant_value(name: str, value: object) -> Value:
     """A value that is given for a constant: a number, a Boolean, or the text of one."""
     if isinstance(value, str):
         try:
-            parser = ExpressionParser(value)
-            found = substitute(parser.expression(), {})
-            if parser.kinds[parser.at] != "end":
-                parser.fail("an operator or the end")
+            found = substitute(ExpressionParser(value).whole(), {})
         except LanguageError as error:
             raise ValueError(f"constant {name} = {value!r}: {error.message}") from None
         if not found.is_literal:
@@ -182,21 +179,20 @@ class _Resolver:
 
     def check_names(self, modules: Sequence[Module]) -> None:
         """Raises LanguageError if two constants, formulas or variables have one name."""
-        formulas = [(name, e.place) for name, e in self.syntax.formulas]
-        constants = [(c.name, c.place) for c in self.syntax.constants]
-        variables = [(v.name, v.place) for v in self.syntax.variables]
-        variables += [
-            (d.name, m.place if d.place < 0 else d.place) for m in modules for d in m.declarations
-        ]
+        syntax = self.syntax
+        declared = [(d, m.place) for m in modules for d in m.declarations]
+        places = [(name, e.place) for name, e in syntax.formulas]
+        places += [(c.name, c.place) for c in (*syntax.constants, *syntax.variables)]
+        places += [(d.name, place if d.place < 0 else d.place) for d, place in declared]
         seen: set[str] = set()
-        for name, place in (*formulas, *constants, *variables):
+        for name, place in places:
             if name in seen:
                 raise LanguageError(place, f"the name {name} is declared twice.")
             seen.add(name)
-        names = [r.name for r in self.syntax.rewards]
-        for r, name in zip(self.syntax.rewards, names, strict=True):
-            if names.count(name) > 1:
-                raise LanguageError(r.place, f'there are two reward structures "{name}".')
+        names = [r.name for r in syntax.rewards]
+        for r in syntax.rewards:
+            if names.count(r.name) > 1:
+                raise LanguageError(r.place, f'there are two reward structures "{r.name}".')
         unknown = sorted(set(self.given) - {c.name for c in self.syntax.constants})
         if unknown:
             listed = ", ".join(c.name for c in self.syntax.constants) or "none"

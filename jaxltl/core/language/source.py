@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
+Item = TypeVar("Item")
 MAX_TOKENS = 2_000_000  # of a text, about 200 MB of memory
 _TOKEN = re.compile(
     r"""
@@ -99,6 +101,13 @@ class TokenReader:
         """Takes the next token, which must be this sign or word."""
         if not self.accept(text):
             self.fail(f"{text!r}{after}")
+
+    def separated(self, item: Callable[[], Item], sign: str = ",") -> list[Item]:
+        """Takes items with a sign between each two."""
+        found = [item()]
+        while self.accept(sign):
+            found.append(item())
+        return found
 
     def word(self, expected: str, kind: str = "word") -> str:
         """Takes a name."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from jaxltl.core.array_types import Integers
@@ -44,25 +46,14 @@ def _assignments(program: Program, max_states: int) -> tuple[dict[str, Integers]
             size = 0
     todo = [p for p in parts if p[0]]
     variables = {v.name: v for v in program.variables}
+    width_of = {v.name: v.high - v.low + 1 for v in program.variables}
     while len(columns) < len(variables):
-        # Next is a variable of the conjunct that needs the fewest combinations.
-        costs = [
-            (
-                np.prod(
-                    [float(variables[n].high - variables[n].low + 1) for n in names - set(columns)]
-                ),
-                i,
-            )
-            for i, (names, _) in enumerate(todo)
-        ]
-        if costs:
-            names, _ = todo[min(costs)[1]]
-            chosen = sorted(names - set(columns))
-        else:
-            chosen = [n for n in variables if n not in columns]
+        # Next are the variables of the conjunct that needs the fewest combinations.
+        needs = [sorted(names - columns.keys()) for names, _ in todo]
+        rest = [n for n in variables if n not in columns]
+        chosen = min(needs, key=lambda some: math.prod(width_of[n] for n in some), default=rest)
         for name in chosen:
-            v = variables[name]
-            width = v.high - v.low + 1
+            v, width = variables[name], width_of[name]
             if size * width > limit:
                 raise LanguageError(
                     program.initial.place,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -305,16 +306,5 @@ class LocalTable:
 
 def _runs(masks: Sequence[int]) -> list[tuple[int, int, int]]:
     """Runs of ones in some words: word, first bit and number of bits."""
-    found = []
-    for word, mask in enumerate(masks):
-        bit = 0
-        while mask >> bit:
-            if mask >> bit & 1:
-                width = 1
-                while mask >> (bit + width) & 1:
-                    width += 1
-                found.append((word, bit, width))
-                bit += width
-            else:
-                bit += 1
-    return found
+    bits = (re.finditer("1+", f"{mask:b}"[::-1]) for mask in masks)
+    return [(w, run.start(), len(run[0])) for w, runs in enumerate(bits) for run in runs]
