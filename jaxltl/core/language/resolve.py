@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from graphlib import CycleError, TopologicalSorter
@@ -180,10 +181,10 @@ class _Resolver:
     def check_names(self, modules: Sequence[Module]) -> None:
         """Raises LanguageError if two constants, formulas or variables have one name."""
         syntax = self.syntax
-        declared = [(d, m.place) for m in modules for d in m.declarations]
+        declared = *syntax.variables, *(d for m in modules for d in m.declarations)
         places = [(name, e.place) for name, e in syntax.formulas]
-        places += [(c.name, c.place) for c in (*syntax.constants, *syntax.variables)]
-        places += [(d.name, place if d.place < 0 else d.place) for d, place in declared]
+        places += [(c.name, c.place) for c in syntax.constants]
+        places += [(d.name, d.place) for d in declared]
         seen: set[str] = set()
         for name, place in places:
             if name in seen:
@@ -352,19 +353,13 @@ class _Checker:
         self.types: dict[str, Type] = {v.name: v.type for v in program.variables}
         self.with_parameters: dict[str, Type] = program.types
         self.owner = {v.name: v.module for v in program.variables}
-        self.range = {v.name: v for v in program.variables}
 
     def check(self) -> None:
         program = self.program
-        sharing: dict[str, set[int]] = {}
+        uses = Counter(a for m in program.modules for a in {c.action for c in m.commands})
         for i, m in enumerate(program.modules):
             for c in m.commands:
-                sharing.setdefault(c.action, set()).add(i)
-        shared = {a for a, where in sharing.items() if a and len(where) > 1}
-        for i, m in enumerate(program.modules):
-            for c in m.commands:
-                self.command(c, i, c.action in shared)
-        actions = {c.action for m in program.modules for c in m.commands}
+                self.command(c, i, bool(c.action) and uses[c.action] > 1)
         for name, e in program.labels.items():
             self.boolean(e, f'the label "{name}"')
         for r in program.rewards:
@@ -373,7 +368,7 @@ class _Checker:
                 self.number(item.value, "a reward")
         if program.initial is not None:
             self.boolean(program.initial, "the init block")
-        self.players(actions)
+        self.players(set(uses))
 
     def players(self, actions: set[str]) -> None:
         program = self.program
