@@ -241,7 +241,7 @@ class _CoreSolver:
         num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
         for k in range(1, _MOST_SWEEPS):
             before, value = value, equation.best(equation.backup(value))
-            if k < num_sweeps or k % _SWEEPS:
+            if k < num_sweeps - large * _SWEEPS or k % _SWEEPS:
                 continue
             if not large:
                 break
