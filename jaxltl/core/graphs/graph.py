@@ -22,9 +22,8 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.models.ops.array_namespace import jit, is_traced
+from jaxltl.core.models.ops.array_namespace import host_callback, is_traced, jit
 from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.construct.convert import keep_latest
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.protocols import Array, Model, PyTree

@@ -18,7 +18,7 @@ from jax import lax
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.host_callback import host_callback
+from jaxltl.core.models.ops.array_namespace import host_callback
 from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.sparse.linear.elimination import factorize

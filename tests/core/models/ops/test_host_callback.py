@@ -9,7 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.graphs.graph import TracedGraph
-from jaxltl.core.models.ops.host_callback import host_callback
+from jaxltl.core.models.ops.array_namespace import host_callback
 
 
 @pytest.fixture
