@@ -316,14 +316,9 @@ def write_npz(path: str | os.PathLike[str], model: Model) -> None:
         ends = _ENDS if model.radius is None else _OF_INTERVALS
         arrays |= {k: np.asarray(getattr(model, k), np.float64) for k in ends}
     sparse = to_sparse(model.nominal if isinstance(model, IntervalMDP) else model)
-    for key in keys:
-        arrays[key] = np.asarray(getattr(sparse, key))
-    if sparse.action is not None:
-        arrays["action"] = np.asarray(sparse.action)
-    if sparse.propositions:
-        arrays["propositions"] = np.array(sparse.propositions)
-    if sparse.action_names:
-        arrays["actions"] = np.array(sparse.action_names)
+    fields = {key: getattr(sparse, key) for key in (*keys, "action")}
+    fields |= {"propositions": sparse.propositions or None, "actions": sparse.action_names or None}
+    arrays |= {key: np.asarray(x) for key, x in fields.items() if x is not None}
     for name, reward in sparse.rewards.items():
         parts = {x: getattr(reward, x) for x in _PARTS if getattr(reward, x) is not None}
         for part, values in (parts or {"state": np.zeros(sparse.num_states)}).items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -254,17 +255,16 @@ def write_pgsolver(
             )
     target = [str(x) for x in vertex[successor].tolist()]
     owner = np.where(np.asarray(game.system), "0", "1").tolist()
-    starts = row_start.tolist()
     lines = [f"parity {vertex.max()};"]
     initial = np.asarray(game.initial)
     if (initial > 0).sum() == 1 and count > 1:
         lines.append(f"start {vertex[np.argmax(initial)]};")
-    for i, (v, p, loops) in enumerate(
-        zip(vertex.tolist(), priority.tolist(), stays.tolist(), strict=True)
+    leads = [",".join(target[a:b]) for a, b in pairwise(row_start.tolist())]
+    for v, p, o, loops, to, name in zip(
+        vertex.tolist(), priority.tolist(), owner, stays.tolist(), leads, names, strict=True
     ):
-        leads = str(v) if loops else ",".join(target[starts[i] : starts[i + 1]])
-        quoted = f' "{names[i]}"' if names[i] else ""
-        lines.append(f"{v} {p} {owner[i]} {leads}{quoted};")
+        quoted = f' "{name}"' if name else ""
+        lines.append(f"{v} {p} {o} {v if loops else to}{quoted};")
     with write_bytes(path) as file:
         file.write("\n".join([*lines, ""]).encode())
 

@@ -58,18 +58,15 @@ def load_scenes(task: TodirlTask, judge: Automaton) -> tuple[list[Scene], list[S
         test += _generate(task, task.test.generate, first, judge)
     for table, scenes in (("world", training), ("test", test)):
         names = [scene.name for scene in scenes]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(
-                    f"{task.path}: [{table}] maps has {name} twice; leave one of them out."
-                )
-    names = [scene.name for scene in test]
-    for name in task.left_out:
-        if name not in names:
+        if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(
-                f"{task.path}: [test] leave_out names {name!r}, which is no test world; there are "
-                f"{', '.join(names[:8])}{', ...' if len(test) > 8 else ''}."
+                f"{task.path}: [{table}] maps has {twice[0]} twice; leave one of them out."
             )
+    if unknown := [name for name in task.left_out if name not in names]:  # of the test worlds
+        raise ValueError(
+            f"{task.path}: [test] leave_out names {unknown[0]!r}, which is no test world; there are "
+            f"{', '.join(names[:8])}{', ...' if len(test) > 8 else ''}."
+        )
     return training, test
 
 

@@ -78,10 +78,8 @@ class Outcome:
 def prepare(task: GroundingTask, seed: int) -> Setup:
     """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
     file, path = task.file, task.path
-    names = zip(map(map_file, task.maps), task.maps, strict=True)
-    texts = [
-        read_map(path, str(entry) if name is None else {"file": name}) for name, entry in names
-    ]
+    maps = zip(map(map_file, task.maps), task.maps, strict=True)
+    texts = [read_map(path, str(x) if name is None else {"file": name}) for name, x in maps]
     options = grid_options(file.world)
     wall = file.world.wall or "#"
     with errors_in(f"{path}: [world] "):

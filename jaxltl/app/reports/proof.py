@@ -79,10 +79,10 @@ def picture(proof: Proof, dynamics: Dynamics, episodes: Sequence[Episode]) -> Pi
     from jaxltl.plot.certificates import certificate
     from jaxltl.plot.style import to_bytes
 
-    runs = [] if proof.violation is None else [proof.violation]
-    for one in episodes if proof.violation is None else ():
-        states = np.asarray(jax.tree.leaves(one.world.world)[0])  # of a time limit: (state, time)
-        runs.append(states[: int(np.asarray(one.valid).sum()) + 1])
+    runs = [proof.violation]
+    if proof.violation is None:  # the world of a time limit is (state, time)
+        states = [np.asarray(jax.tree.leaves(one.world.world)[0]) for one in episodes]
+        runs = [x[: int(np.sum(one.valid)) + 1] for x, one in zip(states, episodes, strict=True)]
     return Picture(
         "certificate.svg",
         "Certified lower bounds",
