@@ -497,18 +497,17 @@ def _strategy_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
     assert found.strategy is not None and found.restricted is not None
     game, nodes, rng = found.restricted.model, found.nodes, np.random.default_rng(0)
     base = np.asarray(found.strategy.base_state)[np.asarray(found.restricted.base_state)]
-    mdp = game.mdp
-    successor, chance = np.asarray(mdp.successor), np.asarray(mdp.probability, float)
+    successor, chance = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability, float)
     allowed, system = np.asarray(game.available), np.asarray(game.system)
     count = len(found.world.actions)
-    initial = np.asarray(game.initial, float)
+    initial, place = np.asarray(game.initial, float), (nodes.world_state, nodes.automaton_state)
     here = int(rng.choice(len(initial), p=initial / initial.sum()))
     steps: list[tuple[int, int, int | None]] = []
     for _ in range(_PLAY_STEPS):
         action = int(rng.choice(np.flatnonzero(allowed[here])))
         shown = None if action >= count else action + count * (not system[here])
-        node = base[here]
-        steps.append((int(nodes.world_state[node]), int(nodes.automaton_state[node]), shown))
+        state, memory = (int(x[base[here]]) for x in place)
+        steps.append((state, memory, shown))
         likely = chance[here, action]
         here = int(rng.choice(successor[here, action], p=likely / likely.sum()))
     return steps

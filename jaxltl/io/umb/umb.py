@@ -253,25 +253,22 @@ def _contents(model: Model, place: str) -> Members:
         "#observations": 0,
         "branch-probability-type": _DOUBLE if interval is None else _INTERVAL,
     }
+    chances = _packed(host.probability, "<f8")
+    if interval is not None:
+        chances = _pairs(interval.lower, interval.upper)
     contents: Members = [("state-is-initial.bin", write_bits(initial > 0))]
     if not host.is_chain:
         contents.append(("state-to-choices.bin", _packed(host.row_start, "<u8")))
     contents += [
         ("choice-to-branches.bin", _packed(host.entry_start, "<u8")),
         ("branch-to-target.bin", _packed(host.successor, "<u8")),
-        (
-            "branch-to-probability.bin",
-            _packed(host.probability, "<f8")
-            if interval is None
-            else _pairs(interval.lower, interval.upper),
-        ),
+        ("branch-to-probability.bin", chances),
     ]
     if system is not None:
         counts["player-names"] = list(_PLAYERS)
         contents.append(("state-to-player.bin", _packed(~system, "<u4")))
     if sparse.action is not None:
-        action = np.asarray(sparse.action)
-        names = sparse.action_names
+        action, names = np.asarray(sparse.action), sparse.action_names
         counts["#choice-actions"] = len(names) or int(action.max()) + 1
         contents.append((f"{ACTIONS}/values.bin", _packed(action, "<u4")))
         contents += _written_texts(names, ACTIONS, place)
@@ -287,10 +284,8 @@ def _contents(model: Model, place: str) -> Members:
     contents += more
     if sparse.valuation:
         variables = write_variables(sparse.valuation, place)
-        states: dict[str, object] = {
-            "unique": False,
-            "classes": [{"variables": variables.variables}],
-        }
+        classes = [{"variables": variables.variables}]
+        states: dict[str, object] = {"unique": False, "classes": classes}
         if variables.named:
             states["#strings"] = len(variables.texts)
             metadata["parameters"] = {TEXTS: variables.named}
