@@ -19,7 +19,7 @@ from jaxltl.core.language.syntax import Program, RewardItem
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.programs.explore import Explored, Progress, explore
+from jaxltl.core.programs.explore import Explored, Progress, Search
 from jaxltl.core.programs.initial import initial_states
 from jaxltl.core.programs.layout import Layout, Reader, Words, make_layout
 from jaxltl.core.programs.local_choices import state_text
@@ -134,8 +134,8 @@ def build_rows(
         Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()
     )
     initial = initial_states(program, layout, max_states)
-    found = explore(program, layout, initial, weights, max_states=max_states, progress=progress)
     try:
+        found = Search(program, layout, weights, max_states).run(initial, progress)
         return _rows(program, found, weights)
     except LanguageError as error:
         raise program.source.located(error) from None

@@ -74,29 +74,12 @@ _ARRAYS = {  # of :class:`Explored`, which a search makes in parts
 }
 
 
-def explore(
-    program: Program,
-    layout: Layout,
-    initial: Words,
-    weights: Numbers,
-    *,
-    max_states: int,
-    progress: Progress | None = None,
-) -> Explored:
+class Search:
     """Breadth-first search from the initial states.
 
-    Raises:
-      ValueError: more than `max_states` states, or an update that is no distribution or leaves the
-        range of a variable, with the command and the state.
+    Its methods raise LanguageError: more than `max_states` states, or an update that is no
+    distribution or leaves the range of a variable, with the command and the state.
     """
-    try:
-        return Search(program, layout, weights, max_states).run(initial, progress)
-    except LanguageError as error:
-        raise program.source.located(error) from None
-
-
-class Search:
-    """The state of a search."""
 
     def __init__(self, program: Program, layout: Layout, weights: Numbers, max_states: int) -> None:
         self.program, self.layout, self.weights = program, layout, weights
