@@ -79,8 +79,9 @@ def picture(proof: Proof, dynamics: Dynamics, episodes: Sequence[Episode]) -> Pi
     from jaxltl.plot.certificates import certificate
     from jaxltl.plot.style import to_bytes
 
-    runs = [proof.violation]
-    if proof.violation is None:  # the world of a time limit is (state, time)
+    if proof.violation is not None:
+        runs = [proof.violation]
+    else:  # the world of a time limit is (state, time)
         states = [np.asarray(jax.tree.leaves(one.world.world)[0]) for one in episodes]
         runs = [x[: int(np.sum(one.valid)) + 1] for x, one in zip(states, episodes, strict=True)]
     return Picture(
