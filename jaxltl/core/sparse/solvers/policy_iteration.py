@@ -236,7 +236,7 @@ class _CoreSolver:
         """A value after a few sweeps, in large cores more while states converge; True if all do."""
         equation, large = self.equation, self.equation.size > _LARGE_CORE
         value, left = np.zeros(equation.size), np.inf
-        if equation.is_chain and not large:
+        if equation.is_chain:  # one elimination suffices
             return value, False
         num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
         for k in range(1, _MOST_SWEEPS):
