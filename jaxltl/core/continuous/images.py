@@ -30,7 +30,7 @@ LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as 
 # of the noise: less trades more evaluations for narrower images.
 CELL_SHARE, NOISE_SHARE = 0.15, 0.02
 _CHUNK = 1024  # boxes of one evaluation, which then fits into the caches
-_ROWS = 2**14  # pairs of cells and actions at once, which bounds the memory
+_ROWS = 2**12  # pairs of cells and actions at once, which bounds the memory
 _ROUNDING = 1e-13  # relative error of a few operations in float64, with a margin of 100
 _CONSTANT = 1e-14  # relative width of the bounds of a constant gain
 _EQUAL_GAINS = 1e-6  # gains of the noise that differ by less are one

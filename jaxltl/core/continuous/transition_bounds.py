@@ -22,7 +22,7 @@ from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.continuous.images import Images, NoiseBox
 from jaxltl.core.pretty_print import brief
 
-_CHUNK = 2**16  # probabilities handled at once by a thread
+_CHUNK = 2**14  # probabilities handled at once by a thread
 _UNIT = float(np.finfo(np.float64).eps)
 
 
@@ -152,14 +152,18 @@ def transition_bounds(
 
 def _distinct(columns: Sequence[Floats]) -> tuple[Floats, Integers]:
     """Distinct rows ``[U, K]`` of K columns ``[R]``, in order, and the one of each row."""
-    number = np.zeros(len(columns[0]), np.int64)
+    number = np.zeros(len(columns[0]), np.int32)
     for column in columns:  # keys of one number are sorted faster, and in less memory, than rows
         if (column == column[0]).all():
             continue
         values, inverse = np.unique(column, return_inverse=True)
-        number = np.unique(number * len(values) + inverse, return_inverse=True)[1]
-    first = np.unique(number, return_index=True)[1]
-    return np.stack([column[first] for column in columns], -1), number.astype(np.int32)
+        if number.any():
+            key = number * np.int64(len(values)) + inverse
+            inverse = np.unique(key, return_inverse=True)[1]
+        number = inverse.astype(np.int32)
+    first = np.empty(int(number.max()) + 1, np.int32)
+    first[number[::-1]] = np.arange(len(number), dtype=np.int32)[::-1]
+    return np.stack([column[first] for column in columns], -1), number
 
 
 def _factors(
@@ -180,7 +184,11 @@ def _factors(
         return np.where(at == 0, bottom, np.where(at == count, top, edges[at]))
 
     def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-        return _bounds(noise, (a, b), rows)
+        a, b = np.broadcast_arrays(a, b)
+        many = max(_CHUNK // a.shape[1], 1)
+        parts = [slice(i, i + many) for i in range(0, len(rows), many)]
+        found = [_bounds(noise, (a[part], b[part]), rows[part]) for part in parts]
+        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
 
     lower, upper = bounds(side(index), side(index + 1))
     first, last = side(start)[:, None], side(start + width)[:, None]
