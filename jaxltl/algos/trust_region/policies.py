@@ -85,20 +85,21 @@ def _agent(
 
 
 def _sampled_action(
-    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key | None
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
 ) -> tuple[jax.Array, PyTree]:
-    """The action of an agent; the mean without a key."""
+    """Random: fails without a key, by which proofs refuse it."""
     state, problem, hparams = run
-    action, deviation = act(state, hparams, flat_observation(observation))
-    if key is not None:
-        action = action + deviation * jax.random.normal(key, action.shape, action.dtype)
+    mean, deviation = act(state, hparams, flat_observation(observation))
+    action = mean + deviation * jax.random.normal(key, mean.shape, mean.dtype)
     return actions_of.as_action(problem.environment.actions, action, None), memory
 
 
 def _mean_action(
     run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: Key
 ) -> tuple[jax.Array, PyTree]:
-    return _sampled_action(run, memory, observation, allowed, None)
+    state, problem, hparams = run
+    mean, _ = act(state, hparams, flat_observation(observation))
+    return actions_of.as_action(problem.environment.actions, mean, None), memory
 
 
 def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
