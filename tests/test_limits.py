@@ -14,12 +14,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 105_050,
-    "statements": 52_790,
-    "docstring lines": 17_240,
+    "lines": 102_510,
+    "statements": 51_780,
+    "docstring lines": 16_945,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,
-    "Any in annotations": 222,
+    "Any in annotations": 211,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }
