@@ -401,16 +401,13 @@ class _Problem:
 
     def _part(self, active: Integers) -> tuple[Successors, TransitionBounds]:
         """The rows of some cells, with their transition probabilities."""
-        clipped = self.dynamics.outside == "clip"
-        if len(active) == len(self.rows.cells):
-            noise = self.dynamics.noise
-            return self.rows, transition_bounds(self.images, self.grid, noise, self.box, clipped)
-        num = self.rows.num_actions
-        index = (active[:, None] * num + np.arange(num)).reshape(-1)
-        part = self.images.part(active, index)
-        arrays = {x: getattr(self.rows, x)[index] for x in ("start", "stop", "outside")}
-        rows = replace(self.rows, cells=part.cells, **arrays)
-        return rows, transition_bounds(part, self.grid, self.dynamics.noise, self.box, clipped)
+        clipped, rows, index = self.dynamics.outside == "clip", self.rows, None
+        if len(active) < len(rows.cells):
+            index = (active[:, None] * rows.num_actions + np.arange(rows.num_actions)).reshape(-1)
+            arrays = {x: getattr(rows, x)[index] for x in ("start", "stop", "outside")}
+            rows = replace(rows, cells=rows.cells[active], **arrays)
+        noise = self.dynamics.noise
+        return rows, transition_bounds(self.images, self.grid, noise, self.box, clipped, index)
 
 
 def safe_actions(dynamics: Dynamics, control: Control, bounds: Bounds) -> Booleans:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -62,14 +62,13 @@ class Images:
     varying: Floats | None = None
     order: tuple[int, ...] = ()
 
-    def part(self, active: Integers, rows: Integers) -> Images:
-        """Some of the rows, those of the cells at positions `active`; equal rows stay one in memory."""
-        arrays = {
-            name: x[: len(rows)] if x.strides[0] == 0 else x[rows]
-            for name in ("low", "high", "gain", "varying")
-            if (x := getattr(self, name)) is not None
-        }
-        return replace(self, cells=self.cells[active], **arrays)
+    def columns(self, axis: int, rows: Integers | None) -> list[Floats]:
+        """Low, high, gain and variation of a coordinate in some rows; equal rows stay one in memory."""
+        none = np.broadcast_to(0.0, self.low.shape) if self.varying is None else self.varying
+        arrays = [x[:, axis] for x in (self.low, self.high, self.gain, none)]
+        if rows is None:
+            return arrays
+        return [x[: len(rows)] if x.strides[0] == 0 else x[rows] for x in arrays]
 
 
 @dataclass(frozen=True)

@@ -126,17 +126,19 @@ class TransitionBounds:
 
 
 def transition_bounds(
-    images: Images, grid: Grid, noise: Sequence[Noise], box: NoiseBox, clipped: bool
+    images: Images,
+    grid: Grid,
+    noise: Sequence[Noise],
+    box: NoiseBox,
+    clipped: bool,
+    only: Integers | None = None,
 ) -> TransitionBounds:
-    """Interval transition probabilities of all rows of images, which hold for noise in a box."""
+    """Interval transition probabilities of (some) rows of images, which hold for noise in a box."""
     factors, ids = [], []
     order = images.order or tuple(range(grid.num_axes))
-    none = np.broadcast_to(0.0, images.low.shape)
-    varying = none if images.varying is None else images.varying
     for axis in order:
         j = images.noise_of[axis]
-        columns = [x[:, axis] for x in (images.low, images.high, images.gain, varying)]
-        rows, number = _distinct(columns)
+        rows, number = _distinct(images.columns(axis, only))
         ids.append(number)
         low, high, gain, _ = rows.T
         ends = (low, high)
@@ -234,36 +236,33 @@ def _stages(
     """Groups of rows that share factors, from the last axis to the first."""
     num_rows = len(ids[0])
     stages = []
-    group = np.zeros(num_rows, np.int64)  # of each row, in the stage before
+    group: Integers = np.zeros(num_rows, np.int32)  # of each row, in the stage before
     before, span = np.zeros((1, len(shape)), np.int32), shape
     starts = np.stack([f.start.astype(np.int32)[i] for f, i in zip(factors, ids, strict=True)], -1)
     widths = np.array([f.low.shape[1] for f in factors])
     for axis in reversed(range(len(shape))):
         if axis == 0:  # the last stage has one group for each row
-            new, inverse = np.arange(num_rows), np.arange(num_rows)
+            new = inverse = np.arange(num_rows, dtype=np.int32)
         else:
             # Rows far apart with equal factors are two groups: padded ranges stay short.
-            pair = group * (int(ids[axis].max()) + 1) + ids[axis]
+            pair = group * np.int64(ids[axis].max() + 1) + ids[axis]
             for other in range(axis):
-                near = starts[:, other] // (2 * widths[other])
+                near = starts[:, other] // np.int32(2 * widths[other])
                 _, pair = np.unique(pair, return_inverse=True)
-                pair = pair.reshape(-1) * (int(near.max()) + 1) + near
+                pair = pair.reshape(-1) * np.int64(near.max() + 1) + near
             _, new, inverse = np.unique(pair, return_index=True, return_inverse=True)
-            inverse = inverse.reshape(-1)
+            inverse = inverse.reshape(-1).astype(np.int32)
         first = np.full((len(new), axis), np.iinfo(np.int32).max, np.int32)
         last = np.zeros((len(new), axis), np.int32)
         np.minimum.at(first, inverse, starts[:, :axis])
         np.maximum.at(last, inverse, starts[:, :axis] + widths[:axis])
         width = tuple(int(w) for w in (last - first).max(0)) if axis else ()
         # Padded ranges stay inside those of the stage before, which include the needed ones.
-        limit = (
-            before[group[new]][:, :axis]
-            + np.array(span[:axis], np.int64)
-            - np.array(width, np.int64)
-        )
-        first = np.minimum(first, limit)
-        parent = group[new].astype(np.int32)
-        stages.append(_Stage(axis, ids[axis][new], parent, before[parent], first, width))
+        parent = group[new]
+        inside = before[parent]
+        room = np.array(span[:axis], np.int32) - np.array(width, np.int32)
+        first = np.minimum(first, inside[:, :axis] + room)
+        stages.append(_Stage(axis, ids[axis][new], parent, inside, first, width))
         group, before, span = inverse, first, width
     return tuple(stages)
 
