@@ -55,7 +55,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import action_distributions
-from jaxltl.algos.common.actor_critic import ActorCritic, dense
+from jaxltl.algos.common.actor_critic import action_parameters, dense
 from jaxltl.algos.common.moments import normalized
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import struct, validation
@@ -73,7 +73,7 @@ from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief
 
 
-class SequenceNetwork(ActorCritic):
+class SequenceNetwork(nn.Module):
     """An actor and a critic that read a :class:`~sequence_task.SequenceObservation`.
 
     With `events_seen`, each place is described by whether the current steps of the sequence reach or
@@ -90,7 +90,11 @@ class SequenceNetwork(ActorCritic):
       embedding: width of the layer that embeds a step's events.
     """
 
+    num_actions: int = 0
+    shape: Sequence[int] = ()
+    hidden: Sequence[int] = (64, 64)
     activation: str = "relu"
+    initial_deviation: float = 1.0
     events_seen: Callable[[PyTree], jax.Array] | None = None
     by_name: bool = False
     detailed: int = 4
@@ -119,8 +123,8 @@ class SequenceNetwork(ActorCritic):
         x = jnp.concatenate([*parts, ahead])
         for i, width in enumerate(self.hidden):
             x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
-        outputs = dense(self.num_outputs, 0.01, "actor")(x)
-        return self.action_parameters(outputs), dense(1, 1.0, "critic")(x)[0]
+        actor = action_parameters(self, lambda n: dense(n, 0.01, "actor")(x))
+        return actor, dense(1, 1.0, "critic")(x)[0]
 
 
 @struct.dataclass

@@ -26,7 +26,8 @@ True
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
@@ -40,6 +41,18 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Box, Finite, flat_observation
 from jaxltl.core.pretty_print import brief
+
+
+class HasNetwork(Protocol):
+    """A problem with a network and its initial memory, ``()`` without."""
+
+    @property
+    def network(self) -> nn.Module:
+        """The module."""
+
+    @property
+    def memory(self) -> PyTree:
+        """Its initial memory."""
 
 
 @brief
@@ -111,6 +124,27 @@ class _Layers(nn.Module):
         return dense(self.outputs, self.last_scale, "out")(x)
 
 
+def action_parameters(module: nn.Module, layer: Callable[[int], jax.Array]) -> PyTree:
+    """The logits of a network `module`, or mean and log standard deviation, by a `layer` of outputs.
+
+    >>> from types import SimpleNamespace
+    >>> action_parameters(SimpleNamespace(num_actions=3), jnp.zeros).shape
+    (3,)
+    """
+    if module.num_actions:
+        return layer(module.num_actions)
+    start = nn.initializers.constant(np.log(module.initial_deviation))
+    spread = module.param("log_deviation", start, tuple(module.shape), jnp.result_type(float))
+    return layer(int(np.prod(module.shape))).reshape(module.shape), spread
+
+
+def _heads(module: nn.Module, x: jax.Array) -> tuple[PyTree, jax.Array]:
+    """Action parameters and value, by two networks that share nothing."""
+    layers = partial(_Layers, tuple(module.hidden), activation=module.activation)
+    actor = action_parameters(module, lambda n: layers(n, 0.01, name="actor")(x))
+    return actor, layers(1, 1.0, name="critic")(x)[0]
+
+
 class ActorCritic(nn.Module):
     """Two multilayer perceptrons of the flattened observation: an actor and a critic.
 
@@ -131,32 +165,12 @@ class ActorCritic(nn.Module):
     activation: str = "tanh"
     initial_deviation: float = 1.0
 
-    @property
-    def num_outputs(self) -> int:
-        """Number of logits, or of the entries of an action."""
-        return self.num_actions or int(np.prod(self.shape))
-
-    def action_parameters(self, outputs: jax.Array) -> PyTree:
-        """Logits, or mean and log standard deviation; of a compact method."""
-        if self.num_actions:
-            return outputs
-        start = nn.initializers.constant(np.log(self.initial_deviation))
-        spread = self.param("log_deviation", start, tuple(self.shape), jnp.result_type(float))
-        return outputs.reshape(self.shape), spread
-
-    def heads(self, x: jax.Array) -> tuple[PyTree, jax.Array]:
-        """Action parameters and value, by two networks that share nothing; of a compact method."""
-        hidden = tuple(self.hidden)
-        outputs = _Layers(hidden, self.num_outputs, 0.01, self.activation, name="actor")(x)
-        value = _Layers(hidden, 1, 1.0, self.activation, name="critic")(x)[0]
-        return self.action_parameters(outputs), value
-
     @nn.compact
     def __call__(self, observation: PyTree) -> tuple[PyTree, jax.Array]:
-        return self.heads(flat_observation(observation))
+        return _heads(self, flat_observation(observation))
 
 
-class RecurrentActorCritic(ActorCritic):
+class RecurrentActorCritic(nn.Module):
     """A dense layer and a gated recurrent unit, with the heads of :class:`ActorCritic` on its memory.
 
     Attributes:
@@ -164,17 +178,19 @@ class RecurrentActorCritic(ActorCritic):
       memory: size of the memory.
     """
 
+    num_actions: int = 0
+    shape: Sequence[int] = ()
     hidden: Sequence[int] = (64,)
     memory: int = 64
+    activation: str = "tanh"
+    initial_deviation: float = 1.0
 
     def initial_memory(self) -> jax.Array:
         """``float[memory]``, zeros."""
         return jnp.zeros(self.memory, jnp.result_type(float))
 
     @nn.compact
-    def __call__(  # type: ignore[override]
-        self, memory: jax.Array, observation: PyTree
-    ) -> tuple[jax.Array, PyTree]:
+    def __call__(self, memory: jax.Array, observation: PyTree) -> tuple[jax.Array, PyTree]:
         x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
         cell = nn.GRUCell(
@@ -184,7 +200,7 @@ class RecurrentActorCritic(ActorCritic):
             name="cell",
         )
         memory, x = cell(memory, x)
-        return memory, self.heads(x)
+        return memory, _heads(self, x)
 
 
 def default_network(actions: Finite | Box) -> ActorCritic:
@@ -220,7 +236,7 @@ def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
     return found
 
 
-def has_memory(problem: PyTree) -> bool:
+def has_memory(problem: HasNetwork) -> bool:
     """``True`` if the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
 
     >>> from types import SimpleNamespace
@@ -230,7 +246,9 @@ def has_memory(problem: PyTree) -> bool:
     return bool(jax.tree.leaves(problem.memory))
 
 
-def evaluated(problem: PyTree, parameters: PyTree, memory: PyTree, observation: PyTree) -> Output:
+def evaluated(
+    problem: HasNetwork, parameters: PyTree, memory: PyTree, observation: PyTree
+) -> Output:
     """The :class:`Output` of the network of a `problem` for one `observation`.
 
     With its `parameters`, in which it is differentiable, and the `memory` before the observation.

@@ -274,9 +274,8 @@ def _improve(
     before = _Lower(bounds.lower, bounds.how, bounds.action)
     lower = problem.lower_bounds(bounds.task, before, bounds.upper, True, clock)
     upper = bounds.upper
-    needed = bounds.task.initial(lower.value)[bounds.initial]
     goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
-    if limits.upper and (needed < goal).any():
+    if limits.upper and (bounds.task.initial(lower.value)[bounds.initial] < goal).any():
         how = np.where(upper <= 0, SURE, UNPROVEN).astype(np.int8)
         start = _Lower(1 - upper, how, lower.action)
         negated = bounds.task.complement()
@@ -284,11 +283,10 @@ def _improve(
         upper = np.minimum(upper, 1 - found.value)
     # Each bound is sound; where rounding makes them cross, the probability is between both.
     upper = np.maximum(upper, lower.value)
-    active = problem.active(bounds.task, lower.value, upper)
+    needed = problem.needed(problem.active(bounds.task, lower.value, upper))
     return replace(
-        bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action,
-        needed=problem.needed(active),
-    )  # fmt: skip
+        bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action, needed=needed
+    )
 
 
 def _open(lower: Floats, upper: Floats, task: TaskProduct) -> Booleans:
@@ -356,7 +354,8 @@ class _Problem:
 
     def needed(self, active: Integers) -> Booleans:
         """Cells ``bool[C]`` at rows' positions."""
-        found: Booleans = np.isin(np.arange(self.grid.num_cells), self.rows.cells[active])
+        found = np.zeros(self.grid.num_cells, bool)
+        found[self.rows.cells[active]] = True
         return found
 
     def lower_bounds(

@@ -82,9 +82,7 @@ class Grid:
         return np.stack(start, -1).astype(np.int32), np.stack(stop, -1).astype(np.int32), outside
 
     def halve(self, cells: Booleans) -> tuple[Grid, tuple[Integers, ...]]:
-        """The grid with all intervals halved that contain a cell of ``bool[C]``, along each axis; and for
-        each axis the interval of this grid that contains each new one.
-        """
+        """A grid with intervals that contain a cell of ``bool[C]`` halved, and the parents of its own."""
         chosen, edges, parents = cells.reshape(self.shape), [], []
         for axis, e in enumerate(self.edges):
             cut = chosen.any(tuple(i for i in range(self.num_axes) if i != axis))

@@ -306,10 +306,8 @@ class _CoreSolver:
                 solver = solver.eliminated(policy)
                 extra = extra if np.isfinite(extra) else None
                 continue
-            if (
-                rounds % (2 * _SWEPT_ROUNDS) == 0
-                and not (solver.solve(weight) < weight / _EPS).all()
-            ):
+            late = rounds % (2 * _SWEPT_ROUNDS) == 0
+            if late and not (solver.solve(weight) < weight / _EPS).all():
                 break  # episodes so long that systems have no correct digit
             image = equation.backup(value)
             gain = sign * (equation.best(image) - value) + extra * weight
@@ -366,10 +364,7 @@ class _CoreSolver:
         return np.where(_reaches(rows, leaves), policy, self.proper)
 
     def _extra_cost(self, time: Floats, value: Floats, margin: int) -> float:
-        """The extra cost of a step: a share of the tolerance, and at least `margin` roundings.
-
-        Relative to the weights, of which `time` is the expected sum.
-        """
+        """A share of the tolerance, at least `margin` roundings; `time` is the sum of weights."""
         largest = 1.0 if self.relative else float(np.abs(value).max(initial=0))
         if self.relative:
             some = value > 0

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from jaxltl.core import validation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
@@ -77,6 +78,8 @@ def traced_arguments(arguments: Mapping[str, PyTree]) -> dict[str, jax.Array]:
             require_in_range(name, value)
             if not is_concrete(value):
                 traced[name] = value
+        elif name == "relative":
+            validation.boolean(name, value)
         else:
             require_real(name, value)
     return traced

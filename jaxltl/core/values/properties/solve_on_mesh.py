@@ -20,8 +20,9 @@ from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.ops import kernels
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.properties.solve_property import FINER, Answer, as_answer
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -87,10 +88,8 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
 
         def advance(start: Bounds, half: float, steps: int) -> Solution:
             if reward is None:
-                found: Solution = _reach_for(model, target, start, half, np.int32(steps), objective)
-            else:
-                found = _earn_until(model, reward, target, 2 * half, objective)
-            return found
+                return _reach_for(model, target, start, half, np.int32(steps), objective)
+            return _earn_until(model, reward, target, 2 * half, objective)
 
         return Question(
             prop,
@@ -143,14 +142,11 @@ def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
 def first_bounds(model: ShardedMDP, question: Question) -> Bounds:
     """Those that any probability has, where the model's values are."""
 
-    def one(fill: float) -> jax.Array:
-        make = jax.jit(
-            lambda: jnp.full(question.shape, fill, model.dtype), out_shardings=model.sharding
-        )
-        result: jax.Array = make()
-        return result
+    def full(number: jax.Array) -> jax.Array:
+        return jnp.full(question.shape, number, model.dtype)
 
-    return one(0.0), one(1.0)
+    make = jax.jit(full, out_shardings=model.sharding)
+    return make(0.0), make(1.0)
 
 
 def _objective(model: ShardedMDP, prop: Property) -> str:
@@ -167,45 +163,45 @@ def _objective(model: ShardedMDP, prop: Property) -> str:
 def _starts(model: ShardedMDP) -> jax.Array:
     """Positions of the initial states in order; on every device."""
     number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
-    found = jax.jit(
-        lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model)
-    )(model.initial)
+    found = _everywhere(model, lambda x: jnp.flatnonzero(x > 0, size=number), model.initial)
     order = np.argsort(on_host(_pick(model, found, model.number)), kind="stable")
-    result: jax.Array = jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
-    return result
+    return _everywhere(model, lambda x: x[order], found)
 
 
-def _everywhere(model: ShardedMDP) -> NamedSharding:
-    return NamedSharding(model.mesh, PartitionSpec())
+def _everywhere(model: ShardedMDP, function: Callable[..., jax.Array], *given: PyTree) -> jax.Array:
+    """The result of a function of arrays, on every device."""
+    whole = NamedSharding(model.mesh, PartitionSpec())
+    found: jax.Array = jax.jit(function, out_shardings=whole)(*given)
+    return found
 
 
 def _pick(model: ShardedMDP, places: jax.Array, quantity: jax.Array) -> jax.Array:
-    result: jax.Array = jax.jit(lambda x, i: x[i], out_shardings=_everywhere(model))(
-        quantity, places
-    )
-    return result
+    return _everywhere(model, lambda x, i: x[i], quantity, places)
 
 
 def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.Array:
-    def one(both: Product, i: jax.Array, x: jax.Array) -> jax.Array:
-        return x[i, both.initial_memory[i]]
-
-    result: jax.Array = jax.jit(one, out_shardings=_everywhere(both.mdp))(both, places, quantity)
-    return result
+    return _everywhere(
+        both.mdp, lambda model, i, x: x[i, model.initial_memory[i]], both, places, quantity
+    )
 
 
-@partial(jax.jit, static_argnames="objective")
+@jit("objective")
 def _reach_for(
-    model: ShardedMDP, target: Array, start: Bounds, half: Array, steps: Array, objective: str
+    model: ShardedMDP,
+    target: Array,
+    start: Bounds,
+    half: Array | float,
+    steps: Array,
+    objective: str,
 ) -> Solution:
     return reachability_probability(
         model, target, objective=objective, tolerance=half, max_steps=steps, start=start
     )
 
 
-@partial(jax.jit, static_argnames="objective")
+@jit("objective")
 def _earn_until(
-    model: ShardedMDP, reward: jax.Array, target: jax.Array, share: jax.Array, objective: str
+    model: ShardedMDP, reward: jax.Array, target: jax.Array, share: Array | float, objective: str
 ) -> Solution:
     return total_reward(model, reward, target, objective=objective, tolerance=share)
 

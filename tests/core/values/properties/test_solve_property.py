@@ -1,6 +1,7 @@
 """Properties of sparse models are answered by the right solver, as Storm answers them."""
 
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -100,6 +101,10 @@ def test_relative_widths_are_refused_where_they_are_not_supported():
             solve_property(model, text, relative=True)
     with pytest.raises(ValueError, match="relative=True is for a SparseMDP"):
         jl.reachability_probability(jl.to_padded(model), np.arange(4) == 3, relative=True)
+    for solve in (partial(solve_property, prop='P=? [ F "high" ]'), jl.reachability_probability):
+        given = {} if isinstance(solve, partial) else {"target": np.arange(4) == 3}
+        with pytest.raises(ValueError, match="relative='yes'; give True or False"):
+            solve(model, **given, relative="yes")
 
 
 def close(found, wanted) -> bool:
