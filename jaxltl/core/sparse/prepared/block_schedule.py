@@ -19,7 +19,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     ordered_components,
     topological_levels,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import offsets_from_counts
 
 # Targets of entries besides nodes: the value one, the goal, and the losing states.
 ONE, GOAL, LOST = -1, -2, -3
@@ -61,8 +61,8 @@ class Schedule(NamedTuple):
 def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
     """The block schedule of a system."""
     count, most, width = nodes.number, *_shape(nodes)
-    nodes = _narrow_rows(nodes, width, one)
-    nodes, choices = _narrow_nodes(nodes, most, one)
+    nodes, _ = _split(nodes, width, one, of_rows=False)
+    nodes, choices = _split(nodes, most, one, of_rows=True)
     parts = [[level for level in part if level.size] for part in _ordered(nodes)]
     size = _block_size([x.size for part in parts for x in part], most * width)
     place: Integers = np.zeros(nodes.number, np.int32)
@@ -72,12 +72,11 @@ def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
         for level in part:
             place[level] = start + np.arange(level.size)
             start += -(-level.size // size) * size
-    total = start
-    blocks.append(total // size)
-    target, source, name = _filled(nodes, place, total, (most, width, size), nothing)
+    blocks.append(start // size)
+    target, source, name = _filled(nodes, place, start, (most, width, size), nothing)
     segments = [Segment(target[a:b], source[a:b], name[a:b]) for a, b in pairwise(blocks)]
     levels = sum(map(len, parts))
-    return Schedule((segments[0], segments[1], segments[2]), place[:count], total, levels, choices)
+    return Schedule((segments[0], segments[1], segments[2]), place[:count], start, levels, choices)
 
 
 def _ranks(group: Integers, count: int) -> Integers:
@@ -88,94 +87,76 @@ def _ranks(group: Integers, count: int) -> Integers:
 
 def _shape(nodes: Nodes) -> tuple[int, int]:
     """Block shape (rows per node, entries per row) of least padding."""
-    rows = np.bincount(np.bincount(nodes.owner, minlength=nodes.number))
-    widths = np.bincount(np.bincount(nodes.row, minlength=nodes.owner.size))
-    mosts = [a for a in _WIDTHS if a > 1 and a < 2 * rows.size] if rows.size > 2 else [1]
-    best: tuple[float, int, int] | None = None
-    for w in (w for w in _WIDTHS if w == 1 or w < 2 * widths.size):
-        if w == 1 and widths.size > 2:
-            continue
-        more = _split(widths, w)
-        for a in mosts:
-            cost = (nodes.number + more + _split(rows, a)) * (a * w + 1)
-            if best is None or cost < best[0]:
-                best = cost, a, w
-    assert best is not None
-    return best[1], best[2]
+    rows = np.bincount(nodes.owner, minlength=nodes.number)
+    widths = np.bincount(nodes.row, minlength=nodes.owner.size)
+    cost = {
+        (a, w): (nodes.number + _num_auxiliary(rows, a) + _num_auxiliary(widths, w)) * (a * w + 1)
+        for a in _limits(rows)
+        for w in _limits(widths)
+    }
+    return min(cost, key=cost.__getitem__)
 
 
-def _split(histogram: Integers, most: int) -> int:
-    """Number of auxiliary nodes that split groups of more than `most` elements."""
-    total = 0
-    for size in range(most + 1, histogram.size):
-        left = size
-        while histogram[size] and left > most:
-            whole, rest = divmod(left, most)
-            total += int(histogram[size]) * (whole + (rest > 1))
-            left = whole + (rest > 0)
-    return total
+def _limits(size: Integers) -> list[int]:
+    """Limits of the sizes of groups; groups of one element cannot be nested."""
+    largest = size.max(initial=1)
+    return [1] if largest == 1 else [x for x in _WIDTHS if 1 < x < 2 * (largest + 1)]
 
 
-def _narrow_rows(nodes: Nodes, width: int, one: int) -> Nodes:
-    """The system with wide rows split among auxiliary nodes."""
-    count, owner, name, row, target, source = nodes
-    while True:
-        size = np.bincount(row, minlength=owner.size)
-        if not (size > width).any():
-            return Nodes(count, owner, name, row, target, source)
-        moved, group, first, group_of = _groups(row, size, width)
-        fresh = np.arange(first.size)
-        heads = row[first]  # the rows that lead to the new nodes
-        row = row.copy()
-        row[moved] = owner.size + group_of
-        row = np.concatenate([row, heads])
-        target = np.concatenate([target, count + fresh])
-        source = np.concatenate([source, np.full(group, one)])
-        order = np.argsort(row, kind="stable")
-        row, target, source = row[order], target[order], source[order]
-        owner = np.concatenate([owner, count + fresh])
-        name = np.concatenate([name, np.zeros(group, name.dtype)])
-        count += group
+def _num_auxiliary(size: Integers, limit: int) -> int:
+    """Number of auxiliary nodes that split groups of more than `limit` elements."""
+    large = size[size > limit]
+    return int((-(-(large - 1) // max(limit - 1, 1)) - 1).sum())
 
 
-def _groups(of: Integers, size: Integers, most: int) -> tuple[Integers, int, Integers, Integers]:
-    """Elements to move out of large groups, with the number, heads and ids of the new groups."""
-    rank = _ranks(of, size.size)
-    alone = (rank % most == 0) & (rank == size[of] - 1)  # one that would be a group alone
-    moved = np.flatnonzero((size[of] > most) & ~alone)
-    new = rank[moved] % most == 0
-    group_of = np.cumsum(new) - 1
-    first = moved[new]
-    return moved, first.size, first, group_of
-
-
-def _narrow_nodes(nodes: Nodes, most: int, one: int) -> tuple[Nodes, int]:
-    """The system with nodes of many rows split, and the number of rounds."""
-    count, owner, name, row, target, source = nodes
+def _split(nodes: Nodes, limit: int, one: int, *, of_rows: bool) -> tuple[Nodes, int]:
+    """The system with large groups, of rows or of entries, split; and the number of rounds."""
     rounds = 0
     while True:
-        size = np.bincount(owner, minlength=count)
-        if not (size > most).any():
-            return Nodes(count, owner, name, row, target, source), rounds
+        group = nodes.owner if of_rows else nodes.row
+        size = np.bincount(group, minlength=1)
+        if not (size > limit).any():
+            return nodes, rounds
+        rank = _ranks(group, size.size)
+        alone = (rank % limit == 0) & (rank == size[group] - 1)  # would be a group alone
+        moved = np.flatnonzero((size[group] > limit) & ~alone)
+        new = rank[moved] % limit == 0
+        head = group[moved[new]]
+        node = nodes.number + np.arange(head.size)
+        more = nodes.owner.size + np.arange(head.size)
+        owner, row = nodes.owner.copy(), nodes.row.copy()
+        if of_rows:  # the old node gets a row that leads to the new one
+            owner[moved] = node[np.cumsum(new) - 1]
+            owners, names, rows = head, -1 - node, more
+        else:  # the new node gets a row, and the old row an entry that leads to it
+            row[moved] = more[np.cumsum(new) - 1]
+            owners, names, rows = node, np.zeros_like(node), head
+        nodes = _in_order(
+            Nodes(
+                nodes.number + head.size,
+                np.append(owner, owners),
+                np.append(nodes.name, names),
+                np.append(row, rows),
+                np.append(nodes.target, node),
+                np.append(nodes.source, np.full(head.size, one)),
+            )
+        )
         rounds += 1
-        moved, group, first, group_of = _groups(owner, size, most)
-        fresh = np.arange(group)
-        heads = owner[first]
-        owner = owner.copy()
-        owner[moved] = count + group_of
-        row = np.concatenate([row, owner.size + fresh])
-        target = np.concatenate([target, count + fresh])
-        source = np.concatenate([source, np.full(group, one)])
-        owner = np.concatenate([owner, heads])
-        name = np.concatenate([name, -1 - (count + fresh)])
-        order = np.argsort(owner, kind="stable")
-        number = np.empty(order.size, np.int64)
-        number[order] = np.arange(order.size)
-        row = number[row]
-        entries = np.argsort(row, kind="stable")
-        row, target, source = row[entries], target[entries], source[entries]
-        owner, name = owner[order], name[order]
-        count += group
+
+
+def _in_order(nodes: Nodes) -> Nodes:
+    """The same system with ascending owners and rows."""
+    order = np.argsort(nodes.owner, kind="stable")
+    row = np.argsort(order)[nodes.row]
+    entries = np.argsort(row, kind="stable")
+    return Nodes(
+        nodes.number,
+        nodes.owner[order],
+        nodes.name[order],
+        row[entries],
+        nodes.target[entries],
+        nodes.source[entries],
+    )
 
 
 # --- the order ----------------------------------------------------------------------------------
@@ -183,21 +164,23 @@ def _narrow_nodes(nodes: Nodes, most: int, one: int) -> tuple[Nodes, int]:
 
 def _ordered(nodes: Nodes) -> list[list[Integers]]:
     """Topological levels before, on and after cycles."""
-    edges = _edges(nodes)
-    back, among = edges.reverse(), np.ones(nodes.number, bool)
-    below = _peeled(back, np.diff(edges.start).astype(np.int32), among)
-    if not among.any():
+    inner = nodes.target >= 0
+    source, target = nodes.owner[nodes.row[inner]], nodes.target[inner].astype(np.int64)
+    edges = _graph(source, target, nodes.number)
+    back, cyclic = edges.reverse(), np.ones(nodes.number, bool)
+    below = _peeled(back, np.diff(edges.start), cyclic)
+    core = np.flatnonzero(cyclic)
+    if not core.size:
         return [below, [], []]
-    inner = among[np.repeat(np.arange(nodes.number), np.diff(back.start))] & among[back.target]
-    left = np.concatenate([[0], inner.cumsum()])[back.start]
-    above = _peeled(edges, np.diff(left).astype(np.int32), among)
-    return [below, _layers(edges, np.flatnonzero(among)), above[::-1]]
-
-
-def _edges(nodes: Nodes) -> Edges:
-    kept = nodes.target >= 0
-    source = nodes.owner[nodes.row[kept]]
-    return _graph(source, nodes.target[kept].astype(np.int64), nodes.number)
+    before = cyclic[np.repeat(np.arange(nodes.number), np.diff(back.start))] & cyclic[back.target]
+    degree = np.diff(np.append(0, before.cumsum())[back.start])
+    above = _peeled(edges, degree, cyclic)
+    core = np.flatnonzero(cyclic)
+    number = np.full(nodes.number, -1)
+    number[core] = np.arange(core.size)
+    kept = cyclic[source]
+    layers = _layers(number[source[kept]], number[target[kept]], core.size)
+    return [below, [core[x] for x in layers], above[::-1]]
 
 
 def _graph(source: Integers, target: Integers, size: int) -> Edges:
@@ -205,8 +188,10 @@ def _graph(source: Integers, target: Integers, size: int) -> Edges:
     return Edges(offsets_from_counts(np.bincount(source, minlength=size)), target)
 
 
-def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
+def _peeled(back: Edges, degree: Integers, among: Booleans) -> list[Integers]:
+    """All levels of the nodes that reach no cycle; removes them from a set."""
     found: list[Integers] = []
+    number = degree.astype(np.int32)
     while True:
         more = topological_levels(back, number, among)
         if not more.node.size:
@@ -214,45 +199,24 @@ def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
         found += [more.node[a:b] for a, b in pairwise(more.start)]
 
 
-def _layers(edges: Edges, core: Integers) -> list[Integers]:
-    """Nodes on cycles, by their distance from the exits of their component."""
-    number: Integers = np.full(edges.num_nodes, -1, np.int64)
-    number[core] = np.arange(core.size)
-    width = edges.start[core + 1] - edges.start[core]
-    target = number[edges.target[concatenated_ranges(edges.start[core], width)]]
-    source = np.repeat(np.arange(core.size), width)
-    leaves = np.zeros(core.size, bool)
-    leaves[source[target < 0]] = True
-    source, target = source[target >= 0], target[target >= 0]
-    label = ordered_components(_graph(source, target, core.size))
-    same = label[source] == label[target]
-    leaves[source[~same]] = True
-    layer = _distances(source[same], target[same], leaves, label)
-    kept = (label[target] < label[source]) | (same & (layer[target] < layer[source]))
-    onward = _graph(source[kept], target[kept], core.size)
-    degree = np.diff(onward.start).astype(np.int32)
-    levels = _peeled(onward.reverse(), degree, np.ones(core.size, bool))
-    return [core[x] for x in levels]
+def _layers(source: Integers, target: Integers, size: int) -> list[Integers]:
+    """Nodes on cycles, by their distance from the exits of their component to nodes elsewhere (-1)."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
 
-
-def _distances(source: Integers, target: Integers, leaves: Booleans, label: Integers) -> Integers:
-    """Distance from the exits of each strongly connected component."""
-    size = leaves.size
-    start = offsets_from_counts(np.bincount(target, minlength=size))
-    before = source[np.argsort(target, kind="stable")]
-    stuck = ~np.isin(label, np.unique(label[leaves]))
-    first: Integers = np.full(int(label.max()) + 1, -1, np.int64)
-    first[label[stuck][::-1]] = np.flatnonzero(stuck)[::-1]
-    frontier = np.concatenate([np.flatnonzero(leaves), first[first >= 0]])
-    layer: Integers = np.full(size, -1, np.int64)
-    layer[frontier], steps = 0, 0
-    while frontier.size:
-        steps += 1
-        found = before[row_entries(start, frontier)[0]]
-        found = found[layer[found] < 0]
-        layer[found] = steps
-        frontier = np.unique(found)
-    return layer
+    inner = target >= 0
+    label = ordered_components(_graph(source[inner], target[inner], size))
+    same = inner & (label[source] == label[target])
+    back = csr_array((np.ones(same.sum()), (target[same], source[same])), shape=(size, size))
+    exits = np.unique(source[~same])
+    _, first = np.unique(label, return_index=True)
+    closed = first[np.bincount(label[exits], minlength=first.size) == 0]
+    seeds = np.append(exits, closed)
+    layer = dijkstra(back, indices=seeds, unweighted=True, min_only=True)
+    onward = (label[target] < label[source]) | (same & (layer[target] < layer[source]))
+    onward &= inner
+    graph = _graph(source[onward], target[onward], size)
+    return _peeled(graph.reverse(), np.diff(graph.start), np.ones(size, bool))
 
 
 # --- the blocks ---------------------------------------------------------------------------------

@@ -6,12 +6,13 @@ order: T + R is one, and T + R + 1 zero.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.contraction import contract_chains
+from jaxltl.core.sparse.contraction import Contraction, contract_chains, identity
 from jaxltl.core.sparse.graph.qualitative import (
     positive_under_all_policies,
     backward_reachable,
@@ -30,7 +31,7 @@ class Loops(NamedTuple):
     group: Integers  # int[E], their groups, ascending
     row: Integers  # int[L], the rows
     row_group: Integers  # int[L]
-    groups: int  # how many there are
+    groups: int  # their number
 
 
 class Cycles(NamedTuple):
@@ -52,100 +53,76 @@ class Plan(NamedTuple):
     row: Integers  # int32[S], the row that it takes else
     loops: Loops | None  # rows that lead to where they are
     cycles: Cycles | None  # end components that are one node
-    terms: int  # how many roundings stand behind a weight
-
-
-class _Entries(NamedTuple):
-    """The entries of some rows of a reduced model: rows by rank, nodes, sources."""
-
-    row: Integers
-    target: Integers
-    source: Integers
+    terms: int  # number of roundings behind a weight
 
 
 def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
     """Plan of an optimum, or of a Markov chain."""
-    mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
-    small = whole.mdp if part is None else part.mdp
-    origin = whole.row if part is None else whole.row[part.row]
-    node = whole.node if part is None else part.node[whole.node]
-    finite = np.isfinite(reduced.known_value)
-    codes = np.where(finite & ((reduced.known_value == 0) | (cost is not None)), GOAL, ONE)
-    codes = np.where(finite, codes, LOST)
+    mdp, small, part = reduced.mdp, reduced.contraction, reduced.quotient
+    known = reduced.known_value
+    if part is not None:
+        small = replace(small, mdp=part.mdp, node=part.node[small.node], row=small.row[part.row])
     if cost is None:
-        codes[reduced.known_value == 0] = LOST
-    open_, rows = np.zeros(small.num_states, bool), np.zeros(0, np.int64)
+        code = np.where(known == 0, LOST, ONE)
+    else:
+        code = np.where(np.isfinite(known), GOAL, LOST)
+    rows = np.zeros(0, np.int64)
     if reduced.problem is not None:
-        open_ = reduced.problem.interior
-        kept = open_[small.state]
-        if reduced.problem.allowed is not None:
-            kept &= reduced.problem.allowed
-        rows = np.flatnonzero(kept)
-    found = _entries(mdp, small, origin, rows)
-    state = small.state[rows]
-    loop = found.target == state[found.row]
-    ends = np.bincount(found.row[~loop], minlength=rows.size) > 0
-    if not ends.all():  # rows that never get anywhere
-        rows, state = rows[ends], state[ends]
-        found = _entries(mdp, small, origin, rows)
-        loop = found.target == state[found.row]
-    loops = None
+        interior, allowed = reduced.problem.interior, reduced.problem.allowed
+        code[interior] = np.arange(np.count_nonzero(interior))
+        kept = interior[small.mdp.state] & ~small.mdp.is_self_loop
+        rows = np.flatnonzero(kept if allowed is None else kept & allowed)
+    order, place, loops = _scheduled(mdp, small, code, rows, cost, mixed=False)
+    own, row = _own(reduced, place)
+    states = place[small.node].astype(np.int32)
+    return Plan(order, states, own, row, loops, _cycles(reduced), _terms(loops))
+
+
+def _scheduled(
+    mdp: HostMDP,
+    small: Contraction,
+    code: Integers,
+    rows: Integers,
+    cost: Floats | None,
+    *,
+    mixed: bool,
+) -> tuple[Schedule, Integers, Loops | None]:
+    """Schedule of the open nodes, the places of all nodes, and the self-loops.
+
+    `code` has the number of each open node, and ONE, GOAL or LOST of the others. If rows are mixed
+    by a policy, all rows of a node are one.
+    """
+    state, origin = small.mdp.state[rows], small.row[rows]
+    width = np.diff(small.mdp.entry_start)[rows]
+    row = np.repeat(np.arange(rows.size), width)
+    successor = small.mdp.successor[concatenated_ranges(small.mdp.entry_start[rows], width)]
+    source = concatenated_ranges(mdp.entry_start[origin], width)
+    loop, loops = successor == state[row], None
     if loop.any():
-        looping = np.zeros(rows.size, bool)
-        looping[found.row[loop]] = True
-        loops = _loops(found, loop, looping, np.cumsum(looping) - 1, origin[rows])
-    number = np.cumsum(open_) - 1
-    target = np.where(open_[found.target], number[found.target], codes[found.target])
-    kept = ~loop & ((target >= 0) | (target == ONE))
-    entries = _Entries(found.row[kept], target[kept], found.source[kept])
-    entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
-    nodes = Nodes(int(open_.sum()), number[state], origin[rows].astype(np.int64), *entries)
-    order = schedule(
-        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
-    )
-    codes = order.size - 1 - codes
-    codes[open_] = order.place
-    own, row = _own(reduced, codes)
-    cycles = _circles(reduced)
-    return Plan(order, codes[node].astype(np.int32), own, row, loops, cycles, _terms(loops))
-
-
-def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> _Entries:
-    width = np.diff(small.entry_start)[rows]
-    return _Entries(
-        np.repeat(np.arange(rows.size), width),
-        small.successor[concatenated_ranges(small.entry_start[rows], width)],
-        concatenated_ranges(mdp.entry_start[origin[rows]], width),
-    )
-
-
-def _loops(
-    found: _Entries, loop: Booleans, looping: Booleans, group: Integers, origin: Integers
-) -> Loops:
-    """Self-loops of the marked rows, by group."""
-    rest = np.flatnonzero(~loop & looping[found.row])
-    of = group[found.row[rest]]
-    order = np.argsort(of, kind="stable")
-    rows = np.flatnonzero(looping)
-    return Loops(
-        found.source[rest][order], of[order], origin[rows], group[rows], int(group[rows].max()) + 1
-    )
-
-
-def _with_costs(
-    entries: _Entries, origin: Integers, cost: Floats | None, num_entries: int
-) -> _Entries:
-    """Adds rewards as entries of the constant one."""
-    if cost is None:
-        return entries
-    paid = np.flatnonzero(cost[origin] > 0)
-    row = np.concatenate([paid, entries.row])
-    order = np.argsort(row, kind="stable")
-    return _Entries(
-        row[order],
-        np.concatenate([np.full(paid.size, ONE), entries.target])[order],
-        np.concatenate([num_entries + origin[paid], entries.source])[order],
-    )
+        group = code[state] if mixed else np.arange(rows.size)
+        looping = np.unique(group[row[loop]])
+        inside, rank = np.isin(group, looping), np.searchsorted(looping, group)
+        rest = ~loop & inside[row]
+        loops = Loops(source[rest], rank[row[rest]], origin[inside], rank[inside], looping.size)
+    target = code[successor]
+    kept = ~loop & (mixed | (target >= 0) | (target == ONE))
+    # Rewards are entries of the constant one.
+    paid = np.zeros(0, np.int64) if cost is None else np.flatnonzero(cost[origin] > 0)
+    row = np.append(paid, row[kept])
+    target = np.append(np.full(paid.size, ONE), target[kept])
+    source = np.append(mdp.num_transitions + origin[paid], source[kept])
+    entries = np.argsort(row, kind="stable")
+    row, target, source = row[entries], target[entries], source[entries]
+    count = np.count_nonzero(code >= 0)
+    if mixed:
+        owner, name, row = np.arange(count), np.zeros(count, np.int64), code[state][row]
+    else:
+        owner, name = code[state], origin.astype(np.int64)
+    one = mdp.num_transitions + mdp.num_rows
+    order = schedule(Nodes(count, owner, name, row, target, source), one, one + 1)
+    place = order.size - 1 - code
+    place[code >= 0] = order.place
+    return order, place, loops
 
 
 def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
@@ -169,7 +146,7 @@ def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
     return own, row
 
 
-def _circles(reduced: ReducedProblem) -> Cycles | None:
+def _cycles(reduced: ReducedProblem) -> Cycles | None:
     """States and rows of the collapsed end components with unknown value."""
     components, whole, part = reduced.components, reduced.contraction, reduced.quotient
     if components is None or part is None or reduced.problem is None:
@@ -200,60 +177,26 @@ def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Flo
     fixed = target | blocked
     if cost is not None:
         fixed |= mdp.over_choices(np.maximum, cost) > 0
-    whole = contract_chains(mdp, fixed, None)
-    small = mdp if whole is None else whole.mdp
-    node = np.arange(mdp.num_states) if whole is None else whole.node
-    origin = np.arange(mdp.num_rows) if whole is None else whole.row
-    goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
-    goal[node[target]], dead[node[blocked]] = True, True
+    whole = contract_chains(mdp, fixed, None) or identity(mdp)
+    small, goal, dead = whole.mdp, whole.region(target), whole.region(blocked)
     if cost is None:
         before = ~(goal | dead)[small.state]
         lost = ~backward_reachable(small, goal, before)
         some = dead | ~positive_under_all_policies(small, goal, among=~dead)
         reached = goal | ~backward_reachable(small, some, before)
-        codes = np.where(reached, ONE, LOST)
+        code = np.where(reached, ONE, LOST)
     else:
         lost = ~almost_sure_reachability(small, goal, np.ones(small.num_rows, bool))[0]
-        reached, codes = goal, np.where(goal, GOAL, LOST)
+        reached, code = goal, np.where(goal, GOAL, LOST)
     open_ = ~(lost | reached)
-    found = _entries(mdp, small, origin, np.flatnonzero(open_[small.state]))
+    code[open_] = np.arange(np.count_nonzero(open_))
     rows = np.flatnonzero(open_[small.state])
-    state = small.state[rows]
-    number = np.cumsum(open_) - 1
-    loop = found.target == state[found.row]
-    loops = None
-    if loop.any():
-        of = np.zeros(small.num_states, bool)
-        of[found.target[loop]] = True
-        loops = _loops(found, loop, of[state], (np.cumsum(of) - 1)[state], origin[rows])
-    to = np.where(open_[found.target], number[found.target], codes[found.target])
-    entries = _Entries(found.row[~loop], to[~loop], found.source[~loop])
-    entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
-    count = int(open_.sum())
-    nodes = Nodes(
-        count,
-        np.arange(count),
-        np.zeros(count, np.int64),
-        number[state][entries.row],
-        entries.target,
-        entries.source,
-    )
-    order = schedule(
-        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
-    )
-    place = order.size - 1 - codes
-    place[open_] = order.place
+    order, place, loops = _scheduled(mdp, whole, code, rows, cost, mixed=True)
     most = int(np.diff(mdp.row_start).max())
     row: Integers = mdp.row_start[:-1].astype(np.int32)
-    return Plan(
-        order,
-        place[node].astype(np.int32),
-        np.full(mdp.num_states, -1, np.int32),
-        row,
-        loops,
-        None,
-        _terms(loops) + 2 * most + 4,
-    )
+    states = place[whole.node].astype(np.int32)
+    nowhere = np.full(mdp.num_states, -1, np.int32)
+    return Plan(order, states, nowhere, row, loops, None, _terms(loops) + 2 * most + 4)
 
 
 def _terms(loops: Loops | None) -> int:
