@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.language.expressions import Expression
+from jaxltl.core.language.expressions import Expression, names_in
 
 _UNDEFINED = -(2**30)  # a value beyond the ranges of variables, which updates refuse
 
@@ -28,9 +28,8 @@ class Compiled:
     code: tuple[tuple[str, tuple[int, ...], Any], ...]
     outputs: tuple[int, ...]
 
-    def __call__(
-        self, values: Mapping[str, Any] | Callable[[str], Any], xp: object = np
-    ) -> list[Any]:
+    @np.errstate(all="ignore")
+    def __call__(self, values: Mapping[str, Any] | Callable[[str], Any], xp: Any = np) -> list[Any]:
         """Values of the expressions.
 
         Args:
@@ -41,12 +40,7 @@ class Compiled:
           An array for each expression; those without variables are scalars. Division by zero is
           infinite or NaN, and a modulus by a number that is not positive is -2^30.
         """
-        with np.errstate(all="ignore"):
-            return self.evaluate(values if callable(values) else values.__getitem__, xp)
-
-    def evaluate(self, read: Callable[[str], Any], xp: Any = np) -> list[Any]:
-        """The values, with the caller's treatment of floating-point errors."""
-        slots: list[Any] = [read(name) for name in self.names]
+        slots: list[Any] = list(map(values if callable(values) else values.__getitem__, self.names))
         table = _operations(xp)
         for operator, operands, value in self.code:
             if operator == "literal":
@@ -65,46 +59,24 @@ def compile_expressions(expressions: Sequence[Expression]) -> Compiled:
       >>> [v.tolist() for v in both({"x": np.array([0, 1]), "y": np.array([1, 1])})]
       [[1, 2], [False, True]]
     """
-    names: dict[str, int] = {}
-    for e in expressions:
-        _collect(e, names, set())
-    builder = _Builder(names)
-    outputs = tuple(builder.slot(e) for e in expressions)
-    return Compiled(tuple(names), tuple(builder.code), outputs)
+    names = sorted(set[str]().union(*map(names_in, expressions)))
+    # Equal nodes have one slot, and shared ones are visited once.
+    slots: dict[Any, int] = {("name", (), str, name): i for i, name in enumerate(names)}
+    code: list[tuple[str, tuple[int, ...], Any]] = []
+    visited: dict[int, int] = {}
 
+    def slot(e: Expression) -> int:
+        if id(e) not in visited:
+            operands = tuple([slot(x) for x in e.operands])
+            key = (e.operator, operands, type(e.value), e.value)
+            if key not in slots:
+                slots[key] = len(slots)
+                code.append((e.operator, operands, e.value))
+            visited[id(e)] = slots[key]
+        return visited[id(e)]
 
-def _collect(e: Expression, names: dict[str, int], seen: set[int]) -> None:
-    if id(e) in seen:
-        return
-    seen.add(id(e))
-    if e.operator == "name":
-        names.setdefault(str(e.value), len(names))
-    for operand in e.operands:
-        _collect(operand, names, seen)
-
-
-class _Builder:
-    """Numbers equal nodes equally."""
-
-    def __init__(self, names: dict[str, int]) -> None:
-        self.names = names
-        self.code: list[tuple[str, tuple[int, ...], Any]] = []
-        self.known: dict[Any, int] = {}
-        self.of_node: dict[int, tuple[int, Expression]] = {}  # the node keeps its id in use
-
-    def slot(self, e: Expression) -> int:
-        if (found := self.of_node.get(id(e))) is not None:
-            return found[0]
-        if e.operator == "name":
-            number = self.names[str(e.value)]
-        else:
-            key = (e.operator, tuple([self.slot(x) for x in e.operands]), type(e.value), e.value)
-            if key not in self.known:
-                self.known[key] = len(self.names) + len(self.code)
-                self.code.append((e.operator, key[1], e.value))
-            number = self.known[key]
-        self.of_node[id(e)] = number, e
-        return number
+    outputs = tuple([slot(e) for e in expressions])
+    return Compiled(tuple(names), tuple(code), outputs)
 
 
 @cache
@@ -119,10 +91,26 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
             return xp.power(xp.asarray(a), xp.maximum(b, 0))
         return xp.power(xp.asarray(a) * 1.0, b)
 
+    def divide(a: Any, b: Any) -> Any:
+        quotient = xp.true_divide(a, b)
+        if xp is np or xp.result_type(a, b).kind not in "iu":
+            return quotient
+        # XLA multiplies by the reciprocal of a constant, and floor(41 / 41) would be 0.
+        divisor = xp.where(xp.equal(b, 0), 1, b)
+        whole_part = xp.floor_divide(a, divisor)
+        exact = whole_part + xp.true_divide(a - whole_part * divisor, divisor)
+        return xp.where(xp.equal(b, 0), quotient, exact)
+
     def whole(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Whole doubles as integers; others become a number beyond every range."""
+        dtype = np.int64 if xp is np else xp.asarray(0).dtype
+
         def rounded(a: Any) -> Any:
             a = xp.asarray(a)
-            return a if a.dtype.kind in "iu" else _integers(xp, function(a))
+            if a.dtype.kind in "iu":
+                return a
+            found = function(a)
+            return xp.where(xp.abs(found) < 2**53, found, _UNDEFINED).astype(dtype)
 
         return rounded
 
@@ -145,7 +133,7 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
         "+": folded(xp.add),
         "-": xp.subtract,
         "*": folded(xp.multiply),
-        "/": lambda a, b: xp.true_divide(a, b),
+        "/": divide,
         "?:": xp.where,
         "min": folded(xp.minimum),
         "max": folded(xp.maximum),
@@ -156,9 +144,3 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
         "mod": modulo,
         "log": lambda a, b: xp.log(a * 1.0) / xp.log(b * 1.0),
     }
-
-
-def _integers(xp: Any, a: Any) -> Any:
-    """Whole doubles as integers; others become a number beyond every range."""
-    dtype = np.int64 if xp is np else xp.asarray(0).dtype
-    return xp.where(xp.abs(a) < 2**53, a, _UNDEFINED).astype(dtype)

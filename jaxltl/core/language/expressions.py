@@ -18,14 +18,9 @@ MAX_DEPTH = 150  # of a tree, also after formulas are substituted: traversals ar
 MAX_SIZE = 200_000  # nodes, counted as if nothing were shared
 MAX_INTEGER = 2**53  # integers up to which every operation on arrays is exact
 FUNCTIONS = {  # the least and the most numbers of arguments
-    "min": (1, None),
-    "max": (1, None),
-    "floor": (1, 1),
-    "ceil": (1, 1),
-    "round": (1, 1),
-    "pow": (2, 2),
-    "mod": (2, 2),
-    "log": (2, 2),
+    **dict.fromkeys(("min", "max"), (1, MAX_SIZE)),
+    **dict.fromkeys(("floor", "ceil", "round"), (1, 1)),
+    **dict.fromkeys(("pow", "mod", "log"), (2, 2)),
 }
 RELATIONS = ("<", "<=", ">", ">=")
 
@@ -122,6 +117,16 @@ def type_of(expression: Expression, types: Mapping[str, Type]) -> Type:
     return _type(expression, types, {})
 
 
+_SIGNATURES: dict[str, tuple[Type, Type | None]] = {  # of operands and values, "double" any number
+    **dict.fromkeys(("!", "&", "|", "=>", "<=>"), ("bool", "bool")),
+    **dict.fromkeys(RELATIONS, ("double", "bool")),
+    **dict.fromkeys(("floor", "ceil", "round"), ("double", "int")),
+    **dict.fromkeys(("/", "log"), ("double", "double")),
+    **dict.fromkeys(("neg", "+", "-", "*", "min", "max", "pow"), ("double", None)),  # as operands
+    "mod": ("int", "int"),
+}
+
+
 def _type(e: Expression, types: Mapping[str, Type], known: dict[int, Type]) -> Type:
     if (found := known.get(id(e))) is None:
         parts = [_type(x, types, known) for x in e.operands]
@@ -130,49 +135,38 @@ def _type(e: Expression, types: Mapping[str, Type], known: dict[int, Type]) -> T
 
 
 def _node_type(e: Expression, parts: list[Type], types: Mapping[str, Type]) -> Type:
-    operator = e.operator
-    if operator == "literal":
+    if e.operator == "literal":
         return value_type(e.value)
-    if operator == "name":
+    if e.operator == "name":
         if str(e.value) not in types:
             raise LanguageError(
                 e.place,
                 f"{e.value} is not declared; it is no constant, variable, formula or label.",
             )
         return types[str(e.value)]
-    if operator in ("!", "&", "|", "=>", "<=>"):
-        _require(e, parts, "bool")
-        return "bool"
-    if operator in ("=", "!="):
-        if ("bool" in parts) and parts[0] != parts[1]:
-            raise LanguageError(e.place, f"{e} compares a Boolean with a number.")
-        return "bool"
-    if operator == "?:":
-        _require(e, parts[:1], "bool")
-        if ("bool" in parts[1:]) and parts[1] != parts[2]:
-            raise LanguageError(e.place, f"{e} is a Boolean in one case and a number in the other.")
-        return "double" if "double" in parts[1:] else parts[1]
-    _require(e, parts, "number")
-    if operator in RELATIONS:
-        return "bool"
-    if operator in ("floor", "ceil", "round"):
-        return "int"
-    if operator == "mod":
-        _require(e, parts, "int")
-        return "int"
-    if operator in ("/", "log"):
-        return "double"
-    return "double" if "double" in parts else "int"
+    result: Type | None
+    if e.operator in ("=", "!=", "?:"):
+        conditional = e.operator == "?:"
+        _require(e, parts[:conditional], "bool")
+        parts, result = parts[conditional:], None if conditional else "bool"
+        if "bool" in parts and parts[0] != parts[1]:
+            cases = "is a Boolean in one case and a number in the other"
+            fault = cases if conditional else "compares a Boolean with a number"
+            raise LanguageError(e.place, f"{e} {fault}.")
+    else:
+        operand, result = _SIGNATURES[e.operator]
+        _require(e, parts, operand)
+    return result or ("double" if "double" in parts else parts[0])
 
 
-def _require(e: Expression, parts: list[Type], kind: str) -> None:
+def _require(e: Expression, parts: list[Type], wanted: Type) -> None:
+    names = {"bool": "a Boolean", "int": "an integer", "double": "a double"}
     for operand, actual in zip(e.operands, parts, strict=False):
-        if (actual == "bool") != (kind == "bool") or (kind == "int" and actual != "int"):
-            wanted = {"bool": "a Boolean", "int": "an integer"}.get(kind, "a number")
+        if actual != wanted and (wanted != "double" or actual == "bool"):
             place = operand.place if operand.place >= 0 else e.place
-            what = {"bool": "a Boolean", "int": "an integer", "double": "a double"}[actual]
+            expected = "a number" if wanted == "double" else names[wanted]
             raise LanguageError(
-                place, f"{operand} is {what}; {e.operator} takes {wanted} as operand."
+                place, f"{operand} is {names[actual]}; {e.operator} takes {expected} as operand."
             )
 
 

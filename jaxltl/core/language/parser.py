@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, NoReturn, cast
+from dataclasses import replace
+from typing import cast
 
 from jaxltl.core.language.expressions import FUNCTIONS, RELATIONS, TRUE, Expression, Type, literal
 from jaxltl.core.language.source import LanguageError, Source, TokenReader
@@ -23,25 +24,19 @@ from jaxltl.core.language.syntax import (
 
 _MAX_NESTING = 60  # of parentheses and prefixes, at most 10 frames of Python each
 _KINDS: dict[str, Kind] = {
-    "dtmc": "dtmc",
-    "probabilistic": "dtmc",
-    "mdp": "mdp",
-    "nondeterministic": "mdp",
+    **dict.fromkeys(("dtmc", "probabilistic"), "dtmc"),
+    **dict.fromkeys(("mdp", "nondeterministic"), "mdp"),
     "smg": "smg",
 }
 _REFUSED = {
-    "ctmc": "continuous-time Markov chains",
-    "stochastic": "continuous-time Markov chains",
+    **dict.fromkeys(("ctmc", "stochastic"), "continuous-time Markov chains"),
     "ma": "Markov automata",
     "pta": "probabilistic timed automata",
-    "pomdp": "partially observable models",
-    "popta": "partially observable models",
+    **dict.fromkeys(("pomdp", "popta"), "partially observable models"),
     "csg": "concurrent games",
-    "tptg": "timed games",
-    "tsg": "timed games",
+    **dict.fromkeys(("tptg", "tsg"), "timed games"),
     "system": "system ... endsystem blocks (modules are composed in parallel over all actions)",
-    "observables": "observables of partially observable models",
-    "observable": "observables of partially observable models",
+    **dict.fromkeys(("observables", "observable"), "observables of partially observable models"),
     "invariant": "invariants of timed automata",
 }
 _RESERVED = frozenset(_KINDS) | {
@@ -51,21 +46,13 @@ _RESERVED = frozenset(_KINDS) | {
     *("pta", "pomdp", "popta", "csg", "invariant", "observables", "observable", "system"),
 }
 # Binary operators by precedence, the tightest last; operators of one level associate to the left.
-_LEVELS: dict[str, int] = {
-    "=>": 1,
-    "<=>": 2,
-    "|": 3,
-    "&": 4,
-    "=": 6,
-    "!=": 6,
+_LEVELS = {
+    **dict.fromkeys(("=", "!="), 6),
     **dict.fromkeys(RELATIONS, 7),
-    "+": 8,
-    "-": 8,
-    "*": 9,
-    "/": 9,
-    "%": 9,
-    "^": 10,
+    **dict.fromkeys("+-", 8),
+    **dict.fromkeys("*/%", 9),
 }
+_LEVELS |= {"=>": 1, "<=>": 2, "|": 3, "&": 4, "^": 10}
 _NOT = 5
 SIMPLE = 6  # the level of comparisons, in which no Boolean operator stands outside of parentheses
 ADDITIVE = 8  # the level of + and -
@@ -102,26 +89,21 @@ class ExpressionParser(TokenReader):
 
     def _climb(self, level: int) -> Expression:
         left = self._prefix(level)
-        while True:
+        while self.kinds[self.at] == "sign":
             operator = self.texts[self.at]
             precedence = _LEVELS.get(operator, -1)
-            if precedence < max(level, 1) or self.kinds[self.at] != "sign":
-                return left
-            self.at += 1
-            right = self._climb(precedence + 1)
-            if operator in _FLAT and left.operator == operator and not left.value:
-                operands = (*left.operands, right)
-                left = self._chain(operator, operands, left.place)
-            else:
-                name = {"^": "pow", "%": "mod"}.get(operator, operator)
-                left = Expression(name, (left, right), place=left.place)
-
-    def _chain(self, operator: str, operands: tuple[Expression, ...], place: int) -> Expression:
-        """A chain of one operator as one node, so that long chains are not deep."""
-        while self.texts[self.at] == operator and self.kinds[self.at] == "sign":
-            self.at += 1
-            operands = (*operands, self._climb(_LEVELS[operator] + 1))
-        return Expression(operator, operands, place=place)
+            if precedence < max(level, 1):
+                break
+            # A chain of one operator is one node, so that long chains are not deep.
+            is_chain = operator in _FLAT
+            operands = list(left.operands if is_chain and left.operator == operator else [left])
+            while self.accept(operator):
+                operands.append(self._climb(precedence + 1))
+                if not is_chain:
+                    break
+            name = {"^": "pow", "%": "mod"}.get(operator, operator)
+            left = Expression(name, tuple(operands), place=left.place)
+        return left
 
     def _prefix(self, level: int) -> Expression:
         place = self.place
@@ -146,10 +128,9 @@ class ExpressionParser(TokenReader):
             return literal(int(text), place)
         if kind == "real":
             self.at += 1
-            value = float(text) if len(text) < 400 else float("inf")
-            if value == float("inf"):
+            if len(text) > 400 or float(text) == float("inf"):
                 raise LanguageError(place, "the number is too large for double precision.")
-            return literal(value, place)
+            return literal(float(text), place)
         if kind == "word":
             return self._word(text, place)
         if kind == "quoted":
@@ -161,35 +142,29 @@ class ExpressionParser(TokenReader):
         return found
 
     def _word(self, text: str, place: int) -> Expression:
+        """A literal, a name, or the call of a function."""
         self.at += 1
         if text in ("true", "false"):
             return literal(text == "true", place)
-        called = self.texts[self.at] == "("
-        if text == "func" and called:
-            self.at += 1
-            name = self.word("the name of a function")
-            self.expect(",", " after the name of a function")
-        elif text in FUNCTIONS and called:
-            self.at += 1
-            name = text
-        elif text in _RESERVED:
-            self.at -= 1
-            self.fail("an expression")
-        else:
+        if self.texts[self.at] != "(" or text not in (*FUNCTIONS, "func"):
+            if text in _RESERVED:
+                self.at -= 1
+                self.fail("an expression")
             return Expression("name", value=text, place=place)
-        if name not in FUNCTIONS:
-            raise LanguageError(place, f"{name} is no function; there are {', '.join(FUNCTIONS)}.")
-        return self._call(name, place)
-
-    def _call(self, name: str, place: int) -> Expression:
+        self.at += 1
+        if text == "func":
+            text = self.word("the name of a function")
+            self.expect(",", " after the name of a function")
+        if text not in FUNCTIONS:
+            raise LanguageError(place, f"{text} is no function; there are {', '.join(FUNCTIONS)}.")
         operands = self.separated(self.expression)
         self.expect(")", " or ','")
-        least, most = FUNCTIONS[name]
-        if len(operands) < least or (most is not None and len(operands) > most):
+        least, most = FUNCTIONS[text]
+        if not least <= len(operands) <= most:
             raise LanguageError(
-                place, f"{name} takes {most} argument{'s' * (most != 1)}, not {len(operands)}."
+                place, f"{text} takes {most} argument{'s' * (most != 1)}, not {len(operands)}."
             )
-        return Expression(name, tuple(operands), place=place)
+        return Expression(text, tuple(operands), place=place)
 
 
 def parse_expression(text: str) -> Expression:
@@ -239,16 +214,8 @@ class _ProgramParser(ExpressionParser):
 
     def __init__(self, source: Source) -> None:
         super().__init__(source.text)
-        self.source = source
-        self.kind: Kind | None = None
-        self.constants: list[Constant] = []
-        self.formulas: list[tuple[str, Expression]] = []
-        self.variables: list[Declaration] = []
-        self.modules: list[Module | RenamedModule] = []
-        self.labels: list[tuple[str, Expression]] = []
-        self.rewards: list[RewardStructure] = []
-        self.initial: Expression | None = None
-        self.players: list[Player] = []
+        self.syntax = Syntax(source)
+        self.has_type = False
 
     def program(self) -> Syntax:
         readers = {
@@ -263,40 +230,30 @@ class _ProgramParser(ExpressionParser):
             "player": self.player,
         }
         while self.kinds[self.at] != "end":
+            self.refuse(*_REFUSED)
             text = self.texts[self.at]
-            if text in _REFUSED:
-                self.refuse()
             if text not in readers:
                 self.fail(
                     "the type of the model (dtmc, mdp, smg), const, formula, label, global, "
                     "module, rewards, init or player"
                 )
+            if text not in ("rate", "prob"):
+                self.at += 1
             readers[text]()
-        if not self.modules:
+        if not self.syntax.modules:
             raise LanguageError(self.place, "the model has no module; it needs at least one.")
-        return Syntax(
-            self.source,
-            self.kind or "mdp",  # PRISM's default
-            tuple(self.constants),
-            tuple(self.formulas),
-            tuple(self.variables),
-            tuple(self.modules),
-            tuple(self.labels),
-            tuple(self.rewards),
-            self.initial,
-            tuple(self.players),
-        )
+        return self.syntax
 
-    def refuse(self) -> NoReturn:
-        """Raises LanguageError: the next word is a feature that is not supported."""
+    def refuse(self, *words: str) -> None:
+        """Raises LanguageError if the next word is one of some features that are not supported."""
         text = self.texts[self.at]
-        raise LanguageError(self.place, f"{text}: {_REFUSED[text]} are not supported.")
+        if text in words:
+            raise LanguageError(self.place, f"{text}: {_REFUSED[text]} are not supported.")
 
     def model_type(self) -> None:
-        if self.kind is not None:
-            raise LanguageError(self.place, "the type of the model is given twice.")
-        self.kind = _KINDS[self.texts[self.at]]
-        self.at += 1
+        if self.has_type:
+            raise LanguageError(self.starts[self.at - 1], "the type of the model is given twice.")
+        self.syntax.kind, self.has_type = _KINDS[self.texts[self.at - 1]], True
 
     def name(self, what: str) -> tuple[str, int]:
         """A name that is no keyword, and its place."""
@@ -307,42 +264,45 @@ class _ProgramParser(ExpressionParser):
             self.fail(f"{what}; {found} is a keyword")
         return found, place
 
+    def action(self) -> str:
+        """The action after an opening bracket, "" for none."""
+        found = "" if self.texts[self.at] == "]" else self.name("the name of an action")[0]
+        self.expect("]", " after the action")
+        return found
+
     def constant(self) -> None:
         type_: Type = "int"
-        if not self.accept("const"):
-            self.at += 1
+        if self.accept("rate") or self.accept("prob"):  # also without const
             type_ = "double"
             self.accept("double")
         elif self.texts[self.at] in ("int", "double", "bool"):
-            type_ = cast(Literal["int", "double", "bool"], self.texts[self.at])
+            type_ = cast(Type, self.texts[self.at])
             self.at += 1
-        elif self.accept("rate") or self.accept("prob"):
-            type_ = "double"
         name, place = self.name("the name of a constant")
         expression = self.expression() if self.accept("=") else None
         self.expect(";", " at the end of a constant")
-        self.constants.append(Constant(name, type_, expression, place))
+        self.syntax.constants.append(Constant(name, type_, expression, place))
+
+    def defined(self, what: str) -> Expression:
+        """The expression of a formula or a label."""
+        self.expect("=")
+        found = self.expression()
+        self.expect(";", f" at the end of a {what}")
+        return found
 
     def formula(self) -> None:
-        self.at += 1
         name, _ = self.name("the name of a formula")
-        self.expect("=")
-        self.formulas.append((name, self.expression()))
-        self.expect(";", " at the end of a formula")
+        self.syntax.formulas.append((name, self.defined("formula")))
 
     def label(self) -> None:
-        self.at += 1
         place = self.place
         name = self.quoted("the name of a label in double quotes")
         if name in ("init", "deadlock") or not name:
             raise LanguageError(place, f'the label "{name}" is built in; choose another name.')
-        self.expect("=")
-        self.labels.append((name, self.expression()))
-        self.expect(";", " at the end of a label")
+        self.syntax.labels.append((name, self.defined("label")))
 
     def global_variable(self) -> None:
-        self.at += 1
-        self.variables.append(self.declaration())
+        self.syntax.variables.append(self.declaration())
 
     def declaration(self) -> Declaration:
         name, place = self.name("the name of a variable")
@@ -368,56 +328,53 @@ class _ProgramParser(ExpressionParser):
         return Declaration(name, low, high, initial, place)
 
     def module(self) -> None:
-        self.at += 1
         name, place = self.name("the name of a module")
         if self.accept("="):
             base, _ = self.name("the name of the module to copy")
-            self.modules.append(RenamedModule(name, base, tuple(self.renaming()), place))
+            copy = RenamedModule(name, base, self.renaming(), place)
+            self.syntax.modules.append(copy)
             return
         declarations: list[Declaration] = []
         commands: list[Command] = []
         while not self.accept("endmodule"):
-            if self.texts[self.at] == "invariant":
-                self.refuse()
+            self.refuse("invariant")
             if self.texts[self.at] == "[":
                 commands.append(self.command())
-            elif self.kinds[self.at] == "word" and not commands:
-                declarations.append(self.declaration())
             elif commands:
                 self.fail("a command, which begins with '[', or endmodule")
+            elif self.kinds[self.at] == "word":
+                declarations.append(self.declaration())
             else:
                 self.fail("a variable, a command or endmodule")
-        self.modules.append(Module(name, tuple(declarations), tuple(commands), place))
+        self.syntax.modules.append(Module(name, tuple(declarations), tuple(commands), place))
 
-    def renaming(self) -> list[tuple[str, str]]:
-        self.expect("[")
+    def renaming(self) -> tuple[tuple[str, str], ...]:
         found: dict[str, str] = {}
 
         def pair() -> None:
             place = self.place
             old = self.word("a name to be replaced")
             self.expect("=")
-            new, _ = self.name("a new name")
             if old in found:
                 raise LanguageError(place, f"{old} is renamed twice.")
-            found[old] = new
+            found[old], _ = self.name("a new name")
 
+        self.expect("[")
         self.separated(pair)
         self.expect("]", " or ','")
         self.expect("endmodule")
-        return list(found.items())
+        return tuple(found.items())
 
     def command(self) -> Command:
         place = self.place
         self.at += 1
-        action = "" if self.texts[self.at] == "]" else self.name("the name of an action")[0]
-        self.expect("]", " after the action")
+        action = self.action()
         guard = self.expression()
         self.expect("->", " after the guard")
         outcomes = self.separated(self.outcome, "+")
         self.expect(";", " or '+' after an update")
         if outcomes[0].probability is TRUE and len(outcomes) == 1:
-            outcomes = [Outcome(literal(1), None, outcomes[0].assignments)]
+            outcomes = [replace(outcomes[0], probability=literal(1))]
         if any(o.probability is TRUE for o in outcomes):
             raise LanguageError(place, "an update of several has no probability.")
         return Command(action, guard, tuple(outcomes), place)
@@ -428,13 +385,12 @@ class _ProgramParser(ExpressionParser):
         after = self.texts[self.at + 1 : self.at + 3]
         if (text == "true" and after[:1] in ([";"], ["&"])) or (text == "(" and after[1:] == ["'"]):
             return Outcome(TRUE, None, self.update())
-        if self.accept("["):
-            lower = self.expression()
+        is_interval = self.accept("[")
+        lower = self.expression()
+        if is_interval:
             self.expect(",", " between the ends of an interval of probabilities")
             upper = self.expression()
             self.expect("]")
-        else:
-            lower = self.expression()
         self.expect(":", " after a probability")
         return Outcome(lower, upper, self.update())
 
@@ -454,46 +410,40 @@ class _ProgramParser(ExpressionParser):
         return found
 
     def reward_structure(self) -> None:
-        place = self.place
-        self.at += 1
+        place = self.starts[self.at - 1]
         name = self.quoted("a name") if self.kinds[self.at] == "quoted" else ""
         items: list[RewardItem] = []
         while not self.accept("endrewards"):
-            action: str | None = None
-            if self.accept("["):
-                action = "" if self.texts[self.at] == "]" else self.name("an action")[0]
-                self.expect("]", " after the action")
+            action = self.action() if self.accept("[") else None
             guard = self.expression()
             if self.texts[self.at] == "->":
                 raise LanguageError(self.place, "rewards of single successors are not supported.")
             self.expect(":", " between a guard and a reward")
-            value = self.expression()
+            items.append(RewardItem(action, guard, self.expression()))
             self.expect(";", " after a reward")
-            items.append(RewardItem(action, guard, value))
-        self.rewards.append(RewardStructure(name, tuple(items), place))
+        self.syntax.rewards.append(RewardStructure(name, tuple(items), place))
 
     def initial_block(self) -> None:
-        if self.initial is not None:
-            raise LanguageError(self.place, "there are two init blocks.")
-        self.at += 1
-        self.initial = self.expression()
+        if self.syntax.initial is not None:
+            raise LanguageError(self.starts[self.at - 1], "there are two init blocks.")
+        self.syntax.initial = self.expression()
         self.expect("endinit")
 
     def player(self) -> None:
-        self.at += 1
         place = self.place
         quoted = self.kinds[self.at] == "quoted"
         name = self.quoted("a name") if quoted else self.name("the name of a player")[0]
-        modules: list[str] = []
-        actions: list[str] = []
+        found: dict[str, list[str]] = {"module": [], "action": []}
 
         def controlled() -> None:
             if self.accept("["):
-                actions.append(self.name("an action")[0])
+                found["action"].append(self.name("an action")[0])
                 self.expect("]")
             else:
-                modules.append(self.name("a module or an action in brackets")[0])
+                found["module"].append(self.name("a module or an action in brackets")[0])
 
         self.separated(controlled)
         self.expect("endplayer", " or ','")
-        self.players.append(Player(name, tuple(modules), tuple(actions), place))
+        self.syntax.players.append(
+            Player(name, tuple(found["module"]), tuple(found["action"]), place)
+        )

@@ -24,7 +24,6 @@ from jaxltl.core.language.parser import ExpressionParser, parse_program
 from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import (
     Assignment,
-    Command,
     Constant,
     Declaration,
     Module,
@@ -104,8 +103,8 @@ def _changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None)
     elif isinstance(tree, str):
         found = (names or {}).get(tree, tree)
     elif is_dataclass(tree) and not isinstance(tree, type):
-        parts = {f.name: getattr(tree, f.name) for f in fields(tree)}
-        found = type(tree)(**{name: _changed(x, change, names) for name, x in parts.items()})
+        parts = {f.name: _changed(getattr(tree, f.name), change, names) for f in fields(tree)}
+        found = type(tree)(**parts)
     return cast(Tree, found)
 
 
@@ -114,56 +113,50 @@ class _Resolver:
 
     def __init__(self, syntax: Syntax, given: Mapping[str, Value]) -> None:
         self.syntax, self.given = syntax, given
+        self.table = {c.name: c for c in syntax.constants}
 
     def program(self) -> Program:
         syntax = self.syntax
         formulas = _expanded(syntax.formulas, "formula", {})
         expand = _substitution(formulas)
         modules = self.renamed(
-            tuple(_changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules),
-            formulas,
+            [_changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules], formulas
         )
         self.check_names(modules)
-        constants, derived = self.constant_values(expand)
-        known = derived | {name: literal(value) for name, value in constants.items()}
+        constants, known = self.constant_values(expand)
         quoted = [(f'"{name}"', expand(e)) for name, e in syntax.labels]
         labels = _expanded(quoted, "label", known)
         fold = _substitution(known | labels)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
         modules = [_changed(m, fold) for m in modules]
-        owned: list[tuple[Declaration, int | None]] = []
-        owned += [(_changed(d, both), None) for d in syntax.variables]
-        owned += [(d, i) for i, m in enumerate(modules) for d in m.declarations]
-        variables = tuple(self.variable(d, i) for d, i in owned)
-        parameters = tuple(
-            c.name for c in syntax.constants if c.name not in constants and c.type == "double"
-        )
-        rewards = _changed(syntax.rewards, both)
+        variables = [self.variable(_changed(d, both), None) for d in syntax.variables]
+        variables += [self.variable(d, i) for i, m in enumerate(modules) for d in m.declarations]
+        rewards = _changed(tuple(syntax.rewards), both)
         used: set[str] = set()
         for e in (
             *(e for m in modules for c in m.commands for e in c.expressions),
             *(i.value for r in rewards for i in r.items),
         ):
             names_in(e, used)
+        undefined = {c.name: c for c in syntax.constants if c.name not in constants}
         program = Program(
             syntax.source,
             syntax.kind,
             constants,
-            tuple(p for p in parameters if p in used),
+            tuple(c.name for c in undefined.values() if c.type == "double" and c.name in used),
             {name: fold(e) for name, e in formulas.items()},
-            variables,
+            tuple(variables),
             tuple(replace(m, declarations=()) for m in modules),
             {name.strip('"'): e for name, e in labels.items()},
             rewards,
             None if syntax.initial is None else both(syntax.initial),
-            syntax.players,
+            tuple(syntax.players),
         )
-        undefined = {c.name: c.place for c in syntax.constants if c.name not in constants}
         _Checker(program, undefined).check()
         return program
 
     def renamed(
-        self, modules: tuple[Module | RenamedModule, ...], formulas: Mapping[str, Expression]
+        self, modules: Sequence[Module | RenamedModule], formulas: Mapping[str, Expression]
     ) -> list[Module]:
         found: dict[str, Module] = {}
         for m in sorted(modules, key=lambda m: isinstance(m, RenamedModule)):  # copies last
@@ -181,49 +174,41 @@ class _Resolver:
     def check_names(self, modules: Sequence[Module]) -> None:
         """Raises LanguageError if two constants, formulas or variables have one name."""
         syntax = self.syntax
-        declared = *syntax.variables, *(d for m in modules for d in m.declarations)
         places = [(name, e.place) for name, e in syntax.formulas]
         places += [(c.name, c.place) for c in syntax.constants]
-        places += [(d.name, d.place) for d in declared]
-        seen: set[str] = set()
-        for name, place in places:
-            if name in seen:
-                raise LanguageError(place, f"the name {name} is declared twice.")
-            seen.add(name)
-        names = [r.name for r in syntax.rewards]
-        for r in syntax.rewards:
-            if names.count(r.name) > 1:
-                raise LanguageError(r.place, f'there are two reward structures "{r.name}".')
-        unknown = sorted(set(self.given) - {c.name for c in self.syntax.constants})
-        if unknown:
-            listed = ", ".join(c.name for c in self.syntax.constants) or "none"
+        places += [(d.name, d.place) for d in syntax.variables]
+        places += [(d.name, d.place) for m in modules for d in m.declarations]
+        _check_distinct(places, "the name {} is declared twice.")
+        structures = [(r.name, r.place) for r in syntax.rewards]
+        _check_distinct(structures, 'there are two reward structures "{}".')
+        if unknown := sorted(self.given.keys() - self.table.keys()):
+            listed = ", ".join(self.table) or "none"
             raise LanguageError(0, f"there is no constant {unknown[0]}; it has {listed}.")
 
     def constant_values(self, expand: Change) -> tuple[dict[str, Value], dict[str, Expression]]:
-        """The value of each constant that is defined or given, and expressions over parameters."""
-        table = {c.name: c for c in self.syntax.constants}
+        """The values of constants that are defined or given, and all of these as expressions."""
+        table = self.table
         texts = {c.name: expand(c.expression) for c in table.values() if c.expression is not None}
-        order = _in_order(texts, "constant", {c.name: c.place for c in self.syntax.constants})
+        order = _in_order(texts, "constant", {c.name: c.place for c in table.values()})
         found: dict[str, Value] = {}
-        derived: dict[str, Expression] = {}
-        for name, value in self.given.items():
-            if name in texts:
-                raise LanguageError(table[name].place, f"the constant {name} has a value already.")
-            found[name] = _typed(table[name], value)
-        known = {name: literal(value) for name, value in found.items()}
+        known: dict[str, Expression] = {}
         types: dict[str, Type] = {c.name: c.type for c in table.values()}
-        for name in order:
-            type_of(texts[name], types)
-            e = substitute(texts[name], known)
+        for name in (*self.given, *order):
+            if name not in self.given:
+                type_of(texts[name], types)
+                e = substitute(texts[name], known)
+            elif name in texts:
+                raise LanguageError(table[name].place, f"the constant {name} has a value already.")
+            else:
+                e = literal(self.given[name])
             if e.is_literal:
                 found[name] = _typed(table[name], e.value)
-                known[name] = literal(found[name])
-                continue
-            for missing in sorted(names_in(e) & set(table)):
+                e = literal(found[name])
+            for missing in sorted(names_in(e) & table.keys()):
                 if types[name] != "double" or types[missing] != "double":
                     raise LanguageError(table[name].place, _no_value(missing))
-            known[name] = derived[name] = e
-        return found, derived
+            known[name] = e
+        return found, known
 
     def variable(self, d: Declaration, module: int | None) -> Variable:
         if d.initial is not None and self.syntax.initial is not None:
@@ -245,9 +230,7 @@ class _Resolver:
 
     def number(self, e: Expression, d: Declaration, expected: Type) -> Value:
         if not e.is_literal:
-            missing = sorted(names_in(e))
-            table = {c.name for c in self.syntax.constants}
-            if missing and missing[0] in table:
+            if missing := sorted(names_in(e) & self.table.keys()):
                 raise LanguageError(e.place, _no_value(missing[0]))
             raise LanguageError(e.place, f"{e} is no constant; ranges and initial values must be.")
         assert e.value is not None and not isinstance(e.value, str)
@@ -257,17 +240,23 @@ class _Resolver:
         return e.value
 
 
+def _check_distinct(names: Sequence[tuple[str, int]], message: str) -> None:
+    """Raises LanguageError at the place of a name that occurs before."""
+    seen: set[str] = set()
+    for name, place in names:
+        if name in seen:
+            raise LanguageError(place, message.format(name))
+        seen.add(name)
+
+
 def _expanded(
     items: Sequence[tuple[str, Expression]], what: str, known: Mapping[str, Expression]
 ) -> dict[str, Expression]:
     """Expressions by name, which may use each other; LanguageError for a circle."""
-    table: dict[str, Expression] = {}
-    for name, e in items:
-        if name in table:
-            raise LanguageError(e.place, f"the {what} {name} is defined twice.")
-        table[name] = e
-    done = dict(known)
-    for name in _in_order(table, what, {n: e.place for n, e in table.items()}):
+    places = [(name, e.place) for name, e in items]
+    _check_distinct(places, f"the {what} {{}} is defined twice.")
+    table, done = dict(items), dict(known)
+    for name in _in_order(table, what, dict(places)):
         done[name] = substitute(table[name], done)
     return {name: done[name] for name in table}
 
@@ -348,10 +337,10 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
 class _Checker:
     """Types, owners of variables, and constants without a value."""
 
-    def __init__(self, program: Program, undefined: Mapping[str, int]) -> None:
+    def __init__(self, program: Program, undefined: Mapping[str, Constant]) -> None:
         self.program, self.undefined = program, undefined
         self.types: dict[str, Type] = {v.name: v.type for v in program.variables}
-        self.with_parameters: dict[str, Type] = program.types
+        self.with_parameters = program.types
         self.owner = {v.name: v.module for v in program.variables}
 
     def check(self) -> None:
@@ -359,13 +348,19 @@ class _Checker:
         uses = Counter(a for m in program.modules for a in {c.action for c in m.commands})
         for i, m in enumerate(program.modules):
             for c in m.commands:
-                self.command(c, i, bool(c.action) and uses[c.action] > 1)
+                self.boolean(c.guard, "a guard")
+                for o in c.outcomes:
+                    for e in (o.probability, o.upper or o.probability):
+                        self.number(e, "a probability")
+                    variables = [(a.variable, a.place) for a in o.assignments]
+                    for a in o.assignments:
+                        self.assignment(a, i, c.action if uses[c.action] > 1 else "")
+                    _check_distinct(variables, "{} is assigned twice in one update.")
         for name, e in program.labels.items():
             self.boolean(e, f'the label "{name}"')
-        for r in program.rewards:
-            for item in r.items:
-                self.boolean(item.guard, "the guard of a reward")
-                self.number(item.value, "a reward")
+        for item in (i for r in program.rewards for i in r.items):
+            self.boolean(item.guard, "the guard of a reward")
+            self.number(item.value, "a reward")
         if program.initial is not None:
             self.boolean(program.initial, "the init block")
         self.players(set(uses))
@@ -374,39 +369,28 @@ class _Checker:
         program = self.program
         if program.kind == "smg" and not program.players:
             raise LanguageError(0, "the game has no player ... endplayer block.")
+        known = {m.name for m in program.modules} | {f"[{a}]" for a in actions}
         seen: set[str] = set()
-        modules = {m.name for m in program.modules}
         for p in program.players:
-            for name, known in ((p.modules, modules), (p.actions, actions)):
-                for one in name:
-                    if one not in known:
-                        raise LanguageError(p.place, f"player {p.name}: there is no {one}.")
-            controlled = {*p.modules, *(f"[{a}]" for a in p.actions)}
-            if both := sorted(controlled & seen):
-                raise LanguageError(p.place, f"{both[0]} belongs to two players.")
-            seen |= controlled
+            controlled = [*p.modules, *(f"[{a}]" for a in p.actions)]
+            for name in controlled:
+                if name not in known:
+                    raise LanguageError(
+                        p.place, f"player {p.name}: there is no {name.strip('[]')}."
+                    )
+                if name in seen:
+                    raise LanguageError(p.place, f"{name} belongs to two players.")
+            seen.update(controlled)
 
-    def command(self, c: Command, module: int, shared: bool) -> None:
-        self.boolean(c.guard, "a guard")
-        for o in c.outcomes:
-            self.number(o.probability, "a probability")
-            if o.upper is not None:
-                self.number(o.upper, "a probability")
-            written: set[str] = set()
-            for a in o.assignments:
-                self.assignment(a, module, c.action if shared else "")
-                if a.variable in written:
-                    raise LanguageError(a.place, f"{a.variable} is assigned twice in one update.")
-                written.add(a.variable)
-
-    def assignment(self, a: Assignment, module: int, action: str) -> None:
+    def assignment(self, a: Assignment, module: int, shared: str) -> None:
+        """Checks an assignment of a module, of a command with a shared action or ""."""
         if a.variable not in self.owner:
             raise LanguageError(a.place, f"{a.variable} is no variable.")
         owner = self.owner[a.variable]
-        if owner is None and action:
+        if owner is None and shared:
             raise LanguageError(
                 a.place,
-                f"[{action}] synchronises modules and assigns the global variable {a.variable}; "
+                f"[{shared}] synchronises modules and assigns the global variable {a.variable}; "
                 "only commands without synchronisation may.",
             )
         if owner not in (None, module):
@@ -433,7 +417,7 @@ class _Checker:
 
     def type(self, e: Expression, types: Mapping[str, Type]) -> Type:
         """The type; LanguageError that names a constant without a value."""
-        for name in names_in(e) - types.keys():
-            if name in self.undefined:
-                raise LanguageError(self.undefined[name], _no_value(name))
+        if missing := (names_in(e) - types.keys()) & self.undefined.keys():
+            name = min(missing)
+            raise LanguageError(self.undefined[name].place, _no_value(name))
         return type_of(e, types)

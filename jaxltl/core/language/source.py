@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import NoReturn, TypeVar
 
 Item = TypeVar("Item")
@@ -17,6 +18,7 @@ _TOKEN = re.compile(
   | (?P<integer>[0-9]+)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
   | (?P<sign><=>|=>|<=|>=|!=|->|\.\.|[-<>=&|!()\[\]{},;:?/+*^%'])
+  | (?P<unknown>.)
 """,
     re.VERBOSE,
 )
@@ -37,42 +39,28 @@ class Source:
     text: str
     name: str = "model"
 
-    def position(self, place: int) -> tuple[int, int]:
-        """Line and column of an offset, both from 1."""
-        before = self.text.rfind("\n", 0, place)
-        return self.text.count("\n", 0, place) + 1, place - before
-
     def located(self, error: LanguageError) -> ValueError:
         """The error with file, line and column."""
-        line, column = self.position(max(error.place, 0))
+        place = max(error.place, 0)
+        line = self.text.count("\n", 0, place) + 1
+        column = place - self.text.rfind("\n", 0, place)
         return ValueError(f"{self.name!r}, line {line}, column {column}: {error.message}")
 
 
 class TokenReader:
-    """The tokens of a text from an offset on, and a place in them.
-
-    The last token has the kind "end", or "unknown" at a character that begins no token: a reader
-    that stops before it has no error.
-    """
+    """The tokens of a text from an offset on, and a place in them; the last one has the kind "end"."""
 
     def __init__(self, text: str, start: int = 0) -> None:
-        self.kinds: list[str] = []
-        self.texts: list[str] = []
-        self.starts: list[int] = []
+        tokens = (found for found in _TOKEN.finditer(text, start) if found.lastgroup != "space")
+        found = list(islice(tokens, MAX_TOKENS + 1))
+        if len(found) > MAX_TOKENS:
+            raise LanguageError(
+                found[-1].start(), f"the text has more than {MAX_TOKENS} words and signs."
+            )
+        self.kinds = [*(str(token.lastgroup) for token in found), "end"]
+        self.texts = [*(token[0] for token in found), ""]
+        self.starts = [*(token.start() for token in found), len(text)]
         self.at = 0
-        place, match = start, _TOKEN.match
-        while found := match(text, place):
-            if found.lastgroup != "space":
-                self._append(str(found.lastgroup), found[0], place)
-            place = found.end()
-            if len(self.kinds) > MAX_TOKENS:
-                raise LanguageError(place, f"the text has more than {MAX_TOKENS} words and signs.")
-        self._append("unknown" if place < len(text) else "end", text[place : place + 1], place)
-
-    def _append(self, kind: str, text: str, start: int) -> None:
-        self.kinds.append(kind)
-        self.texts.append(text)
-        self.starts.append(start)
 
     @property
     def place(self) -> int:
@@ -84,18 +72,16 @@ class TokenReader:
         """Offset of the end of the last token that was taken."""
         return self.starts[self.at - 1] + len(self.texts[self.at - 1])
 
-    def fail(self, expected: str, at: int | None = None) -> NoReturn:
+    def fail(self, expected: str) -> NoReturn:
         """Raises LanguageError: another token is expected."""
-        at = self.at if at is None else at
-        found = "the end" if self.kinds[at] == "end" else repr(self.texts[at])
-        raise LanguageError(self.starts[at], f"found {found}, expected {expected}.")
+        found = "the end" if self.kinds[self.at] == "end" else repr(self.texts[self.at])
+        raise LanguageError(self.place, f"found {found}, expected {expected}.")
 
     def accept(self, text: str) -> bool:
         """Takes the next token if it is this sign or word."""
-        if self.texts[self.at] == text and self.kinds[self.at] != "end":
-            self.at += 1
-            return True
-        return False
+        accepted = self.texts[self.at] == text
+        self.at += accepted
+        return accepted
 
     def expect(self, text: str, after: str = "") -> None:
         """Takes the next token, which must be this sign or word."""

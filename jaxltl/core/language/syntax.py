@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from jaxltl.core.language.expressions import Expression, Type, Value, names_in
@@ -129,20 +129,20 @@ class Player:
     place: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class Syntax:
     """A program as it is written; :func:`~jaxltl.core.language.parser.parse_program`."""
 
     source: Source
-    kind: Kind
-    constants: tuple[Constant, ...]
-    formulas: tuple[tuple[str, Expression], ...]
-    variables: tuple[Declaration, ...]  # global ones
-    modules: tuple[Module | RenamedModule, ...]
-    labels: tuple[tuple[str, Expression], ...]
-    rewards: tuple[RewardStructure, ...]
-    initial: Expression | None
-    players: tuple[Player, ...]
+    kind: Kind = "mdp"  # PRISM's default
+    constants: list[Constant] = field(default_factory=list)
+    formulas: list[tuple[str, Expression]] = field(default_factory=list)
+    variables: list[Declaration] = field(default_factory=list)  # global ones
+    modules: list[Module | RenamedModule] = field(default_factory=list)
+    labels: list[tuple[str, Expression]] = field(default_factory=list)
+    rewards: list[RewardStructure] = field(default_factory=list)
+    initial: Expression | None = None
+    players: list[Player] = field(default_factory=list)
 
 
 # --- after resolution -------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core import validation
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.language.compiled import compile_expressions
 from jaxltl.core.language.expressions import Expression, literal
 from jaxltl.core.language.source import LanguageError
@@ -19,7 +19,7 @@ from jaxltl.core.language.syntax import Program, RewardItem
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.programs.explore import Explored, Progress, Search
+from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
 from jaxltl.core.programs.initial import initial_states
 from jaxltl.core.programs.layout import Layout, Reader, Words, make_layout
 from jaxltl.core.programs.local_choices import state_text
@@ -27,7 +27,6 @@ from jaxltl.core.programs.weights import Functions, Intervals, Numbers, Weight
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 MAX_STATES = 10_000_000
-_Part = tuple[NDArray[Any] | None, NDArray[Any] | None]  # rewards of states and of choices
 _PART = 2**17  # states on which labels and rewards are evaluated together
 
 
@@ -36,9 +35,9 @@ class Rows:
     """Arrays of a model before its probabilities are numbers.
 
     Attributes:
-      row_start, entry_start, successor, weight, initial, label, propositions, action,
-        action_names, valuation: as of :func:`~jaxltl.core.models.sparse.make_sparse`; `weight` has the
-        probabilities, their intervals ``[T, 2]``, or numbers of functions.
+      row_start, entry_start, successor, weight: as of :func:`~jaxltl.core.models.sparse.make_sparse`;
+        `weight` has probabilities, their intervals ``[T, 2]``, or numbers of functions.
+      annotations: keyword arguments of ``make_sparse`` other than rewards.
       rewards: by name the parts on states and choices, None where they are zero.
       functions: of a program with parameters, expressions by number.
       owner: ``int32[S]``, the number of the player of each state of a game.
@@ -48,21 +47,10 @@ class Rows:
     entry_start: Integers
     successor: Integers
     weight: Weight
-    initial: Floats
-    label: Booleans
-    propositions: tuple[str, ...]
-    action: Integers
-    action_names: tuple[str, ...]
-    valuation: dict[str, NDArray[Any]]
-    rewards: dict[str, _Part]
-    functions: tuple[Expression, ...] = ()
-    owner: Integers | None = None
-
-    @property
-    def annotations(self) -> dict[str, Any]:
-        """Keyword arguments of ``make_sparse`` other than rewards."""
-        names = ("initial", "label", "propositions", "action", "action_names", "valuation")
-        return {name: getattr(self, name) for name in names}
+    annotations: dict[str, Any]
+    rewards: dict[str, RewardParts]
+    functions: tuple[Expression, ...]
+    owner: Integers | None
 
 
 def build_model(
@@ -107,18 +95,12 @@ def build_model(
         )
         raise program.source.located(LanguageError(place, text))
     rows = build_rows(program, max_states=max_states, progress=progress)
-    rewards = {
-        name: Rewards(state=state, choice=choice) for name, (state, choice) in rows.rewards.items()
-    }
-    arrays = rows.row_start, rows.entry_start, rows.successor
+    rewards = {name: Rewards(*parts) for name, parts in rows.rewards.items()}
+    starts = rows.row_start, rows.entry_start, rows.successor
+    ends = rows.weight.T if rows.weight.ndim == 2 else [rows.weight]
+    make: Any = interval_rows if len(ends) == 2 else make_sparse
     with validation.errors_in(f"{program.source.name!r}: "):
-        model: SparseMDP | IntervalMDP
-        if rows.weight.ndim == 2:
-            model = interval_rows(
-                *arrays, rows.weight[:, 0], rows.weight[:, 1], rewards=rewards, **rows.annotations
-            )
-        else:
-            model = make_sparse(*arrays, rows.weight, rewards=rewards, **rows.annotations)
+        model: SparseMDP | IntervalMDP = make(*starts, *ends, rewards=rewards, **rows.annotations)
         if rows.owner is None:
             return model
         return make_game(model, np.isin(rows.owner, _players(program, coalition)))
@@ -133,8 +115,8 @@ def build_rows(
     weights: Numbers = (
         Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()
     )
-    initial = initial_states(program, layout, max_states)
     try:
+        initial = initial_states(program, layout, max_states)
         found = Search(program, layout, weights, max_states).run(initial, progress)
         return _rows(program, found, weights)
     except LanguageError as error:
@@ -143,42 +125,42 @@ def build_rows(
 
 def _rows(program: Program, found: Explored, weights: Numbers) -> Rows:
     size = found.words[0].size
-    rewards = {r.name: _reward_parts(found, weights, r.items) for r in program.rewards}
+    found.rewards.update((r.name, _reward_parts(found, weights, r.items)) for r in program.rewards)
     owner = _owners(program, found) if program.kind == "smg" else None
     deadlock = found.row_count == 0
     if deadlock.any():
-        warnings.warn(
-            f"{program.source.name!r}: {int(deadlock.sum())} of {size} states are deadlocks; each "
-            "gets a self-loop.",
-            stacklevel=2,
-        )
-        found, rewards = with_loops(found, weights, np.flatnonzero(deadlock), rewards)
+        count = f"{int(deadlock.sum())} of {size} states are deadlocks"
+        _warn(program, f"{count}; each gets a self-loop.")
+        found = with_loops(found)
     if program.kind == "dtmc" and found.action.size > size:
-        warnings.warn(
-            f"{program.source.name!r}: several commands are enabled in "
-            f"{int((found.row_count > 1).sum())} states of a dtmc; each has the same probability.",
-            stacklevel=2,
-        )
-        found, rewards = as_chain(found, weights, rewards)
-    initial = np.zeros(size)
-    initial[: found.num_initial] = 1 / found.num_initial
+        several = f"in {int((found.row_count > 1).sum())} states of a dtmc"
+        _warn(program, f"several commands are enabled {several}; each has the same probability.")
+        found = as_chain(found, weights)
     label = _label_columns(program, found, deadlock)
-    functions = tuple(weights.expressions) if isinstance(weights, Functions) else ()
+    annotations = {
+        "initial": found.initial,
+        "label": np.stack(list(label.values()), 1) if label else np.zeros((size, 0), bool),
+        "propositions": tuple(label),
+        "action": found.action,
+        "action_names": found.actions,
+        "valuation": {
+            v.name: _column(found.layout, found.words, v.name) for v in program.variables
+        },
+    }
     return Rows(
         offsets_from_counts(found.row_count),
         offsets_from_counts(found.entry_count),
         found.successor,
         found.weight,
-        initial,
-        label[1],
-        label[0],
-        found.action,
-        found.actions,
-        {v.name: _column(found.layout, found.words, v.name) for v in program.variables},
-        rewards,
-        functions,
+        annotations,
+        found.rewards,
+        tuple(weights.expressions) if isinstance(weights, Functions) else (),
         owner,
     )
+
+
+def _warn(program: Program, text: str) -> None:
+    warnings.warn(f"{program.source.name!r}: {text}", stacklevel=4)
 
 
 def _column(layout: Layout, words: Words, name: str) -> NDArray[Any]:
@@ -207,42 +189,37 @@ def on_states(
 
 def _label_columns(
     program: Program, found: Explored, deadlock: Booleans
-) -> tuple[tuple[str, ...], Booleans]:
-    """Names and columns of the labels."""
-    names = tuple(program.labels)
-    columns = on_states(found.layout, found.words, [program.labels[n] for n in names])
+) -> dict[str, NDArray[np.bool_]]:
+    """The states of each label."""
+    columns = on_states(found.layout, found.words, list(program.labels.values()))
+    label = dict(zip(program.labels, columns, strict=True))
     only = np.flatnonzero(found.row_count == 1)
     first = offsets_from_counts(found.row_count)[only]
     entry = offsets_from_counts(found.entry_count)[first]
     loops = np.zeros(deadlock.size, bool)
     loops[only] = (found.entry_count[first] == 1) & (found.successor[entry] == only)
-    if not np.array_equal(loops, deadlock):
-        names, columns = (*names, "deadlock"), [*columns, deadlock]
-    if not columns:
-        return (), np.zeros((deadlock.size, 0), bool)
-    return names, np.stack(columns, 1)
+    return label if np.array_equal(loops, deadlock) else label | {"deadlock": deadlock}
 
 
 # --- rewards ----------------------------------------------------------------------------------
 
 
-def _reward_parts(found: Explored, weights: Numbers, items: Sequence[RewardItem]) -> _Part:
+def _reward_parts(found: Explored, weights: Numbers, items: Sequence[RewardItem]) -> RewardParts:
     """Rewards of states and of choices; numbers of functions in a program with parameters."""
     size = found.words[0].size
     by_action: dict[str | None, list[RewardItem]] = {}
     for i in items:
         by_action.setdefault(i.action, []).append(i)
     state = choices = None
+    if None in by_action:
+        state = _earned(found, weights, by_action.pop(None), np.arange(size))
     of_row = np.repeat(np.arange(size), found.row_count)
-    for action, some in by_action.items():
-        if action is None:
-            state = _earned(found, weights, some, np.arange(size))
-        elif action in found.actions:
-            rows = np.flatnonzero(found.action == found.actions.index(action))
-            if rows.size:
-                earned = _earned(found, weights, some, of_row[rows])
-                choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
-                choices[rows] = earned
+    for number, action in enumerate(found.actions):
+        rows = np.flatnonzero(found.action == number) if action in by_action else np.zeros(0, int)
+        if rows.size:
+            earned = _earned(found, weights, by_action[action], of_row[rows])
+            choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
+            choices[rows] = earned
     return state, choices
 
 
@@ -268,50 +245,31 @@ def _earned(
 # --- deadlocks and overlapping commands -------------------------------------------------------
 
 
-def with_loops(
-    found: Explored, weights: Numbers, states: Integers, rewards: Mapping[str, _Part]
-) -> tuple[Explored, dict[str, _Part]]:
-    """The model with a self-loop in each of some states without choices, and its rewards."""
+def with_loops(found: Explored) -> Explored:
+    """The model with a self-loop in each state without choices."""
+    states = np.flatnonzero(found.row_count == 0)
     row = offsets_from_counts(found.row_count)[states]
     entry = offsets_from_counts(found.entry_count)[row]
-    row_count = found.row_count.copy()
-    row_count[states] = 1
-    changed = replace(
+    return replace(
         found,
-        row_count=row_count,
+        row_count=np.maximum(found.row_count, 1),
         action=np.insert(found.action, row, 0),
         owner=np.insert(found.owner, row, -1),
         entry_count=np.insert(found.entry_count, row, 1),
         successor=np.insert(found.successor, entry, states.astype(np.int32)),
         weight=np.insert(found.weight, entry, 1, axis=0),
+        rewards={
+            name: (state, None if choice is None else np.insert(choice, row, 0))
+            for name, (state, choice) in found.rewards.items()
+        },
     )
-    return changed, {
-        name: (state, None if choice is None else np.insert(choice, row, 0))
-        for name, (state, choice) in rewards.items()
-    }
 
 
-def as_chain(
-    found: Explored, weights: Numbers, rewards: Mapping[str, _Part]
-) -> tuple[Explored, dict[str, _Part]]:
+def as_chain(found: Explored, weights: Numbers) -> Explored:
     """The Markov chain that picks each enabled command with the same probability."""
     starts = offsets_from_counts(found.row_count)[:-1]
     share = np.repeat(found.row_count, found.row_count)
-    of_entry = np.repeat(share, found.entry_count)
-    if isinstance(weights, Functions):
-        scale = np.array([weights.constant(1 / n) for n in range(1, int(share.max()) + 1)])
-        weight = weights.product(found.weight, scale[of_entry - 1])
-    else:
-        shape = (-1,) + (1,) * (found.weight.ndim - 1)
-        weight = found.weight / of_entry.reshape(shape)
-    changed = replace(
-        found,
-        row_count=np.ones_like(found.row_count),
-        action=np.where(found.row_count == 1, found.action[starts], 0).astype(np.int32),
-        entry_count=np.add.reduceat(found.entry_count, starts),
-        weight=weight,
-    )
-    means: dict[str, _Part] = {}
+    rewards = dict(found.rewards)
     for name, (state, choice) in rewards.items():
         if choice is not None and isinstance(weights, Functions):
             raise LanguageError(
@@ -319,9 +277,16 @@ def as_chain(
                 "rewards of choices in a dtmc with overlapping commands and parameters are not "
                 "supported; make the guards disjoint.",
             )
-        mean = None if choice is None else np.add.reduceat(choice / share, starts)
-        means[name] = (state, mean)
-    return changed, means
+        if choice is not None:
+            rewards[name] = state, np.add.reduceat(choice / share, starts)
+    return replace(
+        found,
+        row_count=np.ones_like(found.row_count),
+        action=np.where(found.row_count == 1, found.action[starts], 0).astype(np.int32),
+        entry_count=np.add.reduceat(found.entry_count, starts),
+        weight=weights.divided(found.weight, np.repeat(share, found.entry_count)),
+        rewards=rewards,
+    )
 
 
 # --- games ------------------------------------------------------------------------------------

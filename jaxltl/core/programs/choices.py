@@ -8,7 +8,6 @@ from itertools import product
 from math import prod
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans
 from jaxltl.core.language.compiled import compile_expressions
@@ -52,21 +51,20 @@ def list_choices(program: Program) -> tuple[tuple[Group, ...], tuple[Choice, ...
     choices: list[Choice] = []
     variables = {v.name: v for v in program.variables}
     actions = sorted({c.action for m in program.modules for c in m.commands if c.action})
-    cells = [(m.name, "", [i]) for i, m in enumerate(program.modules)]
-    cells += [(a, a, list(range(len(program.modules)))) for a in actions]
+    everywhere = range(len(program.modules))
+    cells = [(m.name, "", range(i, i + 1)) for i, m in enumerate(program.modules)]
+    cells += [(a, a, everywhere) for a in actions]
     for name, action, modules in cells:
         parts, draw = [], 0
         for m in modules:
             commands = [c for c in program.modules[m].commands if c.action == action]
             if not commands:
                 continue
-            slot = _colours(_overlap(commands, variables))
-            split = [
-                tuple(c for c, s in zip(commands, slot, strict=True) if s == k)
-                for k in range(max(slot) + 1)
-            ]
-            parts.append(range(len(groups), len(groups) + len(split)))
-            groups += [Group(m, action, some, draw) for some in split]
+            slots: dict[int, list[Command]] = {}
+            for c, slot in zip(commands, _colours(_overlap(commands, variables)), strict=True):
+                slots.setdefault(slot, []).append(c)
+            parts.append(range(len(groups), len(groups) + len(slots)))
+            groups += [Group(m, action, tuple(slots[k]), draw) for k in sorted(slots)]
             draw += any(len(c.outcomes) > 1 for c in commands)
         number = prod(map(len, parts)) if parts else 0
         if len(choices) + number > MAX_CHOICES:
@@ -99,16 +97,18 @@ def _overlap(commands: Sequence[Command], variables: dict[str, Variable]) -> Boo
     return overlap
 
 
-def _holds(conditions: Sequence[Expression], ranges: Sequence[Variable]) -> NDArray[np.bool_]:
+def _holds(conditions: Sequence[Expression], ranges: Sequence[Variable]) -> Booleans:
     """Values of the variables at which all conditions on no other ones hold."""
     axes = [np.arange(v.low, v.high + 1) for v in ranges]
-    columns = [x.ravel() for x in np.meshgrid(*axes, indexing="ij")]
+    grid = np.meshgrid(*axes, indexing="ij") if axes else []
     values = {
-        v.name: x != 0 if v.type == "bool" else x for v, x in zip(ranges, columns, strict=True)
+        v.name: x.ravel() != 0 if v.type == "bool" else x.ravel()
+        for v, x in zip(ranges, grid, strict=True)
     }
-    some = [e for e in conditions if names_in(e) <= values.keys()]
-    found = np.ones(columns[0].size if columns else 1, bool)
-    for condition in compile_expressions(some)(values):
+    found = np.ones(prod(map(len, axes)), bool)
+    for condition in compile_expressions([e for e in conditions if names_in(e) <= values.keys()])(
+        values
+    ):
         found &= condition
     return found
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.array_types import Integers
+from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.hash_table import HashTable
@@ -21,6 +21,7 @@ from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges
 
 Progress = Callable[[int, int], None]  # of the numbers of states found and expanded
+RewardParts = tuple[NDArray[Any] | None, NDArray[Any] | None]  # of states and of choices
 
 _CHUNK = 2**15  # states that are expanded together
 _ENTRIES = 2**19  # transitions that are numbered together; bounds the temporary memory
@@ -38,10 +39,11 @@ class Explored:
       num_initial: the initial states are the first ones.
       row_count: ``int32[S]``, choices of each state; 0 of a deadlock.
       action: ``int32[R]``, index in `actions`.
+      owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
       entry_count: ``int64[R]``.
       successor: ``int32[T]``.
       weight: ``[T]``, see :mod:`~jaxltl.core.programs.weights`.
-      owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
+      rewards: by name the parts on states and choices.
     """
 
     layout: Layout
@@ -54,6 +56,14 @@ class Explored:
     entry_count: Integers
     successor: NDArray[np.int32]
     weight: Weight
+    rewards: dict[str, RewardParts] = field(default_factory=dict)
+
+    @property
+    def initial(self) -> Floats:
+        """``float[S]``: the initial states are equally likely."""
+        found = np.zeros(self.row_count.size)
+        found[: self.num_initial] = 1 / self.num_initial
+        return found
 
 
 @dataclass(frozen=True)
@@ -63,15 +73,6 @@ class _Column:
     action: int
     owner: int  # the module, or -1 for an action of several
     parts: tuple[tuple[int, int], ...]  # modules, and the column of the action in each
-
-
-_ARRAYS = {  # of :class:`Explored`, which a search makes in parts
-    "row_count": np.int32,
-    "action": np.int32,
-    "owner": np.int32,
-    "entry_count": np.int64,
-    "successor": np.int32,
-}
 
 
 class Search:
@@ -84,64 +85,60 @@ class Search:
     def __init__(self, program: Program, layout: Layout, weights: Numbers, max_states: int) -> None:
         self.program, self.layout, self.weights = program, layout, weights
         self.max_states = max_states
-        self.codes = [ModuleCode(program, m, layout, weights) for m in program.modules]
-        self.tables = [LocalTable(code) for code in self.codes]
-        names = sorted({a for code in self.codes for a in code.actions if a})
-        self.actions = ("", *names)
-        self.columns = _columns(self.codes, self.actions)
+        codes = [ModuleCode(program, m, layout, weights) for m in program.modules]
+        self.tables = [LocalTable(code) for code in codes]
+        self.actions = ("", *sorted({a for code in codes for a in code.actions if a}))
+        self.columns = _columns(codes, self.actions)
         self.action_of = np.array([c.action for c in self.columns], np.int32)
         self.owner_of = np.array([c.owner for c in self.columns], np.int32)
         self.known = HashTable(layout.num_words)
         self.orbits: tuple[Orbit, ...] = ()  # successors are found up to these symmetries
-        self.output: dict[str, list[NDArray[Any]]] = {n: [] for n in (*_ARRAYS, "weight")}
         self.num_transitions = 0
+        # Arrays of :class:`Explored`, in parts, of which the first ones are empty.
+        types: dict[str, Any] = {"row_count": np.int32, "action": np.int32, "owner": np.int32}
+        types |= {"entry_count": np.int64, "successor": np.int32}
+        self.output = {name: [np.zeros(0, dtype)] for name, dtype in types.items()}
+        self.output["weight"] = [np.zeros((0, *weights.shape), weights.dtype)]
 
     def run(self, initial: Words, progress: Progress | None) -> Explored:
-        num_initial = initial[0].size
-        done = self._narrow(initial)
-        if progress is not None:
-            progress(len(self.known), done)
-        while done < len(self.known):
+        self.known.fill(initial)
+        done = self._narrow(initial) if type(self.weights) is Numbers else 0
+        while True:
+            if progress is not None:
+                progress(len(self.known), done)
+            if done == len(self.known):
+                return self.explored(initial[0].size)
             stop = min(len(self.known), done + _CHUNK)
             self.expand(self.known.words(done, stop))
             done = stop
-            if progress is not None:
-                progress(len(self.known), done)
-        return self.explored(num_initial)
 
     def explored(self, num_initial: int) -> Explored:
         """The result; rows are in the order of expansion."""
-        empty: dict[str, Any] = {name: np.zeros(0, dtype) for name, dtype in _ARRAYS.items()}
-        empty["weight"] = np.zeros((0, *self.weights.shape), self.weights.dtype)
-        arrays = {name: np.concatenate(x or [empty[name]]) for name, x in self.output.items()}
+        arrays: dict[str, Any] = {name: np.concatenate(x) for name, x in self.output.items()}
         words = self.known.words(0, len(self.known))
         return Explored(self.layout, words, self.actions, num_initial, **arrays)
 
     def _narrow(self, initial: Words) -> int:
         """Expands small levels state by state; returns the number of states that are done."""
-        if type(self.weights) is not Numbers:
-            self.known.fill(initial)
-            return 0
-        parts = [column.parts for column in self.columns]
-        found = search_narrow(
-            self.program, self.codes, parts, self.layout, initial, self.max_states
-        )
+        codes, parts = [t.code for t in self.tables], [column.parts for column in self.columns]
+        found = search_narrow(self.program, codes, parts, self.layout, initial, self.max_states)
         self.known.fill(found.words(self.layout))
         self._check_size()
-        self.num_transitions = sum(found.entry_count)
+        self.num_transitions = len(found.successor)
+        column = np.array(found.column, np.int64)
         self._add(
-            row_count=np.array(found.row_count, np.int32),
-            action=self.action_of[np.array(found.column, np.int64)],
-            owner=self.owner_of[np.array(found.column, np.int64)],
-            entry_count=np.array(found.entry_count, np.int64),
-            successor=np.array(found.successor, np.int32),
-            weight=np.array(found.weight, np.float64),
+            row_count=found.row_count,
+            action=self.action_of[column],
+            owner=self.owner_of[column],
+            entry_count=found.entry_count,
+            successor=found.successor,
+            weight=found.weight,
         )
-        return found.done
+        return len(found.row_count)
 
-    def _add(self, **parts: NDArray[Any]) -> None:
+    def _add(self, **parts: ArrayLike) -> None:
         for name, part in parts.items():
-            self.output[name].append(part)
+            self.output[name].append(np.asarray(part, self.output[name][0].dtype))
 
     def _check_size(self) -> None:
         if len(self.known) > self.max_states:
@@ -155,15 +152,11 @@ class Search:
         """Adds the choices and successors of some states."""
         size = words[0].size
         local = [table.choices(words) for table in self.tables]
-        per_module = [
-            table.count if index is None else table.count[index] for table, index in local
-        ]
-        total = np.zeros((size, len(self.columns)))  # doubles do not wrap around
+        counts = [table.count[index] for table, index in local]
+        total = np.ones((size, len(self.columns)))  # doubles do not wrap around
         for i, column in enumerate(self.columns):
-            (m, c), *others = column.parts
-            total[:, i] = per_module[m][:, c]
-            for m, c in others:
-                total[:, i] *= per_module[m][:, c]
+            for m, c in column.parts:
+                total[:, i] *= counts[m][:, c]
         if total.size and total.max() > _MAX_BRANCHING:
             raise LanguageError(
                 0, f"a state has {total.max():.3g} choices, more than {_MAX_BRANCHING}."
@@ -173,35 +166,31 @@ class Search:
         place = concatenated_ranges(np.zeros(total_of.size, np.int64), total_of)
         cells = np.arange(state.size).repeat(total_of)
         rows = _Rows(state[cells], cell[cells], place, [None] * len(self.tables))
-        self._choose(rows, local, per_module)
+        self._choose(rows, local, counts)
         self._add(
-            row_count=total.sum(1).astype(np.int32),
+            row_count=total.sum(1),
             action=self.action_of[rows.column],
             owner=self.owner_of[rows.column],
         )
         self._expand_rows(rows, [table for table, _ in local], words)
 
     def _choose(
-        self, rows: _Rows, local: list[tuple[Choices, Integers | None]], counts: Sequence[Integers]
+        self, rows: _Rows, local: list[tuple[Choices, Integers]], counts: Sequence[Integers]
     ) -> None:
         """The command of each module in each joint choice: digits of its number in mixed radix."""
         rest = rows.place
         for m, (table, index) in enumerate(local):
             column_of = np.full(len(self.columns), -1)
             for i, column in enumerate(self.columns):
-                for module, c in column.parts:
-                    if module == m:
-                        column_of[i] = c
+                column_of[i] = dict(column.parts).get(m, -1)
             chosen = column_of[rows.column]
             part = (chosen >= 0).nonzero()[0]
-            if not part.size:
-                continue
-            state, chosen = rows.state[part], chosen[part]
-            number = counts[m][state, chosen]
-            digit = rest[part] % number
-            rest[part] //= number
-            where = state if index is None else index[state]
-            rows.chosen[m] = part, table.first[where, chosen] + digit
+            if part.size:
+                state, chosen = rows.state[part], chosen[part]
+                number = counts[m][state, chosen]
+                digit = rest[part] % number
+                rest[part] //= number
+                rows.chosen[m] = part, table.first[index[state], chosen] + digit
 
     def _expand_rows(self, rows: _Rows, tables: list[Choices], words: Words) -> None:
         """Joint updates of the choices: sums of changes and products of probabilities."""
@@ -244,15 +233,13 @@ class Search:
                 continue
             local = np.full(size, -1)
             local[chosen[0][low:high] - begin] = chosen[1][low:high]
-            width = np.where(local < 0, 1, table.width[local])
+            width = np.where(local < 0, 1, table.width[local])[row]
+            entry = table.start[local[row]]
             if width.max() > 1:
-                width = width[row]
+                entry = concatenated_ranges(entry, width)
                 again = np.arange(row.size).repeat(width)
-                entry = concatenated_ranges(table.start[local[row]], width)
                 row, target = row[again], [one[again] for one in target]
                 weight = None if weight is None else weight[again]
-            else:
-                entry = table.start[local[row]]
             everywhere = high - low == size
             part = slice(None) if everywhere else (local[row] >= 0).nonzero()[0]
             entry = entry[part]
@@ -284,16 +271,13 @@ class _Rows:
 
 def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_Column]:
     """The synchronisations of a program."""
-    found = []
-    for m, code in enumerate(codes):
-        for c, action in enumerate(code.actions):
-            if not action:
-                found.append(_Column(0, m, ((m, c),)))
+    found = [
+        _Column(0, m, ((m, code.actions.index("")),))
+        for m, code in enumerate(codes)
+        if "" in code.actions
+    ]
     for i, action in enumerate(actions[1:], 1):
-        parts = tuple(
-            (m, code.actions.index(action))
-            for m, code in enumerate(codes)
-            if action in code.actions
-        )
+        users = [(m, code) for m, code in enumerate(codes) if action in code.actions]
+        parts = tuple((m, code.actions.index(action)) for m, code in users)
         found.append(_Column(i, -1, parts))
     return found

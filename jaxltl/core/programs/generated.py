@@ -6,8 +6,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from jaxltl.core.language.expressions import SCALAR, Expression
-from jaxltl.core.language.syntax import Command, Module
+from jaxltl.core.language.syntax import Command, Module, Variable
 from jaxltl.core.programs.layout import Layout
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
 
@@ -36,17 +39,14 @@ def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
     Raises:
       Unsupported: the module is too large or too deep for Python's compiler.
     """
-    expressions = [e for c in module.commands for e in c.expressions]
-    if sum(e.size for e in expressions) > _MAX_SIZE:
+    if sum(e.size for c in module.commands for e in c.expressions) > _MAX_SIZE:
         raise Unsupported
-    names = sorted(module.names)
-    local = {name: f"v{i}" for i, name in enumerate(names)}
+    local = {name: f"v{i}" for i, name in enumerate(sorted(module.names))}
     lines = ["def local(s):"]
-    for name in names:
+    for name, code in local.items():
         field = layout.fields[name]
         v, shift = field.variable, field.shift + 64 * field.word
-        low = f" + {v.low}" if v.low else ""
-        lines.append(f"    {local[name]} = ((s >> {shift}) & {(1 << v.bits) - 1}){low}")
+        lines.append(f"    {code} = ((s >> {shift}) & {(1 << v.bits) - 1}) + {v.low}")
     lines += [f"    a{i} = []" for i in range(len(actions))]
     for c in module.commands:
         lines.append(f"    if {_source(c.guard, local)}:")
@@ -63,31 +63,34 @@ def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
 
 def _command(c: Command, column: int, layout: Layout, local: dict[str, str]) -> list[str]:
     """Lines that append the updates of an enabled command."""
-    lines, pairs, constant = [], [], True
+    lines, pairs = [], []
     for k, o in enumerate(c.outcomes):
-        change = []
+        change = ["0"]
         for i, a in enumerate(o.assignments):
             field = layout.fields[a.variable]
-            v, shift = field.variable, field.shift + 64 * field.word
-            new = f"n{k}_{i}"
+            v, new = field.variable, f"n{k}_{i}"
             lines.append(f"{new} = {_source(a.expression, local)}")
-            if v.type == "int" and not _in_range(a.expression, v.low, v.high):
+            if may_leave(v, a.expression):
                 lines.append(f"if {new} < {v.low} or {new} > {v.high}: raise Unsupported")
-            difference = f"{new} - {local[a.variable]}"
-            change.append(f"(({difference}) << {shift})" if shift else f"({difference})")
-        constant = constant and o.probability.is_literal
-        pairs.append(f"({' + '.join(change) or '0'}, {_source(o.probability, local)})")
+            change.append(f"(({new} - {local[a.variable]}) << {field.shift + 64 * field.word})")
+        pairs.append(f"({' + '.join(change)}, {_source(o.probability, local)})")
     updates = f"({', '.join(pairs)},)"
-    values = [o.probability.value for o in c.outcomes]
-    if constant:
-        _check([(0, float(x)) for x in values if x is not None and not isinstance(x, str)])
-        if all(values):
-            return [*lines, f"a{column}.append({updates})"]
-    return [*lines, f"a{column}.append(check({updates}))"]
+    if fixed_probabilities(c) is None:
+        updates = f"check({updates})"
+    return [*lines, f"a{column}.append({updates})"]
 
 
-def _in_range(e: Expression, low: int, high: int) -> bool:
-    return e.is_literal and isinstance(e.value, int) and low <= e.value <= high
+def fixed_probabilities(c: Command) -> NDArray[np.float64] | None:
+    """The probabilities of a command, if they are positive literals with the sum one."""
+    values = [o.probability.value for o in c.outcomes if o.probability.is_literal]
+    found = np.array(values, np.float64)
+    valid = found.size == len(c.outcomes) and (found > 0).all()
+    return found if valid and abs(found.sum() - 1) <= ROW_SUM_TOLERANCE else None
+
+
+def may_leave(v: Variable, e: Expression) -> bool:
+    """False for values that are in the range of a variable."""
+    return v.type == "int" and not (isinstance(e.value, int) and v.low <= e.value <= v.high)
 
 
 def _check(updates: Any) -> Updates:
@@ -103,11 +106,7 @@ def _source(e: Expression, local: dict[str, str]) -> str:
     if e.operator == "literal":
         if isinstance(e.value, float) and not math.isfinite(e.value):
             raise Unsupported
-        return (
-            f"({e.value!r})"
-            if not isinstance(e.value, bool) and str(e.value)[0] == "-"
-            else repr(e.value)
-        )
+        return f"({e.value!r})"
     if e.operator == "name":
         return local[str(e.value)]
     parts = [_source(x, local) for x in e.operands]
@@ -115,10 +114,8 @@ def _source(e: Expression, local: dict[str, str]) -> str:
         return f"({_INFIX[e.operator].join(parts)})"
     if e.operator == "?:":
         return f"({parts[1]} if {parts[0]} else {parts[2]})"
-    if e.operator == "!":
-        return f"(not {parts[0]})"
-    if e.operator == "neg":
-        return f"(-{parts[0]})"
+    if e.operator in ("!", "neg"):
+        return f"({'not ' if e.operator == '!' else '-'}{parts[0]})"
     if e.operator in ("min", "max") and len(parts) > 1:
         return f"{e.operator}({', '.join(parts)})"
     return f"apply[{e.operator!r}]({', '.join(parts)})"

@@ -17,36 +17,28 @@ _CANDIDATES = 2**24  # partial assignments that are held at once
 
 
 def initial_states(program: Program, layout: Layout, max_states: int) -> Words:
-    """The initial states as packed words: one, or those that satisfy the ``init`` block.
+    """The initial states as packed words; errors as of :func:`initial_columns`."""
+    return layout.packed(*initial_columns(program, max_states))
 
-    Variables are assigned one after the other, and each conjunct of the condition is evaluated as
-    soon as its variables are.
+
+def initial_columns(program: Program, max_states: int) -> tuple[dict[str, Integers], int]:
+    """Values of the variables in the initial states, and the number of these.
+
+    There is one, or those that satisfy the ``init`` block: variables are assigned one after the
+    other, and each conjunct of the condition is evaluated as soon as its variables are.
 
     Raises:
-      ValueError: no state satisfies the condition, or too many do.
+      LanguageError: no state satisfies the condition, or too many do.
     """
     if program.initial is None:
-        return layout.packed({v.name: np.array([v.initial]) for v in program.variables}, 1)
-    try:
-        columns, size = _assignments(program, max_states)
-    except LanguageError as error:
-        raise program.source.located(error) from None
-    return layout.packed(columns, size)
-
-
-def _assignments(program: Program, max_states: int) -> tuple[dict[str, Integers], int]:
-    assert program.initial is not None
-    parts = [(names_in(e), compile_expressions([e])) for e in conjuncts(program.initial)]
-    types = program.types
-    columns: dict[str, Integers] = {}
-    size = 1
-    limit = min(_CANDIDATES, max(max_states, 2**16))
-    for _, condition in [p for p in parts if not p[0]]:
-        if not condition({})[0]:
-            size = 0
-    todo = [p for p in parts if p[0]]
+        return {v.name: np.array([v.initial]) for v in program.variables}, 1
+    todo = [(names_in(e), compile_expressions([e])) for e in conjuncts(program.initial)]
     variables = {v.name: v for v in program.variables}
     width_of = {v.name: v.high - v.low + 1 for v in program.variables}
+    columns: dict[str, Integers] = {}
+    size = int(all(condition({})[0] for names, condition in todo if not names))
+    todo = [p for p in todo if p[0]]
+    limit = min(_CANDIDATES, max(max_states, 2**16))
     while len(columns) < len(variables):
         # Next are the variables of the conjunct that needs the fewest combinations.
         needs = [sorted(names - columns.keys()) for names, _ in todo]
@@ -63,10 +55,10 @@ def _assignments(program: Program, max_states: int) -> tuple[dict[str, Integers]
             columns = {n: x.repeat(width) for n, x in columns.items()}
             columns[name] = np.tile(np.arange(v.low, v.high + 1), size)
             size *= width
-        ready = [p for p in todo if p[0] <= columns.keys()]
+        ready = [condition for names, condition in todo if names <= columns.keys()]
         todo = [p for p in todo if not p[0] <= columns.keys()]
-        for _, condition in ready:
-            typed = {n: x != 0 if types[n] == "bool" else x for n, x in columns.items()}
+        for condition in ready:
+            typed = {n: x != 0 if variables[n].type == "bool" else x for n, x in columns.items()}
             holds = np.flatnonzero(np.broadcast_to(condition(typed)[0], (size,)))
             columns = {n: x[holds] for n, x in columns.items()}
             size = holds.size

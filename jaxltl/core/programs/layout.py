@@ -40,17 +40,10 @@ class Layout:
     def values(self, words: Words, name: str) -> NDArray[Any]:
         """Values of a variable: ``int64[N]``, or ``bool[N]``."""
         field = self.fields[name]
-        raw = words[field.word]
-        if field.shift:
-            raw = raw >> np.uint64(field.shift)
-        raw = raw & np.uint64((1 << field.variable.bits) - 1)
+        raw = (words[field.word] & np.uint64(field.mask)) >> np.uint64(field.shift)
         if field.variable.type == "bool":
-            result: NDArray[Any] = raw != 0
-            return result
-        found = raw.astype(np.int64)
-        if field.variable.low:
-            found += field.variable.low
-        return found
+            return np.asarray(raw != 0)
+        return raw.astype(np.int64) + field.variable.low
 
     def masks(self, names: Iterable[str]) -> tuple[int, ...]:
         """The bits of some variables in each word."""
@@ -64,10 +57,8 @@ class Layout:
         """Words of N states from the values of all variables."""
         words = [np.zeros(size, np.uint64) for _ in range(self.num_words)]
         for name, field in self.fields.items():
-            raw = (np.asarray(columns[name]).astype(np.int64) - field.variable.low).astype(
-                np.uint64
-            )
-            words[field.word] |= raw << np.uint64(field.shift)
+            raw = np.asarray(columns[name], np.int64) - field.variable.low
+            words[field.word] |= raw.astype(np.uint64) << np.uint64(field.shift)
         return tuple(words)
 
 
@@ -79,10 +70,9 @@ class Reader:
         self.known: dict[str, NDArray[Any]] = {}
 
     def __call__(self, name: str) -> NDArray[Any]:
-        found = self.known.get(name)
-        if found is None:
-            found = self.known[name] = self.layout.values(self.words, name)
-        return found
+        if name not in self.known:
+            self.known[name] = self.layout.values(self.words, name)
+        return self.known[name]
 
 
 def make_layout(variables: Sequence[Variable]) -> Layout:

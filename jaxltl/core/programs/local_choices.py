@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -11,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Integers
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.language.compiled import Compiled, compile_expressions
 from jaxltl.core.language.expressions import conjuncts
 from jaxltl.core.language.source import LanguageError
-from jaxltl.core.language.syntax import Assignment, Command, Module, Program
+from jaxltl.core.language.syntax import Command, Module, Program
+from jaxltl.core.programs.generated import fixed_probabilities, may_leave
 from jaxltl.core.programs.hash_table import HashTable
 from jaxltl.core.programs.layout import Field, Layout, Reader, Words
 from jaxltl.core.programs.weights import Numbers, Weight
@@ -74,10 +74,13 @@ class ModuleCode:
             self.weights.compiled(c),
             compile_expressions([a.expression for a in assigned]),
             tuple(
-                tuple((fields[a.variable], _may_leave(a, fields)) for a in o.assignments)
+                tuple(
+                    (fields[a.variable], may_leave(fields[a.variable].variable, a.expression))
+                    for a in o.assignments
+                )
                 for o in c.outcomes
             ),
-            _fixed(c) if type(self.weights) is Numbers else None,
+            fixed_probabilities(c) if type(self.weights) is Numbers else None,
         )
 
     @np.errstate(all="ignore")
@@ -87,7 +90,7 @@ class ModuleCode:
         read = Reader(self.layout, words)
         count = np.zeros(size * width, np.int32)
         enabled: list[tuple[_Code, Integers]] = []
-        met = self.conditions.evaluate(read)
+        met = self.conditions(read)
         # Most commands fail in all states by a single condition.
         possible = [np.asarray(x).any() for x in met]
         for code, guard in zip(self.codes, self.guards, strict=True):
@@ -98,13 +101,11 @@ class ModuleCode:
             if holds.size:
                 enabled.append((code, holds))
                 count[holds * width + code.column] += 1
-        first: Integers = np.cumsum(count, dtype=np.int64)
-        num_rows = int(first[-1]) if first.size else 0
-        first = first - count
+        first: Integers = np.cumsum(count, dtype=np.int64) - count
         fill = np.array(first)
-        start, widths = np.empty(num_rows, np.int64), np.empty(num_rows, np.int64)
-        changes: list[list[NDArray[np.uint64]]] = [[] for _ in words]
-        weights: list[Weight] = []
+        start, widths = np.empty((2, int(count.sum())), np.int64)
+        changes = [[np.zeros(0, np.uint64)] for _ in words]
+        weights: list[Weight] = [np.zeros((0, *self.weights.shape), self.weights.dtype)]
         end = 0
         for code, states in enabled:
             cell: Integers = states * width + code.column
@@ -116,7 +117,7 @@ class ModuleCode:
             number, change, weight = self._updates(code, part, states.size)
             start[row] = end + np.cumsum(number) - number
             widths[row] = number
-            end += weight.shape[0]
+            end += len(weight)
             weights.append(weight)
             for parts, one in zip(changes, change, strict=True):
                 parts.append(one)
@@ -125,10 +126,8 @@ class ModuleCode:
             first.reshape(size, width),
             start,
             widths,
-            tuple(np.concatenate(x) if x else np.zeros(0, np.uint64) for x in changes),
-            np.concatenate(weights)
-            if weights
-            else np.zeros((0, *self.weights.shape), self.weights.dtype),
+            tuple(map(np.concatenate, changes)),
+            np.concatenate(weights),
         )
 
     def _updates(
@@ -136,47 +135,41 @@ class ModuleCode:
     ) -> tuple[Integers, tuple[NDArray[np.uint64], ...], Weight]:
         """Number of updates of each row, and changes and weights of all, row by row."""
         outcomes = len(code.targets)
-        weights: list[Weight] = []
-        possible: list[NDArray[np.bool_]] = []
         if code.fixed is None:
             weights = self.weights.of(code.weights, read, size)
-            possible = [self.weights.possible(w) for w in weights]
+            kept = np.stack([self.weights.possible(w) for w in weights], 1)
+            table = np.stack(weights, 1)
             self._check_weights(code.command, weights, read)
-        values = iter(code.right.evaluate(read))
+        else:
+            kept = np.ones((size, outcomes), bool)
+            table = np.broadcast_to(code.fixed, (size, outcomes))
+        values = iter(code.right(read))
         change = [np.zeros((size, outcomes), np.uint64) for _ in range(self.layout.num_words)]
         for k, fields in enumerate(code.targets):
-            for field, may_leave in fields:
+            for field, checked in fields:
                 new = np.asarray(next(values), np.int64)
-                if may_leave:
-                    held = possible[k] if possible else np.True_
-                    self._check_range(code.command, field, new, held, read)
+                if checked:
+                    self._check_range(code.command, field, new, kept[:, k], read)
                 moved = (new - read(field.variable.name)).view(np.uint64)
                 change[field.word][:, k] += moved << np.uint64(field.shift)
-        flat = tuple(x.reshape(-1) for x in change)
-        if code.fixed is not None:
-            return np.full(size, outcomes), flat, np.tile(code.fixed, size)
-        table, kept = np.stack(weights, 1), np.stack(possible, 1)
-        number = kept.sum(1)
-        if number.sum() == kept.size:
-            return number, flat, table.reshape(-1, *table.shape[2:])
-        return number, tuple(x[kept] for x in change), table[kept]
+        if kept.all():
+            flat = tuple(x.reshape(-1) for x in change)
+            return np.full(size, outcomes), flat, table.reshape(-1, *table.shape[2:])
+        return kept.sum(1), tuple(x[kept] for x in change), table[kept]
 
     def _check_weights(self, command: Command, weights: list[Weight], read: Reader) -> None:
         """Raises LanguageError if some probabilities are negative or do not sum to one."""
         if self.weights.dtype is np.int64:
             return
-        ends = [self.weights.ends(w) for w in weights]
-        low, high = (sum(x[i] for x in ends) for i in (0, 1))
-        bad = ~(
-            (np.asarray(low) <= 1 + ROW_SUM_TOLERANCE) & (np.asarray(high) >= 1 - ROW_SUM_TOLERANCE)
-        )
-        for lower, upper in ends:
-            bad |= ~((lower >= 0) & (lower <= upper) & (upper <= 1 + ROW_SUM_TOLERANCE))
+        low, high = np.array([self.weights.ends(w) for w in weights]).swapaxes(0, 1)
+        least, most = 1 - ROW_SUM_TOLERANCE, 1 + ROW_SUM_TOLERANCE
+        valid = ((low >= 0) & (low <= high) & (high <= most)).all(0)
+        bad = ~(valid & (low.sum(0) <= most) & (high.sum(0) >= least))
         if bad.any():
             i = int(np.argmax(bad))
             shown = " + ".join(
-                f"{lower[i]:.9g}" if lower[i] == upper[i] else f"[{lower[i]:.9g}, {upper[i]:.9g}]"
-                for lower, upper in ends
+                f"{a:.9g}" if a == b else f"[{a:.9g}, {b:.9g}]"
+                for a, b in zip(low[:, i], high[:, i], strict=True)
             )
             raise LanguageError(
                 command.place,
@@ -185,38 +178,19 @@ class ModuleCode:
             )
 
     def _check_range(
-        self,
-        command: Command,
-        field: Field,
-        new: Integers,
-        possible: NDArray[np.bool_] | np.bool_,
-        read: Reader,
+        self, command: Command, field: Field, new: Integers, possible: Booleans, read: Reader
     ) -> None:
         """Raises LanguageError if an update that is possible leaves the range of a variable."""
         v = field.variable
         outside = ((new < v.low) | (new > v.high)) & possible
         if outside.any():
             i = int(np.argmax(outside))
-            shown = np.broadcast_to(new, read(v.name).shape)[i]
+            shown = np.broadcast_to(new, possible.shape)[i]
             raise LanguageError(
                 command.place,
                 f"{_shown(command)} sets {v.name} to {shown} in the state {state_text(read, i)}; its "
                 f"range is [{v.low}..{v.high}].",
             )
-
-
-def _may_leave(a: Assignment, fields: Mapping[str, Field]) -> bool:
-    """False for values that are in the range of a variable."""
-    v, e = fields[a.variable].variable, a.expression
-    return v.type == "int" and not (isinstance(e.value, int) and v.low <= e.value <= v.high)
-
-
-def _fixed(c: Command) -> NDArray[np.float64] | None:
-    """The probabilities of a command, if they are positive literals with the sum one."""
-    values = [o.probability.value for o in c.outcomes if o.probability.is_literal]
-    found = np.array(values, np.float64)
-    valid = found.size == len(c.outcomes) and (found > 0).all()
-    return found if valid and abs(found.sum() - 1) <= ROW_SUM_TOLERANCE else None
 
 
 def _shown(command: Command) -> str:
@@ -245,31 +219,34 @@ class LocalTable:
 
     def __init__(self, code: ModuleCode) -> None:
         self.code = code
-        self.pieces = _runs(code.support)
+        self.pieces = [
+            (w, run.start(), len(run[0]))
+            for w, mask in enumerate(code.support)
+            for run in re.finditer("1+", f"{mask:b}"[::-1])
+        ]  # runs of bits of the variables: word, first bit and number of bits
         bits = sum(width for *_, width in self.pieces)
         self.number = np.full(1 << bits, -1, np.int32) if bits <= _DENSE_BITS else None
-        self.known = HashTable(len(code.support)) if self.number is None else None
+        self.known = HashTable(len(code.support))
         self.asked = self.size = 0
         self.table: Choices | None = None
 
-    def choices(self, words: Words) -> tuple[Choices, Integers | None]:
-        """Choices, and the index of each state among those that they are of; None for all in order."""
+    def choices(self, words: Words) -> tuple[Choices, Integers]:
+        """Choices, and the index of each state among those that they are of."""
         self.asked += words[0].size
         if self.number is not None:
             index = self._dense(self.number, words)
-        elif self.known is not None and self.size < max(_TRIAL, min(_MOST, self.asked // _GAIN)):
-            index = self.known.insert(
-                tuple(w & np.uint64(m) for w, m in zip(words, self.code.support, strict=True))
-            )
+        elif self.size < max(_TRIAL, min(_MOST, self.asked // _GAIN)):
+            support = map(np.uint64, self.code.support)
+            index = self.known.insert(tuple(map(np.bitwise_and, words, support)))
         else:
-            self.known = None
-            return self.code.choices(words), None
+            return self.code.choices(words), np.arange(words[0].size)
         new = (index >= self.size).nonzero()[0]
         if new.size:
             some = np.empty(int(index.max()) + 1 - self.size, np.int64)
             some[index[new] - self.size] = new  # a state of each combination
             self.size += some.size
-            self._extend(self.code.choices(tuple(w[some] for w in words)))
+            more = self.code.choices(tuple(w[some] for w in words))
+            self.table = more if self.table is None else _joined(self.table, more)
         assert self.table is not None
         return self.table, index
 
@@ -281,30 +258,18 @@ class LocalTable:
             part = (words[word] >> np.uint64(shift)) & np.uint64((1 << width) - 1)
             key |= part.astype(np.int64) << place
             place += width
-        index: Integers = number[key]
-        new = key[index < 0]
-        if new.size:
-            new = np.unique(new)
-            number[new] = np.arange(self.size, self.size + new.size)
-            index = number[key]
-        return index
-
-    def _extend(self, more: Choices) -> None:
-        if self.table is None:
-            self.table = more
-            return
-        old = self.table
-        self.table = Choices(
-            np.concatenate([old.count, more.count]),
-            np.concatenate([old.first, more.first + old.start.size]),
-            np.concatenate([old.start, more.start + len(old.weight)]),
-            np.concatenate([old.width, more.width]),
-            tuple(np.concatenate(x) for x in zip(old.change, more.change, strict=True)),
-            np.concatenate([old.weight, more.weight]),
-        )
+        new = np.unique(key[number[key] < 0])
+        number[new] = np.arange(self.size, self.size + new.size)
+        return number[key]
 
 
-def _runs(masks: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Runs of ones in some words: word, first bit and number of bits."""
-    bits = (re.finditer("1+", f"{mask:b}"[::-1]) for mask in masks)
-    return [(w, run.start(), len(run[0])) for w, runs in enumerate(bits) for run in runs]
+def _joined(old: Choices, more: Choices) -> Choices:
+    """The choices of two sets of states."""
+    return Choices(
+        np.concatenate([old.count, more.count]),
+        np.concatenate([old.first, more.first + old.start.size]),
+        np.concatenate([old.start, more.start + len(old.weight)]),
+        np.concatenate([old.width, more.width]),
+        tuple(map(np.concatenate, zip(old.change, more.change, strict=True))),
+        np.concatenate([old.weight, more.weight]),
+    )

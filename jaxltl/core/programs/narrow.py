@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import islice, product
+from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +28,8 @@ _Choices = tuple[list[tuple[int, Updates]], dict[int, list[Updates]]]
 class Narrow:
     """States that were expanded one by one, and their choices; lists of Python's numbers."""
 
-    known: dict[int, int]
-    keys: list[int]
-    done: int = 0  # states that are expanded
-    row_count: list[int] = field(default_factory=list)
+    known: dict[int, int]  # the number of each state, in order
+    row_count: list[int] = field(default_factory=list)  # of states that are expanded
     column: list[int] = field(default_factory=list)
     entry_count: list[int] = field(default_factory=list)
     successor: list[int] = field(default_factory=list)
@@ -38,7 +38,7 @@ class Narrow:
     def words(self, layout: Layout) -> Words:
         """The states as packed words."""
         return tuple(
-            np.array([k >> (64 * w) & _WORD for k in self.keys], np.uint64)
+            np.array([k >> (64 * w) & _WORD for k in self.known], np.uint64)
             for w in range(layout.num_words)
         )
 
@@ -62,7 +62,7 @@ def search_narrow(
     keys = [0] * initial[0].size
     for w, word in enumerate(initial):
         keys = [k | x << (64 * w) for k, x in zip(keys, word.tolist(), strict=True)]
-    found = Narrow({k: i for i, k in enumerate(keys)}, keys)
+    found = Narrow({k: i for i, k in enumerate(keys)})
     try:
         modules = [
             _Module(generate(m, code.actions, layout), i, code, parts)
@@ -70,16 +70,23 @@ def search_narrow(
         ]
     except Unsupported:
         return found
-    level = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
-    while found.done < len(keys) <= max_states and len(keys) - found.done < level:
-        marks = [len(x) for x in (keys, found.row_count, found.column, found.successor)]
+    most = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
+    level = keys
+    while 0 < len(level) < most and len(found.known) <= max_states:
+        size = len(found.known)
+        lists: tuple[list[Any], ...]
+        lists = (found.row_count, found.column, found.entry_count, found.successor, found.weight)
+        marks = [len(x) for x in lists]
         try:
-            for key in keys[found.done : marks[0]]:
+            for key in level:
                 _expand(key, modules, parts, found)
-            found.done = marks[0]
         except (Unsupported, ArithmeticError, ValueError):
-            _undo(found, marks)
+            for key in list(islice(found.known, size, None)):
+                del found.known[key]
+            for items, mark in zip(lists, marks, strict=True):
+                del items[mark:]
             break
+        level = list(islice(reversed(found.known), len(found.known) - size))[::-1]
     return found
 
 
@@ -96,12 +103,13 @@ class _Module:
         self.local = local
         self.mask = sum(m << (64 * w) for w, m in enumerate(code.support))
         self.known: dict[int, _Choices] = {}
-        self.alone: list[tuple[int, int]] = []  # column, and the module's own
-        self.joint: list[tuple[int, int]] = []
-        for i, part in enumerate(parts):
-            for m, c in part:
-                if m == number:
-                    (self.alone if len(part) == 1 else self.joint).append((i, c))
+        mine = [
+            (i, dict(part)[number], len(part))
+            for i, part in enumerate(parts)
+            if number in dict(part)
+        ]
+        self.alone = [(i, c) for i, c, size in mine if size == 1]  # column, and the module's own
+        self.joint = [(i, c) for i, c, size in mine if size > 1]
 
     def choices(self, key: int) -> _Choices:
         found = self.known.get(key & self.mask)
@@ -122,17 +130,12 @@ def _expand(
     for m, (own, joint) in enumerate(local):
         for column, updates in own:
             _add(key, column, updates, found)
-        for column, rows in joint.items():
-            first, *others = parts[column]
-            if first[0] != m:
+        for column in joint:
+            if parts[column][0][0] != m:
                 continue
-            together = [rows]
-            for other, _ in others:
-                more = local[other][1].get(column)
-                if more is None:
-                    break
-                together.append(more)
-            else:
+            others = [local[other][1].get(column) for other, _ in parts[column]]
+            together = [rows for rows in others if rows is not None]
+            if len(together) == len(others):
                 for updates in _joint(together):
                     _add(key, column, updates, found)
     found.row_count.append(len(found.column) - before)
@@ -140,10 +143,7 @@ def _expand(
 
 def _joint(together: list[list[Updates]]) -> list[Updates]:
     """The joint updates of every combination of commands."""
-    size = 1
-    for rows in together:
-        size *= sum(map(len, rows))
-    if size > _MAX_UPDATES:
+    if prod(sum(map(len, rows)) for rows in together) > _MAX_UPDATES:
         raise Unsupported
     found = together[0]
     for rows in together[1:]:
@@ -157,21 +157,7 @@ def _joint(together: list[list[Updates]]) -> list[Updates]:
 def _add(key: int, column: int, updates: Updates, found: Narrow) -> None:
     known = found.known
     for change, probability in updates:
-        target = key + change
-        number = known.get(target)
-        if number is None:
-            number = known[target] = len(found.keys)
-            found.keys.append(target)
-        found.successor.append(number)
+        found.successor.append(known.setdefault(key + change, len(known)))
         found.weight.append(probability)
     found.column.append(column)
     found.entry_count.append(len(updates))
-
-
-def _undo(found: Narrow, marks: list[int]) -> None:
-    """Removes the choices and successors of a level."""
-    size, states, rows, entries = marks
-    for key in found.keys[size:]:
-        del found.known[key]
-    del found.keys[size:], found.row_count[states:], found.column[rows:], found.entry_count[rows:]
-    del found.successor[entries:], found.weight[entries:]

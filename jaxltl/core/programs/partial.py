@@ -19,7 +19,6 @@ from jaxltl.core.logic.labels import is_boolean, require_known, satisfying
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
 from jaxltl.core.programs.explore import Search
@@ -149,16 +148,15 @@ def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | No
 def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
     narrow = bool((upper - lower <= tolerance).all())
     status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
-    arrays: dict[str, Array] = {
-        "value": (lower + upper) / 2,
-        "lower": lower,
-        "upper": upper,
-        "policy": np.zeros(0, np.int32),
-        "residual": np.float64(0),
-        "num_steps": np.int32(part.num_expanded),
-        "status": np.int32(Status.CONVERGED if narrow else status),
-    }
-    solution = Solution(**arrays)
+    solution = Solution(
+        value=(lower + upper) / 2,
+        policy=np.zeros(0, np.int32),
+        lower=lower,
+        upper=upper,
+        residual=np.float64(0),
+        num_steps=np.int32(part.num_expanded),
+        status=np.int32(Status.CONVERGED if narrow else status),
+    )
     if part.event.complement:
         solution = complement_event(solution)
     method = f"partial exploration of {part.num_states} states, {part.num_expanded} expanded"
@@ -169,29 +167,28 @@ def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance
 def _event(program: Program, prop: Property) -> _Event:
     """The event of a property; ValueError for properties of another kind."""
     path, steps = prop.path, None
-    operator: str
     if prop.operator != "P" or prop.aggregate is not None or isinstance(path, Earned):
         raise _unsupported(prop)
-    direction = prop.direction
-    if direction is None and program.kind == "mdp":
+    if prop.direction is None and program.kind == "mdp":
         raise ValueError(f"{prop.text}: ask for Pmax=? or Pmin=? of an mdp.")
     if isinstance(path, Bounded):
         if path.reward is not None or path.lower or path.upper is None:
             raise _unsupported(prop)
-        steps, operator, left, right = path.upper, path.operator, path.left, path.right
+        steps, left, right = path.upper, path.left, path.right
     else:
-        operator, operands = path.operator, path.operands
-        if operator not in tuple("FGUWR") or not all(map(is_boolean, operands)):
+        if path.operator not in tuple("FGUWR") or not all(map(is_boolean, path.operands)):
             raise _unsupported(prop)
-        left, right = operands[0], operands[-1]
-    objective = direction or "max"
-    if operator in ("F", "U"):
-        return _Event(TRUE if operator == "F" else left, right, False, steps, objective)
+        left, right = path.operands[0], path.operands[-1]
+    objective = prop.direction or "max"
     stay, goal = {
+        "F": (TRUE, right),
+        "U": (left, right),
         "G": (TRUE, ~right),
         "W": (~right, ~left & ~right),
         "R": (TRUE if left == FALSE else ~left, ~right),
-    }[operator]
+    }[path.operator]
+    if path.operator in ("F", "U"):
+        return _Event(stay, goal, False, steps, objective)
     return _Event(stay, goal, True, steps, "min" if objective == "max" else "max")
 
 
@@ -230,12 +227,12 @@ class _Conditions:
 
     def holds(self, read: Reader, size: int, initial: bool) -> list[Booleans]:
         """The truth ``bool[N]`` of each formula in N states."""
-        columns = np.zeros((size, len(self.names)), bool)
+        columns = np.full((size, len(self.names)), initial)
         for i, name in enumerate(self.names):
             if name in self.comparisons:
                 columns[:, i] = self.comparisons[name].holds({v: read(v) for v in self.variables})
-            else:
-                columns[:, i] = self.labels[name](read)[0] if name in self.labels else initial
+            elif name in self.labels:
+                columns[:, i] = self.labels[name](read)[0]
         return [satisfying(columns, self.names, f, self.text) for f in self.formulas]
 
 
@@ -278,11 +275,7 @@ class _Part:
     @property
     def frontier(self) -> Booleans:
         """States that are not expanded and do not decide the event."""
-        return self.frontier_of(slice(self.size))
-
-    def frontier_of(self, states: Integers | slice) -> Booleans:
-        """The marks of some states in :attr:`frontier`."""
-        stay, goal, expanded = self.truths[:, states]
+        stay, goal, expanded = self.truths[:, : self.size]
         found: Booleans = stay & ~goal & ~expanded
         return found
 
@@ -315,7 +308,8 @@ class _Part:
             if self.program.kind == "mdp":
                 states = np.flatnonzero(self.frontier)
             else:
-                inner = self.frontier_of(reached) & (self.weight[reached] >= self.least)
+                stay, goal, expanded = self.truths[:, reached]
+                inner = stay & ~goal & ~expanded & (self.weight[reached] >= self.least)
                 states = np.unique(reached[inner])
 
     def _add(self, weight: float) -> None:
@@ -336,7 +330,7 @@ class _Part:
         begin = {name: len(parts) for name, parts in output.items()}
         self.search.expand(tuple(k[states] for k in self.search.known.keys))
         rows, entries, successor, probability = (
-            np.concatenate(output[name][begin[name] :] or [np.zeros(0, np.int64)])
+            np.concatenate([output[name][0], *output[name][begin[name] :]])
             for name in ("row_count", "entry_count", "successor", "weight")
         )
         self.order.append(states)
@@ -384,18 +378,16 @@ class _Part:
         place[self.states] = np.arange(size, dtype=np.int32)
         rows = np.append(found.row_count, np.zeros(size - done.size, np.int32))
         found = replace(found, row_count=rows, successor=place[found.successor])
-        found, _ = with_loops(found, Numbers(), np.flatnonzero(found.row_count == 0), {})
+        found = with_loops(found)
         if self.program.kind == "dtmc" and found.action.size > size:
-            found, _ = as_chain(found, Numbers(), {})
-        initial = np.zeros(size)
-        initial[: self.num_initial] = 1 / self.num_initial
+            found = as_chain(found, Numbers())
         truths = (*self.truths[:2, :size], self.frontier)
         self.model = make_sparse(
             offsets_from_counts(found.row_count),
             offsets_from_counts(found.entry_count),
             found.successor,
             found.weight,
-            initial=initial,
+            initial=found.initial,
             label=np.stack([x[self.states] for x in truths], 1),
             propositions=("stay", "goal", "frontier"),
         )

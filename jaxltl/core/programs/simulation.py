@@ -5,25 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
-from types import ModuleType
+from functools import reduce
+from itertools import accumulate
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from numpy.typing import NDArray
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.language.compiled import Compiled, compile_expressions
 from jaxltl.core.language.expressions import FALSE, Expression
 from jaxltl.core.language.source import LanguageError
-from jaxltl.core.language.syntax import Command, Program, Variable
+from jaxltl.core.language.syntax import Command, Program, RewardItem, Variable
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.programs.choices import Choice, Group, list_choices
-from jaxltl.core.programs.initial import initial_states
-from jaxltl.core.programs.layout import make_layout
+from jaxltl.core.programs.initial import initial_columns
 
 World = dict[str, jax.Array]  # int32[] or bool[] of each variable
 _SUM_TOLERANCE = 1e-4  # of probabilities in single precision
@@ -81,11 +79,12 @@ def program_environment(
         _require_name(program, "label", name, {*program.labels, "deadlock"})
     try:
         _check_integers(program)
-        items = () if reward is None else rewards[reward]
-        made = _simulation(program, [(i.action, i.guard, i.value) for i in items], names)
-        columns, size = _initial_columns(program)
+        made = _simulation(program, () if reward is None else rewards[reward], names)
+        values, size = initial_columns(program, _MAX_STARTS)
     except LanguageError as error:
         raise program.source.located(error) from None
+    types = {v.name: bool if v.type == "bool" else np.int32 for v in program.variables}
+    columns = {name: x.astype(types[name]) for name, x in values.items()}
     chain = program.kind == "dtmc"
     variables = len(program.variables)
     return make_environment(
@@ -152,8 +151,7 @@ def _require_simulated(program: Program) -> None:
 
 
 def _reset(columns: World, key: chex.PRNGKey) -> World:
-    size = len(next(iter(columns.values())))
-    index = jax.random.randint(key, (), 0, size) if size > 1 else 0
+    index = jax.random.randint(key, (), 0, len(next(iter(columns.values()))))
     return {name: jnp.asarray(x)[index] for name, x in columns.items()}
 
 
@@ -176,7 +174,7 @@ class _Simulation:
     deadlock: int  # the label of states without choices, or -1
 
     def step(self, world: World, action: jax.Array, key: chex.PRNGKey) -> Timestep:
-        values = map(jnp.asarray, self.updates(world, _arrays()))
+        values = map(jnp.asarray, self.updates(world, jnp))
         guards = self._by_group(values)
         mask = self._available(guards)
         # The last draw chooses among the enabled commands of a chain.
@@ -189,15 +187,19 @@ class _Simulation:
             picked = _any([chosen[k] for k, c in enumerate(self.choices) if i in c.groups])
             for command, guard in zip(group.commands, enabled, strict=True):
                 active = picked & guard
-                invalid = invalid | active & _update(
-                    command, active, uniform[group.draw], values, new
-                )
+                invalid |= active & _update(command, active, uniform[group.draw], values, new)
         for v in self.variables:
             if v.type == "int":
                 inside = jnp.clip(new[v.name], v.low, v.high)
-                invalid = invalid | (inside != new[v.name])
+                invalid |= inside != new[v.name]
                 new[v.name] = inside
-        earned = self._reward(values, chosen)
+        earned = jnp.zeros((), jnp.result_type(float))
+        for action_name in self.earned:
+            guard, value = next(values), next(values)
+            if action_name is not None:
+                marks = zip(self.choices, chosen, strict=True)
+                guard = guard & _any([m for c, m in marks if c.action == action_name])
+            earned = earned + jnp.where(guard, value, 0)
         reward = jnp.where(invalid, jnp.nan, earned).astype(jnp.result_type(float))
         return Timestep(new, reward, terminated=jnp.bool_(False))
 
@@ -205,9 +207,9 @@ class _Simulation:
         return [[next(values) for _ in g.commands] for g in self.groups]
 
     def _available(self, guards: list[list[jax.Array]]) -> list[jax.Array]:
-        """Enabledness of each choice."""
+        """Enabledness of each choice, from the guards by group."""
         of_group = [_any(some) for some in guards]
-        return [_all([of_group[g] for g in c.groups]) for c in self.choices]
+        return [reduce(jnp.logical_and, [of_group[g] for g in c.groups]) for c in self.choices]
 
     def _chosen(
         self, mask: list[jax.Array], action: jax.Array, uniform: jax.Array
@@ -215,35 +217,21 @@ class _Simulation:
         """Marks of the chosen one among the available choices."""
         if not self.chain:
             return [m & (action == k) for k, m in enumerate(mask)]
-        if len(mask) == 1:
-            return mask
-        count = reduce(jnp.add, [m.astype(jnp.int32) for m in mask])
-        number = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
-        found, before = [], jnp.int32(0)
-        for m in mask:
-            found.append(m & (before == number))
-            before = before + m
-        return found
+        before = jnp.cumsum(jnp.stack(mask), dtype=jnp.int32)
+        number = jnp.minimum((uniform * before[-1]).astype(jnp.int32), before[-1] - 1)
+        return [m & (before[k] - 1 == number) for k, m in enumerate(mask)]
 
-    def _reward(self, values: Iterator[jax.Array], chosen: list[jax.Array]) -> jax.Array:
-        total = jnp.zeros((), jnp.result_type(float))
-        for action in self.earned:
-            guard, value = next(values), next(values)
-            if action is not None:
-                marks = zip(self.choices, chosen, strict=True)
-                guard = guard & _any([m for c, m in marks if c.action == action])
-            total = total + jnp.where(guard, value, 0)
-        return total
+    def _enabled(self, world: World) -> list[jax.Array]:
+        return self._available(self._by_group(map(jnp.asarray, self.guards(world, jnp))))
 
     def allowed(self, world: World) -> jax.Array:
-        mask = self._available(self._by_group(map(jnp.asarray, self.guards(world, _arrays()))))
+        mask = self._enabled(world)
         return jnp.stack([mask[0] | ~_any(mask), *mask[1:]])
 
     def labels(self, world: World) -> jax.Array:
-        found = [jnp.asarray(x) for x in self.conditions(world, _arrays())]
+        found = [jnp.asarray(x) for x in self.conditions(world, jnp)]
         if self.deadlock >= 0:
-            guards = self._by_group(map(jnp.asarray, self.guards(world, _arrays())))
-            found[self.deadlock] = ~_any(self._available(guards))
+            found[self.deadlock] = ~_any(self._enabled(world))
         return jnp.stack(found) if found else jnp.zeros(0, bool)
 
     def observe(self, world: World) -> jax.Array:
@@ -252,16 +240,12 @@ class _Simulation:
 
 
 def _simulation(
-    program: Program,
-    rewards: Sequence[tuple[str | None, Expression, Expression]],
-    labels: Sequence[str],
+    program: Program, rewards: Sequence[RewardItem], labels: Sequence[str]
 ) -> _Simulation:
     groups, choices = list_choices(program)
     commands = [c for g in groups for c in g.commands]
     guards = [c.guard for c in commands]
     updates = [e for c in commands for e in _command_expressions(c)]
-    earned = [e for _, guard, value in rewards for e in (guard, value)]
-    conditions = [program.labels.get(name, FALSE) for name in labels]
     implicit = "deadlock" in labels and "deadlock" not in program.labels
     return _Simulation(
         program.variables,
@@ -269,9 +253,9 @@ def _simulation(
         choices,
         program.kind == "dtmc",
         compile_expressions(guards),
-        compile_expressions([*guards, *updates, *earned]),
-        tuple(action for action, *_ in rewards),
-        compile_expressions(conditions),
+        compile_expressions([*guards, *updates, *(e for i in rewards for e in (i.guard, i.value))]),
+        tuple(i.action for i in rewards),
+        compile_expressions([program.labels.get(name, FALSE) for name in labels]),
         labels.index("deadlock") if implicit else -1,
     )
 
@@ -302,16 +286,16 @@ def _update(
 
 def _outcome_marks(weights: Sequence[jax.Array], uniform: jax.Array) -> list[jax.Array]:
     """Marks of the outcome of a uniform number; one of probability 0 never has it."""
-    sums = [weights[0]]
-    for weight in weights[1:]:
-        sums.append(sums[-1] + weight)
+    if len(weights) == 1:
+        return [jnp.bool_(True)]
+    sums = list(accumulate(weights, jnp.add))
     scaled = uniform * sums[-1]
     # From the last one on: the first outcome that is possible and has its sum above the number, or
     # the last possible one, where rounding leaves none.
     number = jnp.asarray(-1, jnp.int32)
-    for k in range(len(weights) - 1, -1, -1):
-        number = jnp.where((weights[k] > 0) & ((scaled < sums[k]) | (number < 0)), k, number)
-    return [number == k for k in range(len(weights))] if len(weights) > 1 else [jnp.bool_(True)]
+    for k, (weight, total) in reversed(list(enumerate(zip(weights, sums, strict=True)))):
+        number = jnp.where((weight > 0) & ((scaled < total) | (number < 0)), k, number)
+    return [number == k for k in range(len(weights))]
 
 
 def _any(marks: Sequence[jax.Array]) -> jax.Array:
@@ -319,45 +303,7 @@ def _any(marks: Sequence[jax.Array]) -> jax.Array:
     return result
 
 
-def _all(marks: Sequence[jax.Array]) -> jax.Array:
-    return reduce(jnp.logical_and, marks)
-
-
-@cache
-def _arrays() -> ModuleType:
-    """The namespace of JAX arrays, where integers have quotients with exact integral parts.
-
-    XLA multiplies by the reciprocal of a constant, and floor(41 / 41) would be 0.
-    """
-    found = ModuleType("arrays")
-    found.__dict__.update(vars(jnp))
-
-    def true_divide(a: chex.Numeric, b: chex.Numeric) -> jax.Array:
-        quotient = jnp.true_divide(a, b)
-        if not jnp.issubdtype(jnp.result_type(a, b), jnp.integer):
-            return quotient
-        divisor = jnp.where(jnp.equal(b, 0), 1, b)
-        whole = jnp.floor_divide(a, divisor)
-        exact = whole + jnp.true_divide(a - whole * divisor, divisor)
-        return jnp.where(jnp.equal(b, 0), quotient, exact)
-
-    found.__dict__["true_divide"] = true_divide
-    return found
-
-
-# --- checks and initial states --------------------------------------------------------------------
-
-
-def _initial_columns(program: Program) -> tuple[dict[str, NDArray[np.generic]], int]:
-    """Values of each variable in the initial states."""
-    layout = make_layout(program.variables)
-    words = initial_states(program, layout, _MAX_STARTS)
-    size = words[0].size
-    found: dict[str, NDArray[np.generic]] = {}
-    for v in program.variables:
-        values = layout.values(words, v.name)
-        found[v.name] = values if v.type == "bool" else values.astype(np.int32)
-    return found, size
+# --- sizes of integers --------------------------------------------------------------------------------
 
 
 _Ends = tuple[float, float, bool]  # least and largest value, and True for integers

@@ -34,12 +34,11 @@ class Orbit:
         if bits > 64:
             return
         key = np.zeros((words[0].size, len(self.slots)), np.uint64)
-        parts = [(layout.fields[n], i) for i, slot in enumerate(self.slots) for n in slot]
         for name, values in self.selectors.items():
-            for i, value in enumerate(values):
-                key[:, i] = key[:, i] << np.uint64(1) | (layout.values(words, name) == value)
+            key = key << np.uint64(1) | (layout.values(words, name)[:, None] == np.array(values))
+        parts = [(layout.fields[n], i) for i, slot in enumerate(self.slots) for n in slot]
         for f, i in parts:
-            raw = words[f.word] >> np.uint64(f.shift) & np.uint64((1 << f.variable.bits) - 1)
+            raw = (words[f.word] & np.uint64(f.mask)) >> np.uint64(f.shift)
             key[:, i] = key[:, i] << np.uint64(f.variable.bits) | raw
         key.sort(axis=1)
         for f, i in reversed(parts):
@@ -176,16 +175,18 @@ class _Exchange:
         except _Asymmetric:
             return None
 
+    def _name(self, name: str) -> str:
+        return self.names.get(name, name)
+
     def _command(self, c: Command) -> str:
         outcomes = []
         for o in c.outcomes:
             changes = [
-                f"{self.names.get(a.variable, a.variable)}'={self._value(a.variable, a.expression)}"
+                f"{self._name(a.variable)}'={self._value(a.variable, a.expression)}"
                 for a in o.assignments
             ]
             outcomes.append(f"{self._expression(o.probability)}:{sorted(changes)}")
-        action = f"[{c.action}]"
-        return f"{self.names.get(action, action)} {self._expression(c.guard)} -> {sorted(outcomes)}"
+        return f"{self._name(f'[{c.action}]')} {self._expression(c.guard)} -> {sorted(outcomes)}"
 
     def _value(self, name: str, e: Expression) -> str:
         """An expression that is compared with, or assigned to, a variable."""
@@ -197,20 +198,20 @@ class _Exchange:
         return str(self.values[name].get(value, value))
 
     def _expression(self, e: Expression) -> str:
-        if (found := self.memory.get(id(e))) is not None:
-            return found
-        name = str(e.operands[0].value) if e.operands else ""
+        if id(e) not in self.memory:
+            self.memory[id(e)] = self._node(e)
+        return self.memory[id(e)]
+
+    def _node(self, e: Expression) -> str:
         if e.operator == "name":
             if e.value in self.values:
                 raise _Asymmetric
-            found = self.names.get(str(e.value), str(e.value))
-        elif e.operator in ("=", "!=") and e.operands[0].operator == "name" and name in self.values:
-            found = f"{e.operator}({sorted([name, self._value(name, e.operands[1])])})"
-        elif e.operands:
-            parts = [self._expression(x) for x in e.operands]
-            ordered = sorted(parts) if e.operator in _COMMUTATIVE else parts
-            found = f"{e.operator}({ordered})"
+            return self._name(str(e.value))
+        if not e.operands:
+            return repr(e.value)
+        name = str(e.operands[0].value)
+        if e.operator in ("=", "!=") and e.operands[0].operator == "name" and name in self.values:
+            parts = [name, self._value(name, e.operands[1])]
         else:
-            found = repr(e.value)
-        self.memory[id(e)] = found
-        return found
+            parts = [self._expression(x) for x in e.operands]
+        return f"{e.operator}({sorted(parts) if e.operator in _COMMUTATIVE else parts})"

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.language.compiled import compile_expressions
 from jaxltl.core.language.expressions import Expression, literal, names_in, substitute
 from jaxltl.core.language.syntax import Command
@@ -41,6 +42,10 @@ class Numbers:
     def product(self, left: Weight, right: Weight) -> Weight:
         """Weights of independent updates that happen together."""
         return left * right
+
+    def divided(self, weight: Weight, numbers: Integers) -> Weight:
+        """Weights divided by positive integers."""
+        return (weight.T / numbers).T
 
 
 class Intervals(Numbers):
@@ -83,29 +88,20 @@ class Functions(Numbers):
 
     def numbers(self, e: Expression, read: Reader, size: int) -> NDArray[np.int64]:
         """The number of the function that an expression is in each of N states."""
-        names = sorted(names_in(e) & read.layout.fields.keys())
+        fields = read.layout.fields
+        names = sorted(names_in(e) & fields.keys())
         if not names:
             return np.full(size, self._number(substitute(e, {})))
         table = np.stack([read(name).astype(np.int64) for name in names], 1)
         rows, inverse = np.unique(table, axis=0, return_inverse=True)
-        fields = read.layout.fields
-        found = [
-            self._number(
-                substitute(
-                    e,
-                    {
-                        n: literal(bool(v) if fields[n].variable.type == "bool" else v)
-                        for n, v in zip(names, row, strict=True)
-                    },
-                )
-            )
-            for row in rows.tolist()
-        ]
+        found = []
+        for row in rows.tolist():
+            values = {
+                n: literal(bool(v) if fields[n].variable.type == "bool" else v)
+                for n, v in zip(names, row, strict=True)
+            }
+            found.append(self._number(substitute(e, values)))
         return np.array(found, np.int64)[inverse.ravel()]
-
-    def constant(self, value: float) -> int:
-        """The number of a constant function."""
-        return self._number(literal(value))
 
     def _number(self, e: Expression) -> int:
         if e.is_literal and e.value in (0, 1):
@@ -125,3 +121,7 @@ class Functions(Numbers):
                 self.products[a, b] = one
             found.append(self.products[a, b])
         return np.array(found, np.int64)[inverse.ravel()]
+
+    def divided(self, weight: Weight, numbers: Integers) -> Weight:
+        shares = [self._number(literal(1 / n)) for n in range(1, int(numbers.max()) + 1)]
+        return self.product(weight, np.array(shares)[numbers - 1])

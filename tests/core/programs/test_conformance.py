@@ -188,7 +188,7 @@ M = "module m x : [0..1]; [] true -> true; endmodule"
     ("text", "place", "says"),
     [
         ("mdp " + M.replace("[0..1]", "[0..1] init 1") + " init x=0 endinit", 14, "init block"),
-        ('mdp rewards "a" true : 1; endrewards rewards "a" endrewards ' + M, 5, "two reward str"),
+        ('mdp rewards "a" true : 1; endrewards rewards "a" endrewards ' + M, 38, "two reward str"),
         ('mdp label "a" = "b"; label "b" = !"a"; ' + M, 17, 'the label "a" depends on itself'),
         ("mdp " + M.replace("true ->", '"a" ->'), 29, '"a" is not declared'),
         ("dtmc const double p; " + M.replace("-> true", "-> p:true + 1-p:true"), 19, "no value"),
