@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, combinations, product
 
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.table import Table, quotient
 from jaxltl.core.logic.ltl import Formula
 
 Word = Sequence[frozenset[str]]
@@ -92,6 +94,20 @@ def residual_count(formula: Formula, letters: Word, stem: int, tail: int, cycle:
             tuple(holds_by_definition(formula, (*u, *v), w) for v, w in continuations)
             for u in words(letters, 0, stem)
         }
+    )
+
+
+def minimize(automaton: Automaton) -> Automaton:
+    """The minimal automaton with the same priorities along every run."""
+    table = Table(automaton.delta, automaton.priority, int(automaton.initial))
+    small, base = quotient(table)
+    names = automaton.state_names
+    return replace(
+        automaton,
+        delta=small.delta,
+        priority=small.priority,
+        initial=small.initial,
+        state_names=tuple(names[q] for q in base) if names else (),
     )
 
 

@@ -4,27 +4,34 @@ The alternating cycle decomposition (Casares, Colcombet & Fijalkow 2021, "Optima
 of games and automata using Muller conditions") of a strongly connected part is a tree of its
 cycles: the root holds all transitions, and the children of a node are its maximal strongly
 connected parts with the opposite verdict. No parity automaton on top of the same states has
-fewer states or priorities than the one that it gives.
+fewer states or priorities than the one that it gives. For one state on which any set of colors can
+recur, it is the Zielonka tree (Zielonka 1998).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import reduce
+from collections.abc import Callable, Iterator
+from functools import cache, partial, reduce
 from operator import or_
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
+from jaxltl.core.automata.table import (
+    Table,
+    components,
+    distinct_columns,
+    explore,
+    too_many_states,
+)
 from jaxltl.core.sparse.graph.components import strong_components
 
 Condition: TypeAlias = tuple[Any, ...]  # see `holds`
+Part: TypeAlias = frozenset[int]  # of the transitions or colors that can recur together
 
 MAX_COLORS = 62  # the bits of a set of colors
-MAX_SUBSETS = 20_000  # parts examined in one decomposition before it is given up
+MAX_SUBSETS = 20_000  # parts examined for one tree before it is given up
 
 
 def holds(condition: Condition, colors: int) -> bool:
@@ -78,15 +85,134 @@ def residual(condition: Condition, absent: int, present: int) -> Condition:
     return (condition[0], *parts)
 
 
-def parity_condition(num_priorities: int) -> Condition:
-    """The condition that the least color seen infinitely often is even."""
+def parity_condition(num_priorities: int, first: int = 0) -> Condition:
+    """The condition that the least priority seen infinitely often is even; 0 has color `first`."""
     condition: Condition = ("false",)
-    for color in reversed(range(num_priorities)):
-        if color % 2 == 0:
-            condition = ("or", ("inf", color), condition)
-        else:
-            condition = ("and", ("fin", color), condition)
+    for priority in reversed(range(num_priorities)):
+        atom = "fin" if priority % 2 else "inf"
+        condition = ("and" if priority % 2 else "or", (atom, first + priority), condition)
     return condition
+
+
+def _members(colors: int) -> list[int]:
+    return [color for color in range(colors.bit_length()) if colors >> color & 1]
+
+
+# ---------------------------------------------------------------------------------------------
+# Trees of sets that can recur
+# ---------------------------------------------------------------------------------------------
+
+
+class CycleTree:
+    """Sets of transitions or colors: the children of a node are its maximal parts of other verdict.
+
+    `colors_of` gives the colors of a part, and `without` its largest parts that lack a color.
+    """
+
+    def __init__(
+        self,
+        whole: Part,
+        condition: Condition,
+        colors_of: Callable[[Part], int],
+        without: Callable[[Part, int], list[Part]],
+        max_states: int,
+    ) -> None:
+        self._condition, self._without, self._examined = condition, without, 0
+        self._colors_of = cache(colors_of)
+        self._holds = cache(partial(holds, condition))
+        self.accepting = self._holds(colors_of(whole))
+        self.labels, self.parent, self.depth = [whole], [0], [0]
+        self.children: list[list[int]] = []
+        maximal = cache(self._maximal)  # a part may stand below several others
+        for node, label in enumerate(self.labels):  # grows
+            below = maximal(label)
+            self.children.append([len(self.labels) + i for i in range(len(below))])
+            self.labels += below
+            self.parent += [node] * len(below)
+            self.depth += [self.depth[node] + 1] * len(below)
+            if len(self.labels) > 2 * max_states:
+                raise too_many_states(max_states, "to_parity")
+
+    def _maximal(self, part: Part) -> list[Part]:
+        accepting = self._holds(self._colors_of(part))
+        found: list[Part] = []
+        seen, waiting = {part}, [part]
+        while waiting:
+            whole = waiting.pop()
+            for color in self._to_remove(self._colors_of(whole), accepting):
+                for smaller in self._without(whole, color):
+                    if smaller in seen:
+                        continue
+                    seen.add(smaller)
+                    same = self._holds(self._colors_of(smaller)) == accepting
+                    (waiting if same else found).append(smaller)
+                    self._examined += 1
+                    if self._examined > MAX_SUBSETS:
+                        raise ValueError(
+                            f"to_parity: more than {MAX_SUBSETS} sets of transitions or colors to "
+                            "examine. The acceptance condition has too many independent parts."
+                        )
+        return [one for one in found if not any(one < other for other in found)]
+
+    def _to_remove(self, colors: int, accepting: bool) -> list[int]:
+        """The colors one of which has to go; one alone if no smaller part can keep it.
+
+        A rejecting part of an accepting one lacks a color of an `inf` condition, an accepting part
+        of a rejecting one a color of a `fin` condition.
+        """
+        inf, fin = polarities(residual(self._condition, ~colors, 0))
+        choices, others = (inf, fin) if accepting else (fin, inf)
+        if not inf & fin:
+            for color in _members(choices):
+                if self._holds(1 << color | others) == accepting:
+                    return [color]
+        return _members(choices)
+
+    def lowest(self, node: int, admits: Callable[[int], bool]) -> int:
+        """The first lowest admitted node below a node."""
+        while admitted := [child for child in self.children[node] if admits(child)]:
+            node = admitted[0]
+        return node
+
+    def turn(
+        self, leaf: int, contains: Callable[[int], bool], admits: Callable[[int], bool]
+    ) -> tuple[int, int]:
+        """The next leaf, and the priority: that of the lowest ancestor that contains a transition."""
+        node, came_from = leaf, leaf
+        while not contains(node):
+            node, came_from = self.parent[node], node
+        priority = self.depth[node] + (not self.accepting)
+        siblings = self.children[node]
+        first = siblings.index(came_from) + 1 if came_from in siblings else 0
+        for child in siblings[first:] + siblings[:first]:
+            if admits(child):
+                return self.lowest(child, admits), priority
+        return node, priority
+
+
+class ZielonkaTree(CycleTree):
+    """The tree of the colors of a condition; `missing[n]` are the colors that end node n's turn."""
+
+    def __init__(self, condition: Condition, max_states: int) -> None:
+        self.colors = reduce(or_, polarities(condition))
+
+        def colors_of(part: Part) -> int:
+            return sum(1 << color for color in part)
+
+        def without(part: Part, color: int) -> list[Part]:
+            return [part - {color}]
+
+        whole = frozenset(_members(self.colors))
+        super().__init__(whole, condition, colors_of, without, max_states)
+        self.missing = [self.colors & ~colors_of(label) for label in self.labels]
+
+    def leaf_below(self, node: int) -> int:
+        """The first leaf below a node."""
+        return self.lowest(node, lambda _: True)
+
+    def step(self, leaf: int, colors: int) -> tuple[int, int]:
+        """The next leaf and the priority of a transition with some colors."""
+        return self.turn(leaf, lambda node: not colors & self.missing[node], lambda _: True)
 
 
 def to_parity(
@@ -96,333 +222,68 @@ def to_parity(
     condition: Condition,
     max_states: int = 1_000_000,
 ) -> tuple[Integers, Integers, int, Integers]:
-    """A deterministic min-even parity automaton with the language of an Emerson-Lei one."""
-    inf, fin = polarities(condition)
-    if (inf | fin) >> MAX_COLORS:
+    """A deterministic min-even parity automaton with the language of an Emerson-Lei one.
+
+    Its states are pairs of a state and a lowest node of its component's tree that holds it.
+    """
+    used = reduce(or_, polarities(condition))
+    if used >> MAX_COLORS:
         raise ValueError(
-            f"to_parity: color {(inf | fin).bit_length() - 1} is in the condition. "
+            f"to_parity: color {used.bit_length() - 1} is in the condition. "
             f"Number at most {MAX_COLORS} colors from 0."
         )
-    columns, inverse = _distinct_columns(delta, colors)
-    few_delta, few_colors = delta[:, columns], colors[:, columns]
-    component = strong_components(
-        np.repeat(np.arange(len(delta)), len(columns)), few_delta.ravel(), len(delta)
-    )
-    memo: dict[int, bool] = {}
+    columns, place = distinct_columns(delta, colors)
+    delta, colors = delta[:, columns], colors[:, columns]
+    component = components(Table(delta, colors, initial))
+    # Transitions with the same ends and colors are one to the trees.
+    _, color = np.unique(colors, return_inverse=True)
+    ends = np.arange(len(delta))[:, None] * len(delta) + delta
+    code = ends.ravel() * (color.max() + 1) + color.ravel()
+    _, first, edge = np.unique(code, return_index=True, return_inverse=True)
+    source, target, mask = first // len(columns), delta.ravel()[first], colors.ravel()[first]
+    inside = component[source] == component[target]
 
-    def verdict(mask: int) -> bool:
-        if mask not in memo:
-            memo[mask] = holds(condition, mask)
-        return memo[mask]
+    def colors_of(part: Part) -> int:
+        return int(np.bitwise_or.reduce(mask[list(part)])) if part else 0
 
-    trees: dict[int, _Tree] = {}
-    for c in np.unique(component[reached_from(few_delta, initial)]).tolist():
-        trees[c] = _tree(few_delta, few_colors, component, c, (verdict, inf, fin), max_states)
-    new_delta, priority, base = _unfold(few_delta, component, trees, initial, max_states)
-    return new_delta[:, inverse], priority[:, inverse], 0, base
+    def without(part: Part, color: int) -> list[Part]:
+        kept = np.array([e for e in sorted(part) if not mask[e] >> color & 1], int)
+        states, numbers = np.unique([source[kept], target[kept]], return_inverse=True)
+        begin, end = numbers.reshape(2, -1)
+        label = strong_components(begin, end, len(states))
+        cyclic = label[begin] == label[end]
+        kept, label = kept[cyclic], label[begin[cyclic]]
+        return [frozenset(kept[label == each].tolist()) for each in np.unique(label)]
 
+    @cache
+    def tree_of(number: int) -> tuple[CycleTree, list[frozenset[int]]]:
+        """The tree of a component, and the states of its nodes."""
+        whole = frozenset(np.flatnonzero(inside & (component[source] == number)).tolist())
+        tree = CycleTree(whole, condition, colors_of, without, max_states)
+        return tree, [frozenset(source[list(part)].tolist()) for part in tree.labels]
 
-def _distinct_columns(delta: Integers, colors: Integers) -> tuple[Integers, Integers]:
-    both = np.concatenate([delta, colors]).T
-    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    return first, inverse.ravel()
+    follow: list[list[int]] = delta.tolist()
+    edges: list[list[int]] = edge.reshape(delta.shape).tolist()
+    part_of: list[int] = component.tolist()
 
+    def entered(state: int) -> tuple[int, int]:
+        tree, states = tree_of(part_of[state])
+        return state, tree.lowest(0, lambda node: state in states[node])
 
-def reached_from(delta: Integers, initial: int) -> NDArray[np.bool_]:
-    """The states that some word leads to, bool `[Q]`."""
-    reached = np.zeros(len(delta), bool)
-    frontier = np.array([initial])
-    while frontier.size:
-        reached[frontier] = True
-        following = np.unique(delta[frontier])
-        frontier = following[~reached[following]]
-    return reached
-
-
-# ---------------------------------------------------------------------------------------------
-# The decomposition of one component
-# ---------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Tree:
-    """Nodes of a decomposition, parents first; `edges[n]` are ``q * K + k``, `states[n]` sources."""
-
-    accepting: bool = False
-    edges: list[frozenset[int]] = field(default_factory=list)
-    states: list[frozenset[int]] = field(default_factory=list)
-    parent: list[int] = field(default_factory=list)
-    depth: list[int] = field(default_factory=list)
-    children: list[list[int]] = field(default_factory=list)
-
-    def add(self, edges: frozenset[int], states: frozenset[int], parent: int) -> None:
-        if self.edges:
-            self.children[parent].append(len(self.edges))
-        self.edges.append(edges)
-        self.states.append(states)
-        self.parent.append(parent)
-        self.depth.append(self.depth[parent] + 1 if len(self.edges) > 1 else 0)
-        self.children.append([])
-
-
-def _tree(
-    delta: Integers,
-    colors: Integers,
-    component: Integers,
-    chosen: int,
-    judge: tuple[Callable[[int], bool], int, int],
-    max_nodes: int,
-) -> _Tree:
-    width = delta.shape[1]
-    members = np.flatnonzero(component == chosen)
-    inside = component[delta[members]] == chosen
-    row, column = np.nonzero(inside)
-    source = members[row]
-    target, mask = delta[source, column], colors[source, column]
-    tree = _Tree()
-    number = source * width + column
-
-    def sets(part: Integers) -> tuple[frozenset[int], frozenset[int]]:
-        return frozenset(number[part].tolist()), frozenset(source[part].tolist())
-
-    # Transitions with the same ends and colors stand together.
-    ends = np.stack([source, target, mask], axis=1)
-    _, first, twin = np.unique(ends, axis=0, return_index=True, return_inverse=True)
-    twin = twin.ravel()
-    known: dict[bytes, tuple[frozenset[int], frozenset[int]]] = {}
-    parts = _Parts(source[first], target[first], mask[first], *judge)
-    whole = np.arange(len(first))
-    tree.accepting = bool(len(source)) and judge[0](_union(mask))
-    tree.add(*sets(np.arange(len(source))), 0)
-    waiting: list[tuple[Integers, bool, int]] = []
-    if len(source):
-        waiting.append((whole, tree.accepting, 0))
-    while waiting:
-        part, accepting, node = waiting.pop()
-        for smaller in parts.maximal(part, accepting):
-            key = smaller.tobytes()
-            if key not in known:  # the same part may stand below several others
-                known[key] = sets(np.flatnonzero(np.isin(twin, smaller)))
-            waiting.append((smaller, not accepting, len(tree.edges)))
-            tree.add(*known[key], node)
-        if len(tree.edges) > 2 * max_nodes:
-            raise ValueError(
-                f"to_parity: more than {max_nodes} states. Use fewer letters, or raise the limit."
+    def step(pair: tuple[int, int]) -> Iterator[tuple[tuple[int, int], int]]:
+        state, leaf = pair
+        tree, states = tree_of(part_of[state])
+        for end, taken in zip(follow[state], edges[state], strict=True):
+            if part_of[end] != part_of[state]:
+                yield entered(end), 1
+                continue
+            node, priority = tree.turn(
+                leaf,
+                lambda node, taken=taken: taken in tree.labels[node],  # type: ignore[misc]
+                lambda node, end=end: end in states[node],  # type: ignore[misc]
             )
-    return tree
+            yield (end, node), priority
 
-
-def _union(masks: Integers) -> int:
-    return int(np.bitwise_or.reduce(masks)) if len(masks) else 0
-
-
-@dataclass
-class _Parts:
-    """Searches strongly connected sets of transitions."""
-
-    source: Integers
-    target: Integers
-    mask: Integers
-    verdict: Callable[[int], bool]
-    inf: int
-    fin: int
-    examined: int = 0
-    known: dict[bytes, list[Integers]] = field(default_factory=dict)
-
-    def maximal(self, part: Integers, accepting: bool) -> list[Integers]:
-        """The maximal strongly connected subsets with the other verdict.
-
-        A rejecting subset of an accepting part lacks a color of an `inf` condition, an accepting
-        subset of a rejecting part one of a `fin` condition. So it lies in a component of the part
-        without the transitions of that color.
-        """
-        key = part.tobytes()
-        if key not in self.known:
-            self.known[key] = self._maximal(part, accepting)
-        return self.known[key]
-
-    def _maximal(self, part: Integers, accepting: bool) -> list[Integers]:
-        removable = self.inf if accepting else self.fin
-        found: dict[bytes, Integers] = {}
-        seen: set[bytes] = set()
-        waiting = [part]
-        while waiting:
-            whole = waiting.pop()
-            colors = self._to_remove(_union(self.mask[whole]), removable, accepting)
-            for color in range(colors.bit_length()):
-                if not colors >> color & 1:
-                    continue
-                for smaller in self._components(whole[self.mask[whole] >> color & 1 == 0]):
-                    key = smaller.tobytes()
-                    if key in seen:
-                        continue
-                    seen.add(key)
-                    self.examined += 1
-                    if self.examined > MAX_SUBSETS:
-                        raise ValueError(
-                            f"to_parity: more than {MAX_SUBSETS} sets of transitions to "
-                            "examine. The acceptance condition has too many independent parts."
-                        )
-                    if self.verdict(_union(self.mask[smaller])) != accepting:
-                        found[key] = smaller
-                    else:
-                        waiting.append(smaller)
-        return _largest(list(found.values()))
-
-    def _to_remove(self, colors: int, removable: int, accepting: bool) -> int:
-        """The colors one of which has to go; one alone if no smaller part can keep it."""
-        choices = colors & removable
-        if self.inf & self.fin:
-            return choices
-        other = colors & (self.fin if accepting else self.inf)
-        for color in range(choices.bit_length()):
-            if choices >> color & 1 and self.verdict(1 << color | other) == accepting:
-                return 1 << color
-        return choices
-
-    def _components(self, part: Integers) -> list[Integers]:
-        source, target = self.source[part], self.target[part]
-        if not len(part):
-            return []
-        if (source == source[0]).all() and (target == source[0]).all():
-            return [part]
-        states, ends = np.unique(np.concatenate([source, target]), return_inverse=True)
-        ends = ends.ravel()
-        label = strong_components(ends[: len(part)], ends[len(part) :], len(states))
-        start, stop = label[ends[: len(part)]], label[ends[len(part) :]]
-        part, start = part[start == stop], start[start == stop]
-        return [part[start == c] for c in np.unique(start)]
-
-
-def _largest(parts: list[Integers]) -> list[Integers]:
-    """The parts that are in no other."""
-    kept: list[tuple[Integers, frozenset[int]]] = []
-    for part in sorted(parts, key=len, reverse=True):
-        members = frozenset(part.tolist())
-        if not any(members <= other for _, other in kept):
-            kept.append((part, members))
-    return [part for part, _ in kept]
-
-
-# ---------------------------------------------------------------------------------------------
-# The parity automaton
-# ---------------------------------------------------------------------------------------------
-
-
-def _unfold(
-    delta: Integers, component: Integers, trees: dict[int, _Tree], initial: int, max_states: int
-) -> tuple[Integers, Integers, Integers]:
-    """The automaton on pairs of a state and a lowest node of the tree that holds it."""
-    width = delta.shape[1]
-    component_of = component.tolist()
-    table = delta.tolist()
-
-    found: dict[tuple[int, int], int] = {}
-
-    def lowest(tree: _Tree, node: int, state: int) -> int:
-        key = (node, state)  # a state is in one tree only
-        if key not in found:
-            below = next((n for n in tree.children[node] if state in tree.states[n]), None)
-            found[key] = node if below is None else lowest(tree, below, state)
-        return found[key]
-
-    def step(state: int, leaf: int, k: int) -> tuple[int, int, int]:
-        target = table[state][k]
-        tree = trees[component_of[state]]
-        if component_of[target] != component_of[state]:
-            return target, lowest(trees[component_of[target]], 0, target), 1
-        edge = state * width + k
-        node, came_from = leaf, -1
-        while edge not in tree.edges[node]:
-            node, came_from = tree.parent[node], node
-        priority = tree.depth[node] + (not tree.accepting)
-        siblings = tree.children[node]
-        turn = siblings.index(came_from) + 1 if came_from >= 0 else 0
-        for child in siblings[turn:] + siblings[:turn]:
-            if target in tree.states[child]:
-                return target, lowest(tree, child, target), priority
-        return target, node, priority
-
-    start = (initial, lowest(trees[component_of[initial]], 0, initial))
-    index = {start: 0}
-    order = [start]
-    rows, priorities = [], []
-    for state, leaf in order:
-        row, marks = [], []
-        for k in range(width):
-            target, node, priority = step(state, leaf, k)
-            pair = (target, node)
-            if pair not in index:
-                index[pair] = len(order)
-                order.append(pair)
-            row.append(index[pair])
-            marks.append(priority)
-        rows.append(row)
-        priorities.append(marks)
-        if len(order) > max_states:
-            raise ValueError(
-                f"to_parity: more than {max_states} states. Use fewer letters, or raise the limit."
-            )
+    order, rows, marks = explore(entered(initial), step, max_states, "to_parity")
     base = np.array([state for state, _ in order])
-    return np.array(rows, np.int32), np.array(priorities, np.int32), base
-
-
-# ---------------------------------------------------------------------------------------------
-# The Zielonka tree
-# ---------------------------------------------------------------------------------------------
-
-
-class ZielonkaTree:
-    """The decomposition for one state on which any set of colors can recur (Zielonka 1998)."""
-
-    def __init__(self, condition: Condition, max_nodes: int) -> None:
-        inf, fin = polarities(condition)
-        self.colors = inf | fin
-        self.accepting = holds(condition, self.colors)
-        labels, self.parent, self.depth = [self.colors], [0], [0]
-        self.children: list[list[int]] = []
-        for node, label in enumerate(labels):  # grows
-            below = _largest_sets(condition, label, self.accepting == (self.depth[node] % 2 == 0))
-            self.children.append([len(labels) + i for i in range(len(below))])
-            labels += below
-            self.parent += [node] * len(below)
-            self.depth += [self.depth[node] + 1] * len(below)
-            if len(labels) > 2 * max_nodes:
-                raise ValueError(
-                    f"to_parity: more than {max_nodes} states. Use fewer letters, or raise the limit."
-                )
-        self.missing = [self.colors & ~label for label in labels]
-
-    def leaf_below(self, node: int) -> int:
-        """The first leaf below a node."""
-        while self.children[node]:
-            node = self.children[node][0]
-        return node
-
-    def step(self, leaf: int, colors: int) -> tuple[int, int]:
-        """The next leaf and the priority of a transition with some colors."""
-        node, came_from = leaf, leaf
-        while colors & self.missing[node]:
-            node, came_from = self.parent[node], node
-        priority = self.depth[node] + (not self.accepting)
-        siblings = self.children[node]
-        turn = siblings.index(came_from) + 1 if siblings else 0
-        return self.leaf_below(siblings[turn % len(siblings)] if siblings else node), priority
-
-
-def _largest_sets(condition: Condition, colors: int, accepting: bool) -> list[int]:
-    """The maximal subsets of a set of colors that have the other verdict."""
-    found: list[int] = []
-    seen: set[int] = set()
-    waiting = [colors]
-    while waiting:
-        whole = waiting.pop()
-        inf, fin = polarities(residual(condition, ~whole, 0))
-        for color in range(MAX_COLORS):
-            smaller = whole & ~(1 << color)
-            if (inf if accepting else fin) >> color & 1 and smaller not in seen:
-                seen.add(smaller)
-                (waiting if holds(condition, smaller) == accepting else found).append(smaller)
-        if len(seen) > MAX_SUBSETS:
-            raise ValueError(f"to_parity: more than {MAX_SUBSETS} sets of colors to examine.")
-    return [one for one in found if not any(one & other == one != other for other in found)]
+    return np.stack(rows)[:, place], np.stack(marks).astype(np.int32)[:, place], 0, base

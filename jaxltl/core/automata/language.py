@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, complement, make_automaton
-from jaxltl.core.automata.emerson_lei import Condition, to_parity
+from jaxltl.core.automata.emerson_lei import (
+    MAX_COLORS,
+    Condition,
+    parity_condition,
+    residual,
+    to_parity,
+)
 from jaxltl.core.automata.parity import simplify
-from jaxltl.core.automata.runs import EVEN, ODD, Lasso, align, find_lasso, joint_runs, some_loop
+from jaxltl.core.automata.products import EVEN, ODD
+from jaxltl.core.automata.runs import Lasso, align, find_lasso, has_lasso, joint_runs
 from jaxltl.core.automata.translate import Task, as_automaton
 from jaxltl.core.logic.ltl import Letter
-
-
-_MAX_COLORS = 62  # the bits of an int64 that are surely positive
 
 
 def find_accepted(automaton: Automaton) -> Lasso | None:
@@ -30,12 +34,12 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
 
 def is_empty(automaton: Automaton) -> bool:
     """True if the automaton accepts no word."""
-    return not some_loop(joint_runs([automaton]), [(EVEN,)])
+    return not has_lasso([automaton], [(EVEN,)])
 
 
 def is_universal(automaton: Automaton) -> bool:
     """True if the automaton accepts every word over its letters."""
-    return not some_loop(joint_runs([automaton]), [(ODD,)])
+    return not has_lasso([automaton], [(ODD,)])
 
 
 def find_difference(a: Task, b: Task) -> Lasso | None:
@@ -78,7 +82,7 @@ def is_equivalent(a: Task, b: Task) -> bool:
       >>> is_equivalent("F (a | b)", "F a | F b")
       True
     """
-    return not some_loop(joint_runs(_aligned(a, b)), [(EVEN, ODD), (ODD, EVEN)])
+    return not has_lasso(_aligned(a, b), [(EVEN, ODD), (ODD, EVEN)])
 
 
 def find_not_included(a: Task, b: Task) -> Lasso | None:
@@ -104,7 +108,7 @@ def is_included(a: Task, b: Task) -> bool:
       >>> is_included(to_automaton("a U b"), to_automaton("F b"))
       True
     """
-    return not some_loop(joint_runs(_aligned(a, b)), [(EVEN, ODD)])
+    return not has_lasso(_aligned(a, b), [(EVEN, ODD)])
 
 
 def intersection(a: Task, b: Task) -> Automaton:
@@ -130,11 +134,12 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
     """The automaton of the words for which `a` `connective` `b`."""
     a, b = _aligned(a, b)
     runs = joint_runs([a, b])
-    colors_of_a, accepted_by_a, used = _colored(runs.priorities[0], 0)
-    colors_of_b, accepted_by_b, used = _colored(runs.priorities[1], used)
-    if used > _MAX_COLORS:
+    priorities = [x.priority[state] for x, state in zip((a, b), runs.states.T, strict=True)]
+    colors_of_a, accepted_by_a, used = _colored(priorities[0], 0)
+    colors_of_b, accepted_by_b, used = _colored(priorities[1], used)
+    if used > MAX_COLORS:
         raise ValueError(
-            f"{used} priorities in the two automata matter; the limit is {_MAX_COLORS}. "
+            f"{used} priorities in the two automata matter; the limit is {MAX_COLORS}. "
             "Combine automata with fewer, such as simplified ones."
         )
     condition = (connective, accepted_by_a, accepted_by_b)
@@ -154,17 +159,12 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
 def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], Condition, int]:
     """Priorities as sets of colours and a condition on the colours met infinitely often."""
     values, place = np.unique(priority, return_inverse=True)
-    level_of = np.concatenate([[0], np.cumsum(np.diff(values % 2) != 0)])
-    level = level_of[place.reshape(priority.shape)]
+    level_of = np.cumsum([values[0] % 2, *(np.diff(values) % 2)])
     last = int(level_of[-1])
-    condition: Condition = ("true",) if values[-1] % 2 == 0 else ("false",)
-    for i in reversed(range(last)):
-        if (values[0] + i) % 2 == 0:
-            condition = ("or", ("inf", first + i), condition)
-        else:
-            condition = ("and", ("fin", first + i), condition)
+    # Some priority recurs in every run: the last one, if none of the others does.
+    condition = residual(parity_condition(last + 1, first), 0, 1 << first + last)
     bits = np.array([1 << (first + i) if first + i < 63 else 0 for i in range(last)] + [0])
-    return bits.astype(np.int64)[level], condition, first + last
+    return bits[level_of[place].reshape(priority.shape)], condition, first + last
 
 
 def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None = None) -> Automaton:

@@ -11,20 +11,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Integers
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
-from jaxltl.core.automata.merging import (
-    MERGE_WORK,
-    Table,
-    Word,
-    distinct_columns,
-    language_classes,
-    merged,
-)
-from jaxltl.core.sparse.graph.components import strong_components
+from jaxltl.core.automata.merging import MERGE_WORK, language_classes, merged
+from jaxltl.core.automata.products import EVEN, ODD, Word, states_that_may
+from jaxltl.core.automata.table import Table, components, distinct_columns, quotient
 
 ORDERS = (1, -1)  # similar states first, different ones first
 
@@ -50,7 +43,7 @@ def simplify(automaton: Automaton) -> Automaton:
 
 def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integers]:
     """The small table, its acceptance, and an old state of each new one; `thorough` is slow."""
-    columns, inverse = distinct_columns(table)
+    columns, inverse = distinct_columns(*table[:2])
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
     every, work = np.arange(len(table.delta)), MERGE_WORK
     words: list[Word] = []
@@ -63,11 +56,8 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
             break
     assert best is not None
     few, base = best
-    return (
-        Table(few.delta[:, inverse], few.priority[:, inverse], few.initial),
-        _acceptance(few),
-        base,
-    )
+    wide = Table(few.delta[:, inverse], few.priority[:, inverse], few.initial)
+    return wide, _acceptance(few), base
 
 
 def _reduced(
@@ -75,25 +65,23 @@ def _reduced(
 ) -> tuple[Table, Integers, int]:
     """The table after the steps that make it smaller, merging states in an order if one is given."""
     while True:
-        few, base = _composed(quotient_table(few), base)
-        few, base = _composed(_fewest_priorities(few), base)
-        few, base = _composed(quotient_table(few), base)
-        if is_weak(few):
-            few, base = _composed(_weak_minimal(few), base)
-            return _early(few), base, work
+        for step in (quotient, _fewest_priorities, quotient):
+            few, old = step(few)
+            base = base[old]
         size = len(few.delta)
-        few, base = _composed(_move_down(few), base)
+        if is_weak(few):
+            few, old = _weak_minimal(few)
+            return _early(few), base[old], work
+        few, old = _move_down(few)
+        base = base[old]
         if len(few.delta) < size:
             continue
         if order is not None:
             table, work = merged(few, order, work, words)
-            few, base = _composed(quotient_table(table), base)
+            few, old = quotient(table)
+            base = base[old]
         if len(few.delta) == size:
             return few, base, work
-
-
-def _composed(step: tuple[Table, Integers], base: Integers) -> tuple[Table, Integers]:
-    return step[0], base[step[1]]
 
 
 def _acceptance(table: Table) -> str:
@@ -109,47 +97,8 @@ def _acceptance(table: Table) -> str:
 
 
 # ---------------------------------------------------------------------------------------------
-# Steps that keep the language
+# Steps that keep the language: the new table, and an old state of each new one
 # ---------------------------------------------------------------------------------------------
-
-
-def quotient_table(table: Table) -> tuple[Table, Integers]:
-    """Reachable states, merged where every word reads the same priorities (Moore 1956)."""
-    (delta, priority, _), old = reachable(table)
-    _, block = np.unique(priority, axis=0, return_inverse=True)
-    block = block.ravel()
-    count = block.max() + 1
-    while count < len(delta):
-        signature = np.concatenate([block[:, None], block[delta]], axis=1)
-        _, block = np.unique(signature, axis=0, return_inverse=True)
-        block = block.ravel()
-        if block.max() + 1 == count:
-            break
-        count = block.max() + 1
-    _, first = np.unique(block, return_index=True)
-    small = Table(block[delta[first]], priority[first], int(block[0]))
-    ordered, order = reachable(small)
-    return ordered, old[first[order]]
-
-
-def _order(table: Table) -> Integers:
-    """The reachable states, breadth first."""
-    seen = {table.initial: None}
-    rows = table.delta.tolist()
-    for state in (queue := [table.initial]):
-        for successor in dict.fromkeys(rows[state]):
-            if successor not in seen:
-                seen[successor] = None
-                queue.append(successor)
-    return np.array(queue)
-
-
-def reachable(table: Table) -> tuple[Table, Integers]:
-    """The reachable part, renumbered breadth first, and the old numbers."""
-    order = _order(table)
-    position = np.full(len(table.delta), -1)
-    position[order] = np.arange(len(order))
-    return Table(position[table.delta[order]], table.priority[order], 0), order
 
 
 def _fewest_priorities(table: Table) -> tuple[Table, Integers]:
@@ -160,26 +109,23 @@ def _fewest_priorities(table: Table) -> tuple[Table, Integers]:
     return Table(delta, priority, initial), base
 
 
-def components(table: Table) -> Integers:
-    """The strongly connected component of each state."""
-    count, width = table.delta.shape
-    source = np.repeat(np.arange(count), width)
-    return strong_components(source, table.delta.ravel(), count)
+def _cycles(table: Table) -> tuple[Integers, Booleans, Integers]:
+    """Components, the transitions `[Q, L]` that stay in theirs, and the components of these."""
+    component = components(table)
+    inside = component[table.delta] == component[:, None]
+    return component, inside, component[np.nonzero(inside)[0]]
 
 
 def is_weak(table: Table) -> bool:
     """True if no component has cycles of both verdicts; priorities must be the fewest."""
-    component = components(table)
-    inside = component[table.delta] == component[:, None]
-    low = np.full(component.max() + 1, table.priority.max() + 1)
-    high = np.full(component.max() + 1, -1)
-    states = np.broadcast_to(component[:, None], inside.shape)[inside]
-    np.minimum.at(low, states, table.priority[inside])
-    np.maximum.at(high, states, table.priority[inside])
+    component, inside, of = _cycles(table)
+    low, high = np.full(len(component), table.priority.max() + 1), np.full(len(component), -1)
+    np.minimum.at(low, of, table.priority[inside])
+    np.maximum.at(high, of, table.priority[inside])
     return bool((low >= high).all())
 
 
-def _reach(delta: Integers) -> NDArray[np.bool_]:
+def _reach(delta: Integers) -> Booleans:
     """bool `[Q, Q]`: which states are reachable from which, themselves included."""
     count = len(delta)
     reach = np.eye(count, dtype=bool)
@@ -191,14 +137,17 @@ def _reach(delta: Integers) -> NDArray[np.bool_]:
         reach = wider
 
 
+def _on_states(table: Table, priority: Integers) -> Table:
+    """The table with a priority for each state."""
+    return table._replace(priority=np.repeat(priority[:, None], table.delta.shape[1], axis=1))
+
+
 def _weak_minimal(table: Table) -> tuple[Table, Integers]:
     """The minimal form of a weak automaton, priorities 0 and 1 on states."""
-    component = components(table)
-    level = np.zeros(component.max() + 1, int)
-    inside = component[table.delta] == component[:, None]
-    verdict = np.full(component.max() + 1, -1)  # -1: transient
-    states = np.broadcast_to(component[:, None], inside.shape)[inside]
-    verdict[states] = table.priority[inside] % 2
+    component, inside, of = _cycles(table)
+    level = np.zeros(len(component), int)
+    verdict = np.full(len(component), -1)  # -1: transient
+    verdict[of] = table.priority[inside] % 2
     # The level of a component is the greatest below it, raised where its verdict asks so.
     source = np.repeat(component, table.delta.shape[1])
     target = component[table.delta].ravel()
@@ -207,27 +156,19 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
         np.maximum.at(higher, source, np.where(source == target, 0, level[target]))
         higher += (verdict >= 0) & (higher % 2 != verdict)
         if (higher == level).all():
-            break
+            return quotient(_on_states(table, level[component] % 2))
         level = higher
-    priority = np.repeat((level % 2)[component][:, None], table.delta.shape[1], axis=1)
-    return quotient_table(Table(table.delta, priority, table.initial))
 
 
 def _early(table: Table) -> Table:
     """A weak automaton with the earliest verdicts, if its language is co-safe or safe."""
-    component = components(table)
-    inside = component[table.delta] == component[:, None]
+    _, inside, _ = _cycles(table)
     good, bad = ((inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1))
-    reach = _reach(table.delta)
-    universal, live = ~(reach & bad).any(axis=1), (reach & good).any(axis=1)
-    if (good <= universal).all():
-        final = universal
-    elif (bad <= ~live).all():
-        final = live
-    else:
-        return table
-    priority = np.repeat(np.where(final, 0, 1)[:, None], table.delta.shape[1], axis=1)
-    return table._replace(priority=priority)
+    universal, live = ~states_that_may(table, ODD), states_that_may(table, EVEN)
+    for final in (universal, live):
+        if (good <= final).all() and (bad <= ~final).all():
+            return _on_states(table, 1 - final)
+    return table
 
 
 def _move_down(table: Table) -> tuple[Table, Integers]:
@@ -236,12 +177,10 @@ def _move_down(table: Table) -> tuple[Table, Integers]:
     count = len(table.delta)
     if same is None or len(np.unique(same)) == count:
         return table, np.arange(count)
-    component = components(table)
-    rank = _reach(table.delta).sum(axis=1) * count + component  # lower below
+    rank = _reach(table.delta).sum(axis=1) * count + components(table)  # lower below
     target = np.arange(count)
     for state in np.unique(same):
         members = np.flatnonzero(same == state)
         lowest = members[rank[members] == rank[members].min()]
         target[np.setdiff1d(members, lowest)] = lowest[0]
-    moved = Table(target[table.delta], table.priority, int(target[table.initial]))
-    return quotient_table(moved)
+    return quotient(Table(target[table.delta], table.priority, int(target[table.initial])))

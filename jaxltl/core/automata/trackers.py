@@ -8,7 +8,8 @@ is refuted: the formula holds iff it guesses finitely often. Pi-2 formulas are n
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Iterator
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
@@ -22,6 +23,7 @@ from jaxltl.core.automata.emerson_lei import (
     residual,
     ZielonkaTree,
 )
+from jaxltl.core.automata.table import explore
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.normal_form import Combination, Part, is_pure, limit_parts
@@ -123,8 +125,8 @@ class Trackers:
         # The letters that the trackers tell apart, and each letter's place among them.
         self.letters, place = np.unique(classes, axis=1, return_inverse=True)
         self.class_of = place.ravel()
-        self._remaining = lru_cache(maxsize=None)(self._residual)
-        self.heard = lru_cache(maxsize=None)(self._heard)
+        self._remaining = cache(self._residual)
+        self.heard = cache(self._heard)
 
     def remaining(self, states: States, condition: Condition) -> tuple[Condition, int]:
         """A condition restricted to some states, and the trackers that it depends on."""
@@ -178,49 +180,25 @@ def _condition(parts: Combination, number: dict[_Followed, int]) -> Condition:
     return (operator, *(_condition(part, number) for part in parts[1:]))
 
 
-def too_many_states(max_states: int) -> ValueError:
-    """The error of a construction that exceeds the limit of states."""
-    return ValueError(
-        f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
-        "formula into parts that are tracked side by side, or raise max_states."
-    )
-
-
-def track_together(run: Trackers, max_states: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def track_together(run: Trackers, max_states: int) -> tuple[Integers, Integers]:
     """All trackers as one automaton with an Emerson-Lei condition: its transitions and colors."""
-    canonical: dict[States, States] = {}
     decided: dict[Condition, States] = {}
+    every = (1 << len(run.start)) - 1
 
-    def canonical_state(states: States) -> States:
+    @cache
+    def canonical(states: States) -> States:
         """The state with idle trackers set aside; decided states are one state each."""
-        if states not in canonical:
-            condition, live = run.remaining(states, run.condition)
-            small = tuple(
-                q if q in (_PROVEN, _REFUTED) or live >> i & 1 else IDLE
-                for i, q in enumerate(states)
-            )
-            canonical[states] = small if live else decided.setdefault(condition, small)
-        return canonical[states]
+        condition, live = run.remaining(states, run.condition)
+        small = tuple(
+            q if q in (_PROVEN, _REFUTED) or live >> i & 1 else IDLE for i, q in enumerate(states)
+        )
+        return small if live else decided.setdefault(condition, small)
 
-    start = canonical_state(run.start)
-    index = {start: 0}
-    order = [start]
-    every = (1 << len(start)) - 1
-    table, marks = [], []
-    for states in order:
-        row = []
-        following = run.successors(states, every)
-        for target, _ in following:
-            small = canonical_state(target)
-            if small not in index:
-                index[small] = len(order)
-                order.append(small)
-            row.append(index[small])
-        table.append(row)
-        marks.append([colors for _, colors in following])
-        if len(order) > max_states:
-            raise too_many_states(max_states)
-    return np.array(table, np.int32), np.array(marks, np.int64)
+    def step(states: States) -> list[tuple[States, int]]:
+        return [(canonical(end), colors) for end, colors in run.successors(states, every)]
+
+    _, rows, marks = explore(canonical(run.start), step, max_states)
+    return np.stack(rows), np.stack(marks)
 
 
 # Of the trackers; the condition that remains; the leaf of its Zielonka tree.
@@ -235,10 +213,11 @@ def track_on_demand(run: Trackers, max_states: int) -> tuple[Integers, Integers]
     seen. A guess may be made anew at any time, hence a tracker can sleep in these leaves. For
     limits with memory this takes a sum over the leaves, in place of the product of all trackers.
     """
-    trees: dict[Condition, ZielonkaTree] = {}
+    tree_of = cache(lambda condition: ZielonkaTree(condition, max_states))
+    places: list[Integers] = []
 
     def settled(states: States, condition: Condition, live: int, leaf: int) -> _Node:
-        needed = trees[condition].missing[leaf]
+        needed = tree_of(condition).missing[leaf]
         kept = (
             tracker.awake(q, bool(needed >> i & 1)) if live >> i & 1 else IDLE
             for i, (tracker, q) in enumerate(zip(run.trackers, states, strict=True))
@@ -246,38 +225,28 @@ def track_on_demand(run: Trackers, max_states: int) -> tuple[Integers, Integers]
         return tuple(kept), condition, leaf
 
     def entered(states: States, condition: Condition, live: int) -> _Node:
-        if condition not in trees:
-            trees[condition] = ZielonkaTree(condition, max_states)
-        return settled(states, condition, live, trees[condition].leaf_below(0))
+        return settled(states, condition, live, tree_of(condition).leaf_below(0))
 
-    start = entered(run.start, *run.remaining(run.start, run.condition))
-    index = {start: 0}
-    order = [start]
-    rows, priorities = [], []
-    for states, condition, leaf in order:
-        tree = trees[condition]
-        awake = tree.missing[leaf]
+    def step(node: _Node) -> Iterator[tuple[_Node, int]]:
+        states, condition, leaf = node
+        awake = tree_of(condition).missing[leaf]
         heard = sum(
             1 << i
             for i, (t, q) in enumerate(zip(run.trackers, states, strict=True))
             if q >= 0 and (awake >> i & 1 or t.whole is not None)
         )
-        row, marks = [], []
+        places.append(run.heard(heard)[1])
         for target, colors in run.successors(states, heard):
             remaining, live = run.remaining(target, condition)
             if remaining == condition:
-                next_leaf, priority = tree.step(leaf, colors & awake)
-                state = settled(target, condition, live, next_leaf)
+                after, priority = tree_of(condition).step(leaf, colors & awake)
+                yield settled(target, condition, live, after), priority
             else:
-                state, priority = entered(target, remaining, live), 1
-            if state not in index:
-                index[state] = len(order)
-                order.append(state)
-            row.append(index[state])
-            marks.append(priority)
-        place = run.heard(heard)[1]
-        rows.append(np.array(row, np.int32)[place])
-        priorities.append(np.array(marks, np.int32)[place])
-        if len(order) > max_states:
-            raise too_many_states(max_states)
-    return np.stack(rows), np.stack(priorities)
+                yield entered(target, remaining, live), 1
+
+    start = entered(run.start, *run.remaining(run.start, run.condition))
+    _, *tables = explore(start, step, max_states)
+    delta, priority = (
+        np.stack([row[place] for row, place in zip(rows, places, strict=True)]) for rows in tables
+    )
+    return delta, priority

@@ -17,14 +17,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import to_parity
-from jaxltl.core.automata.minimal import equivalence_classes, quotient
-from jaxltl.core.automata.merging import Table
-from jaxltl.core.automata.parity import is_weak, reachable, reduce_table
-from jaxltl.core.automata.runs import EVEN, ODD, find_lasso, live_states, universal_states
-from jaxltl.core.automata.trackers import track_on_demand
-from jaxltl.core.automata.trackers import Alphabet, Trackers, too_many_states, track_together
+from jaxltl.core.automata.parity import is_weak, reduce_table
+from jaxltl.core.automata.products import EVEN, ODD
+from jaxltl.core.automata.runs import find_lasso, live_states, universal_states
+from jaxltl.core.automata.table import Table, explore, quotient, reachable
+from jaxltl.core.automata.trackers import Alphabet, Trackers, track_on_demand, track_together
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import (
     Formula,
@@ -147,45 +147,34 @@ def _progression_automaton(
     """The minimal automaton of a co-safe or safety formula in negation normal form."""
     propositions = formula.propositions
     progression = Progression([formula], alphabet, propositions)
-    states, delta = _explore(progression, progression.diagram_of[formula], max_states)
-    reached = np.array(states) == (TRUE if acceptance == "cosafe" else FALSE)
-    decided = _forced(delta, reached)
-    final = decided if acceptance == "cosafe" else ~decided
+    states, rows, _ = explore(
+        progression.diagram_of[formula],
+        lambda diagram: ((after(diagram), 0) for after in progression.after),
+        max_states,
+    )
+    delta = np.stack(rows)
+    decided = _forced(delta, np.array(states) == (TRUE if acceptance == "cosafe" else FALSE))
+    priority = 1 - (decided if acceptance == "cosafe" else ~decided)
     delta = delta[:, progression.class_of]
-    automaton = Automaton(
-        delta=delta,
-        initial=0,
-        priority=np.where(final, 0, 1)[:, None].repeat(delta.shape[1], axis=1).astype(np.int32),
+    small, base = quotient(Table(delta, np.repeat(priority[:, None], delta.shape[1], axis=1), 0))
+    made = _automaton(small, alphabet, propositions, acceptance)
+    return replace(made, state_names=_names(made, progression, [states[q] for q in base]))
+
+
+def _automaton(
+    table: Table, alphabet: NDArray[np.bool_], propositions: tuple[str, ...], acceptance: str
+) -> Automaton:
+    return Automaton(
+        delta=table.delta.astype(np.int32),
+        initial=np.asarray(table.initial, np.int32),
+        priority=table.priority.astype(np.int32),
         letters=alphabet,
         propositions=propositions,
         acceptance=acceptance,
     )
-    classes = equivalence_classes(automaton)
-    minimal = quotient(automaton, classes)
-    _, first = np.unique(classes, return_index=True)  # every state is reachable
-    return replace(minimal, state_names=_names(minimal, progression, [states[q] for q in first]))
 
 
-def _explore(
-    progression: Progression, start: int, max_states: int
-) -> tuple[list[int], NDArray[np.int32]]:
-    """The diagrams reached from `start`, breadth first, and their transitions `[Q, K]`."""
-    states = [start]
-    index = {start: 0}
-    rows = []
-    for state in states:
-        row = [after(state) for after in progression.after]
-        for successor in row:
-            if successor not in index:
-                index[successor] = len(states)
-                states.append(successor)
-        rows.append([index[successor] for successor in row])
-        if len(states) > max_states:
-            raise too_many_states(max_states)
-    return states, np.array(rows, np.int32)
-
-
-def _forced(delta: NDArray[np.int32], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _forced(delta: Integers, target: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The states from which every word reaches the target, bool `[Q]`."""
     while True:
         wider = target | target[delta].all(axis=1)
@@ -238,17 +227,9 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
         if best is not None:
             break
     assert best is not None
-    class_of = best[1]
     small, kind, _ = reduce_table(best[0])
-    table, _ = reachable(Table(small.delta[:, class_of], small.priority[:, class_of], 0))
-    automaton = Automaton(
-        delta=table.delta.astype(np.int32),
-        initial=np.asarray(table.initial, np.int32),
-        priority=table.priority.astype(np.int32),
-        letters=alphabet,
-        propositions=formula.propositions,
-        acceptance=kind,
-    )
+    table, _ = reachable(Table(small.delta[:, best[1]], small.priority[:, best[1]], 0))
+    automaton = _automaton(table, alphabet, formula.propositions, kind)
     return replace(automaton, state_names=_residual_names(plain, automaton))
 
 
@@ -312,10 +293,7 @@ def _on_demand(run: Trackers, max_states: int) -> Table:
 
 def _together(run: Trackers, max_states: int) -> Table:
     delta, colors = track_together(run, max_states)
-    try:
-        return Table(*to_parity(delta, colors, 0, run.condition, max_states)[:3])
-    except ValueError:
-        raise too_many_states(max_states) from None
+    return Table(*to_parity(delta, colors, 0, run.condition, max_states)[:3])
 
 
 def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ import pytest
 
 from jaxltl.core.automata.automaton import accepts_lasso, complement, make_automaton
 from jaxltl.core.automata.language import find_difference, is_equivalent
-from jaxltl.core.automata.minimal import minimize
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.text import to_dict
 from jaxltl.core.automata.translate import to_automaton
@@ -21,6 +20,7 @@ from jaxltl.core.logic.ltl import (
 from jaxltl.core.logic.simplify import simplify
 from tests.reference_logic import (
     holds_by_definition,
+    minimize,
     random_formula,
     random_lasso,
     residual_count,
