@@ -52,6 +52,8 @@ def attracted(
         goal.copy(),
         first,
         np.zeros(goal.size, np.int32),
+        bool(rule.any()),
+        not rule.all(),
     )
     # In the first round also states without a row join that need all, and empty rows lead anywhere.
     alone: Integers = np.flatnonzero(~rule & (left == 0) & open_)
@@ -83,6 +85,8 @@ class _Search(NamedTuple):
     region: Booleans
     row: Integers
     rank: Integers
+    needs_one: bool  # whether one row suffices in some states
+    needs_all: bool  # whether some states need all rows
 
     def many(self, frontier: Integers, rank: int, empty: Integers | None = None) -> Integers:
         """The states that join after a frontier."""
@@ -102,20 +106,24 @@ class _Search(NamedTuple):
         self.waiting[row] = False
         row = row[self.open[self.graph.state[row]]]
         state: Integers = self.graph.state[row]
-        all_rows = ~self.rule[state]
-        decrement(self.left, state[all_rows])
-        joins = ~all_rows | (self.left[state] == 0)
-        state, row = state[joins], row[joins]
+        if self.needs_all:
+            every = state[~self.rule[state]] if self.needs_one else state
+            decrement(self.left, every)
+            joins = self.left[state] == 0
+            if self.needs_one:
+                joins |= self.rule[state]
+            state, row = state[joins], row[joins]
         first = group_starts(state)  # rows are in order, so those of one state are contiguous
-        state, row = state[first], row[first]
+        state = state[first]
         self.open[state], self.region[state], self.rank[state] = False, True, rank
-        one = self.rule[state]
-        self.row[state[one]] = row[one]
+        if self.needs_one:
+            one = self.rule[state]
+            self.row[state[one]] = row[first][one]
         return state
 
     def few(self, frontier: Integers, rank: int) -> tuple[Integers, int]:
         """Rounds by plain loops while few states join, as along a chain; the next frontier."""
-        arrays: tuple[Any, ...] = (*self.graph.predecessors, self.graph.state, *self[1:])
+        arrays: tuple[Any, ...] = (*self.graph.predecessors, self.graph.state, *self[1:9])
         views: list[Any] = [None if x is None else memoryview(x) for x in arrays]
         start, pred, owner, waiting, lacking, left, open_, rule, region, first, joined = views
         todo = frontier.tolist()

@@ -28,8 +28,8 @@ def positive_under_all_policies(
     mdp: HostGraph, goal: Booleans, rows: Booleans | None = None, among: Booleans | None = None
 ) -> Booleans:
     """States from which every policy reaches a goal with positive probability (not Prob0E)."""
-    if mdp.is_chain and rows is None and among is None:
-        return backward_reachable(mdp, goal)
+    if rows is None and mdp.is_chain:
+        return backward_reachable(mdp, goal, None if among is None else among[mdp.state])
     return attracted(mdp, goal, rows, exists=False, among=among).region
 
 

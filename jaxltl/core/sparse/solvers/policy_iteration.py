@@ -67,7 +67,7 @@ _KEPT = 0.75  # of the extra cost: smaller gains are ignored, and the rest prove
 _MAX_ROUNDS = 300
 # Unknowns from which value iteration is tried, its sweeps, and a change at its end, in tolerances;
 # elimination takes longer in cores of zeroconf with 120,000 unknowns.
-_LARGE_CORE, _MOST_SWEEPS, _CONVERGED = 50_000, 400, 0.01
+_LARGE_CORE, _MOST_SWEEPS, _CONVERGED = 20_000, 400, 0.01
 _USEFUL = 0.1  # bounds of this width give a start policy for extended precision
 
 
@@ -79,8 +79,7 @@ def policy_iteration(
     n = rows.num_nodes
     # A product and a sum for each successor of a row, twice for its normalisation, and the bounds.
     unit = (4 * rows.widest + problem.depth + 16) * _EPS
-    bounds: Floats = np.zeros((3, n + 1))  # the bound that the policy attains, the other one, value
-    bounds[:, n] = 1
+    bounds: Floats = np.zeros((3, n))  # the bound that the policy attains, the other one, value
     policy: Integers = rows.row_start[:-1].copy()
     edges = rows.edges()
     back, among = edges.reverse(), np.ones(n, bool)
@@ -108,7 +107,7 @@ def policy_iteration(
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         solve_levels(rows, after, bounds, policy, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
-    attained, outer, value = bounds[:, :n]
+    attained, outer, value = bounds
     low, high = (attained, outer) if sign > 0 else (outer, attained)
     low = np.where(np.isfinite(low), np.maximum(low - TINY, 0), 0)
     high = np.where(np.isnan(high), np.inf, high + TINY)
@@ -164,15 +163,15 @@ def _core_solver(
     row = concatenated_ranges(rows.row_start[core], count)[choices.order]
     core = core[choices.states]
     entry, width = row_entries(rows.entry_start, row)
-    number: Integers = np.full(rows.num_nodes + 1, -1, np.int32)
+    number: Integers = np.full(rows.num_nodes, -1, np.int32)
     number[core] = np.arange(core.size)
     target, weight = rows.target[entry], rows.weight[entry]
     inner = number[target] >= 0
     of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     out = np.flatnonzero(~inner)
-    cost = np.bincount(of[out], weight[out] * value[target[out]], row.size).astype(np.float64)
-    below = out[target[out] != rows.num_nodes]
-    leaving: Floats = np.bincount(of[below], weight[below], row.size) + rows.leaving[row]
+    terms = weight[out] * value[target[out]]
+    cost: Floats = rows.known[row] + np.bincount(of[out], terms, row.size)
+    leaving: Floats = rows.leaving[row] + np.bincount(of[out], weight[out], row.size)
     start = offsets_from_counts(np.bincount(of[inner], minlength=row.size))
     shape = (row.size, core.size)
     matrix = sparse.csr_array((weight[inner], number[target[inner]], start), shape=shape)

@@ -65,60 +65,43 @@ class Enclosure:
 
 @dataclass(frozen=True)
 class InteriorRows:
-    """Rows of the interior states without self-loops, and a last node of value 1 for known values."""
+    """Rows of the interior states, the nodes, without self-loops: ``known_r + P_r x``."""
 
     row_start: Integers  # int[N + 1]
     entry_start: Integers  # int[R + 1]
-    target: Integers  # int32[T], nodes; N for the last one, weighed by cost and known value
+    target: Integers  # int32[T], nodes
     weight: Floats  # float64[T]
+    known: Floats  # float64[R], cost, and known values by the probability of reaching them
+    leaving: Floats  # float64[R], the probability of leaving the interior
     row: Integers  # int[R], int[N], rows and states of the model
     node: Integers
-    leaving: Floats  # float64[R], the probability of leaving the interior
     widest: int  # the largest number of successors of a row in the model, over which sums go
 
     @property
     def num_nodes(self) -> int:
         return self.node.size
 
-    def take(self, node: Integers) -> InteriorRows:
-        """The rows of some nodes, in their order; targets keep their numbers."""
-        row, count = row_entries(self.row_start, node)
-        entry, width = row_entries(self.entry_start, row)
-        return InteriorRows(
-            row_start=offsets_from_counts(count),
-            entry_start=offsets_from_counts(width),
-            target=self.target[entry],
-            weight=self.weight[entry],
-            row=self.row[row],
-            node=self.node[node],
-            leaving=self.leaving[row],
-            widest=self.widest,
-        )
-
     def edges(self) -> Edges:
-        """The graph of the nodes, without the last one."""
-        kept = self.target != self.num_nodes
-        place = np.zeros(kept.size + 1, np.int32)
-        np.cumsum(kept, out=place[1:])
-        return Edges(place[self.entry_start[self.row_start]], self.target[kept])
+        """The graph of the nodes."""
+        return Edges(self.entry_start[self.row_start], self.target)
 
     def backup(self, value: Floats) -> Floats:
-        """``c_r + P_r x`` of each row, from ``float64[N + 1]``."""
+        """``known_r + P_r x`` of each row."""
         if self.target.size > SCIPY_SIZE:
             from scipy import sparse
 
             arrays = self.weight, self.target, self.entry_start
             matrix = sparse.csr_array(arrays, shape=(self.row.size, value.size))
-            found: Floats = matrix @ value
+            found: Floats = self.known + matrix @ value
             return found
-        return np.add.reduceat(self.weight * value[self.target], self.entry_start[:-1])
+        of = np.repeat(np.arange(self.row.size), np.diff(self.entry_start))
+        return self.known + np.bincount(of, self.weight * value[self.target], self.row.size)
 
     def residual(self, value: Floats, sign: int) -> float:
         """The residual of the optimality equation, relative where the value exceeds one."""
         if not value.size or not np.isfinite(value).all():
             return np.inf if value.size else 0.0
-        image = self.backup(np.append(value, 1))
-        best = _reduction(sign).reduceat(image, self.row_start[:-1])
+        best = _reduction(sign).reduceat(self.backup(value), self.row_start[:-1])
         return float((np.abs(best - value) / np.maximum(value, 1)).max())
 
 
@@ -144,9 +127,8 @@ def interior_rows(problem: ShortestPathProblem) -> InteriorRows:
     if not inner.all():
         out = np.flatnonzero(~inner)
         leaving = np.bincount(of[out], weight[out], row.size).astype(np.float64)
-        known = known + np.bincount(
-            of[out], weight[out] * problem.terminal_value[target[out]], row.size
-        )
+        terms = weight[out] * problem.terminal_value[target[out]]
+        known = known + np.bincount(of[out], terms, row.size)
     loops = inner & (target == state[of])
     if loops.any():
         rest = np.bincount(of[~loops], weight[~loops], row.size)
@@ -163,37 +145,18 @@ def interior_rows(problem: ShortestPathProblem) -> InteriorRows:
             target, weight, of, inner = (x[keep[of]] for x in (target, weight, number[of], inner))
     if not inner.all():
         target, weight, of = target[inner], weight[inner], of[inner]
-    return _with_known_values(problem, (row, state, known, leaving), (target, weight, of), widest)
-
-
-def _with_known_values(
-    problem: ShortestPathProblem,
-    rows: tuple[Integers, Integers, Floats, Floats],
-    entries: tuple[Integers, Floats, Integers],
-    widest: int,
-) -> InteriorRows:
-    """Puts the known part of each row, if it is positive or the row is empty, before its entries."""
-    (row, state, known, leaving), (target, weight, of) = rows, entries
-    node = np.flatnonzero(problem.interior)
-    number: Integers = np.zeros(problem.interior.size, np.int32)
+    node = np.flatnonzero(interior)
+    number = np.zeros(interior.size, np.int32)
     number[node] = np.arange(node.size)
-    count = np.bincount(of, minlength=row.size)
-    some = (known != 0) | (count == 0)
-    start = offsets_from_counts(count + some)
-    first = start[:-1][some]
-    targets, weights = np.empty(start[-1], np.int32), np.empty(start[-1])
-    inside = np.ones(start[-1], bool)
-    inside[first] = False
-    targets[first], weights[first] = node.size, known[some]
-    targets[inside], weights[inside] = number[target], weight
     return InteriorRows(
         row_start=offsets_from_counts(np.bincount(number[state], minlength=node.size)),
-        entry_start=start,
-        target=targets,
-        weight=weights,
+        entry_start=offsets_from_counts(np.bincount(of, minlength=row.size)),
+        target=number[target],
+        weight=weight,
+        known=known,
+        leaving=leaving,
         row=row,
         node=node,
-        leaving=leaving,
         widest=widest,
     )
 
@@ -204,30 +167,41 @@ def solve_levels(
     """Backward induction over levels, in place; the caller accounts for its rounding."""
     if not levels.node.size:
         return
-    part = rows.take(levels.node)
-    single = part.row.size == part.node.size
+    row, count = row_entries(rows.row_start, levels.node)
+    entry, width = row_entries(rows.entry_start, row)
+    targets, weights, images = rows.target[entry], rows.weight[entry], rows.known[row]
+    # Rows without entries have no sum: the numbers of the others, and where their entries begin.
+    some = np.flatnonzero(width)
+    first = offsets_from_counts(width)[some]
+    begin = offsets_from_counts(count)
+    single = row.size == levels.node.size
     same = bool((bounds[0] == bounds[1]).all())
     sides = [bounds[2]] if same else [bounds[2], bounds[1], bounds[0]]
     operation = _reduction(sign)
-    images: Floats = np.empty(part.row.size)
-    row_at = part.row_start[levels.start]
-    entry_at = part.entry_start[row_at].tolist()
-    for (a, b), (r0, r1), (e0, e1) in zip(
-        pairwise(levels.start), pairwise(row_at.tolist()), pairwise(entry_at), strict=True
+    row_at = begin[levels.start]
+    some_at = np.searchsorted(some, row_at)
+    entry_at = np.append(first, entry.size)[some_at].tolist()
+    for (a, b), (r0, r1), (s0, s1), (e0, e1) in zip(
+        *(pairwise(x) for x in (levels.start, row_at.tolist(), some_at.tolist(), entry_at)),
+        strict=True,
     ):
         if a == b:
             continue
-        target, weight, node = part.target[e0:e1], part.weight[e0:e1], levels.node[a:b]
-        starts, image = part.entry_start[r0:r1] - e0, images[r0:r1]
-        begin = None if single else part.row_start[a:b] - r0
+        known, node = images[r0:r1], levels.node[a:b]
         for side in sides:
-            np.add.reduceat(weight * side[target], starts, out=image)
-            side[node] = image if begin is None else operation.reduceat(image, begin)
+            image = known
+            if s0 < s1:
+                sums = np.add.reduceat(weights[e0:e1] * side[targets[e0:e1]], first[s0:s1] - e0)
+                image = known + sums if s1 - s0 == r1 - r0 else known.copy()
+                if s1 - s0 < r1 - r0:
+                    image[some[s0:s1] - r0] += sums
+            side[node] = image if single else operation.reduceat(image, begin[a:b] - r0)
+        images[r0:r1] = image
     if not single:
-        start = part.row_start[:-1]
-        owner = np.arange(start.size, dtype=np.int32).repeat(np.diff(part.row_start))
-        first = first_hits(images == sides[-1][levels.node][owner], owner, start)
-        policy[levels.node] = rows.row_start[levels.node] + first - start
+        owner = np.arange(count.size, dtype=np.int32).repeat(count)
+        start = begin[:-1]
+        hits = first_hits(images == sides[-1][levels.node][owner], owner, start)
+        policy[levels.node] = rows.row_start[levels.node] + hits - start
     if same:
         bounds[:2, levels.node] = bounds[2, levels.node]
 
