@@ -6,22 +6,22 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import chain
-from operator import itemgetter
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.models import MDP, DenseMDP, SparseMDP, TransitionCounts, make_counts, to_sparse
-from jaxltl.core.models.construct.counts import Places, in_order, listed, merged, place_of, places
+from jaxltl.core.models.construct.counts import in_order, listed, place_of, places
 from jaxltl.io.files import streamed
 
 _COUNT = re.compile(r"[0-9]{1,16}")
 _MOST = 2**53  # transitions
-_HELD = 2**16  # distinct lines buffered before equal ones are merged
+_LONGEST = 2**16  # bytes of a line
+_JUNK = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]")  # of no text; a tab may stand in one
+_BOM = b"\xef\xbb\xbf"
+
+Fields = tuple[str, ...]
 
 
 def read_log(
@@ -73,26 +73,37 @@ def read_log(
         states, actions = support.states, support.actions
     if not isinstance(count, str):
         raise ValueError(f"count={validation.shorten(count)}; give the name of a column.")
-    numbers = _names("states", states), _names("actions", actions)
-    name, total, size = str(path), 0, 0
-    held = [np.zeros((4, 0), np.int64)]
-    for lines in read_columns(path, columns, (count,)):
-        part = _numbered(lines, *numbers, support)
-        total += sum(part[3].tolist())
+    name, total = str(path), 0
+    times: Counter[Fields] = Counter()
+    line_of: dict[Fields, int] = {}  # the first line of each transition, in order
+    for line, (*transition, number) in read_columns(path, columns, count):
+        if number != "1" and (not _COUNT.fullmatch(number) or int(number) > _MOST):
+            message = f"the count is {number[:60]!r}; expected an integer from 0 to 2^53."
+            raise _error(name, line, message)
+        key = tuple(transition)
+        times[key] += int(number)
+        line_of.setdefault(key, line)
+        total += int(number)
         if total > _MOST:
-            raise ValueError(
-                f"{name!r}, line {lines.first + len(lines.fields) - 1}: counts add up to more than "
-                "2^53 up to here."
-            )
-        held.append(part)
-        size += part.shape[1]
-        if size > _HELD + 2 * held[0].shape[1]:
-            held = [merged(np.concatenate(held, 1))]
-            size = held[0].shape[1]
-    every = np.concatenate(held, 1)
-    if not every.size:
-        raise ValueError(f"{name!r}, line 2: there is no transition after the header.")
-    return _by_name(every, *numbers)
+            raise _error(name, line, "counts add up to more than 2^53 up to here.")
+    if not times:
+        raise _error(name, 2, "there is no transition after the header.")
+    columns_of_names = list(zip(*times, strict=True))
+    state_names = _names("states", states, columns_of_names[0] + columns_of_names[2])
+    action_names = _names("actions", actions, columns_of_names[1])
+    kinds = ("state", state_names), ("action", action_names), ("state", state_names)
+    table = []
+    for (kind, names), column in zip(kinds, columns_of_names, strict=True):
+        index = {x: i for i, x in enumerate(names)}
+        for x, line in zip(column, line_of.values(), strict=True):
+            if x not in index:
+                raise _error(name, line, _unknown(kind, x, names))
+        table.append(np.array([index[x] for x in column]))
+    if support is not None and (wrong := place_of(support, *table)[1]):
+        line = list(line_of.values())[wrong[0]]
+        raise _error(name, line, f"the model does not have it: {wrong[1]}.")
+    counts = np.array(list(times.values()))
+    return make_counts(*table, counts, states=state_names, actions=action_names)
 
 
 def read_labels(
@@ -122,16 +133,15 @@ def read_labels(
       {'goal': ('bay', 'hall'), 'warm': ('bay',)}
     """
     _check_columns(columns, 2)
-    allowed = set() if states is None else set(map(str, validation.sequence("states", states)))
+    name = str(path)
+    allowed = None if states is None else _names("states", states, ())
     states_of_label: dict[str, dict[str, bool]] = {}
-    for lines in read_columns(path, columns):
-        for fields in lines.times:
-            state, label = fields
-            if states is not None and state not in allowed:
-                raise lines.error(fields, _unknown("state", state, list(states)))
-            states_of_label.setdefault(label, {})[state] = True
+    for line, (state, label) in read_columns(path, columns):
+        if allowed is not None and state not in allowed:
+            raise _error(name, line, _unknown("state", state, list(allowed)))
+        states_of_label.setdefault(label, {})[state] = True
     if not states_of_label:
-        raise ValueError(f"{str(path)!r}, line 2: there is no label after the header.")
+        raise _error(name, 2, "there is no label after the header.")
     return {label: tuple(some) for label, some in states_of_label.items()}
 
 
@@ -144,237 +154,103 @@ def _check_columns(columns: Sequence[str], number: int) -> None:
         )
 
 
-@dataclass
-class _Names:
-    """Name-to-index map; unless complete, new names are appended."""
-
-    number: dict[str, int]
-    complete: bool
-
-
-def _names(kind: str, names: Sequence[str] | None) -> _Names:
-    every = [] if names is None else list(map(str, validation.sequence(kind, names)))
-    number = {x: i for i, x in enumerate(every)}
-    if len(number) < len(every):
-        twice = next(x for i, x in enumerate(every) if number[x] != i)
-        raise ValueError(f"the name {twice!r} stands twice; names must be distinct.")
-    return _Names(number, names is not None)
+def _names(kind: str, names: Sequence[str] | None, used: Sequence[str]) -> Fields:
+    """The given names, or those that are used, in order."""
+    if names is None:
+        return in_order(set(used))
+    return tuple(map(str, validation.sequence(kind, names)))
 
 
 def _unknown(kind: str, name: str, names: Sequence[str]) -> str:
     return f"there is no {kind} {name!r}; there are {listed(names)}."
 
 
-def _numbered(
-    lines: Lines, states: _Names, actions: _Names, support: Places | None
-) -> NDArray[np.int64]:
-    """Distinct lines as state, action and next-state indices and counts, ``[4, N]``."""
-    distinct = list(lines.times)
-    texts, times = list(zip(*distinct, strict=True)), list(lines.times.values())
-    if len(texts) > 3:
-        times = [n * _count(lines, fields) for n, fields in zip(times, distinct, strict=True)]
-    table = np.array([*_numbers(lines, distinct, texts, states, actions), times], np.int64)
-    if support is not None:
-        _, wrong = place_of(support, *table[:3])
-        if wrong:
-            message = f"the model does not have it: {wrong[1]}."
-            raise lines.error(distinct[wrong[0]], message)
-    return table
-
-
-def _numbers(
-    lines: Lines,
-    distinct: list[tuple[str, ...]],
-    texts: list[tuple[str, ...]],
-    states: _Names,
-    actions: _Names,
-) -> list[list[int]]:
-    columns = []
-    for kind, names, column in zip(
-        ("state", "action", "state"), (states, actions, states), texts, strict=False
-    ):
-        new = set(column).difference(names.number)
-        if new and names.complete:
-            i = next(i for i, text in enumerate(column) if text in new)
-            raise lines.error(distinct[i], _unknown(kind, column[i], list(names.number)))
-        for text in new:  # in any order; sorted at the end
-            names.number[text] = len(names.number)
-        columns.append([names.number[text] for text in column])
-    return columns
-
-
-def _count(lines: Lines, fields: tuple[str, ...]) -> int:
-    if _COUNT.fullmatch(fields[3]) and (count := int(fields[3])) <= _MOST:
-        return count
-    raise lines.error(
-        fields, f"the count is {fields[3][:60]!r}; expected an integer from 0 to 2^53."
-    )
-
-
-def _by_name(table: NDArray[np.int64], states: _Names, actions: _Names) -> TransitionCounts:
-    """Counts renumbered by the order of names."""
-    orders = []
-    for names in (states, actions):
-        order = tuple(names.number) if names.complete else in_order(names.number)
-        place = {name: i for i, name in enumerate(order)}
-        orders.append((order, np.array([place[name] for name in names.number], np.int64)))
-    (state_names, s), (action_names, a) = orders
-    return make_counts(
-        s[table[0]], a[table[1]], s[table[2]], table[3], states=state_names, actions=action_names
-    )
-
-
-# --- tables ----------------------------------------------------------------------------------
-
-
-_STEP = 2**13  # bytes per batch; larger batches are slower
-_LONGEST = 2**16  # bytes of a line
-_JUNK = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]")  # of no text; a tab may stand in one
-_BOM = b"\xef\xbb\xbf"
-
-
-@dataclass(frozen=True)
-class Lines:
-    """Consecutive lines of a CSV table, restricted to the requested columns."""
-
-    name: str  # file name
-    first: int  # number of the first line
-    fields: list[tuple[str, ...]]  # requested fields of each line
-    times: Counter[tuple[str, ...]]  # number of lines with the same fields
-
-    def error(self, fields: tuple[str, ...], message: str) -> ValueError:
-        return _error(self.name, self.first + self.fields.index(fields), message)
-
-
-def read_columns(
-    path: str | os.PathLike[str], columns: Sequence[str], optional: Sequence[str] = ()
-) -> Iterator[Lines]:
-    """Requested columns of a UTF-8 CSV table with a header, in batches of lines.
-
-    Fields may be quoted; blanks around them are removed. Yields the fields of `columns`, then those
-    of `optional` that exist; an empty field is an error.
-    """
-    name, empty = str(path), 0
-    place: tuple[int, ...] = ()
-    for first, data in _whole_lines(name, streamed(path)):
-        rows = _rows(name, first, data)
-        if not place:
-            header, rows, first = _stripped(rows[0]), rows[1:], first + 1
-            place = _places(name, header, columns, optional)
-        number = first + len(rows)
-        while rows and _is_empty(rows[-1]):
-            rows.pop()
-        if rows:
-            if empty:
-                raise _error(name, empty, "is empty; remove it.")
-            _check_widths(name, first, rows, len(header))
-            lines = _picked(name, first, rows, place)
-            _check_fields(lines, [header[i] for i in place])
-            yield lines
-        if first + len(rows) < number:
-            empty = empty or first + len(rows)
-    if not place:
-        raise _error(name, 1, f"the file is empty; it should begin with {','.join(columns)}.")
-
-
 def _error(name: str, line: int, message: str) -> ValueError:
     return ValueError(f"{name!r}, line {line}: {message}")
 
 
-def _whole_lines(name: str, parts: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Splits the byte stream at line ends; yields the first line number and the bytes."""
-    line, held = 1, b""
-    for part in (x[i : i + _STEP] for x in parts for i in range(0, len(x), _STEP)):
-        data = held + part
-        cut = data.rfind(b"\n") + 1
-        count, held = data.count(b"\n"), data[cut:]
-        if len(held) > _LONGEST:
-            raise _error(name, line + count, f"is longer than {_LONGEST} bytes.")
-        if cut:
-            yield line, data[:cut]
-        line += count
-    if held:
-        yield line, held
+def read_columns(
+    path: str | os.PathLike[str], columns: Sequence[str], count: str | None = None
+) -> Iterator[tuple[int, Fields]]:
+    """Line numbers and fields of the requested columns of a UTF-8 CSV table with a header.
 
-
-def _rows(name: str, first: int, data: bytes) -> list[list[str]]:
-    if first == 1:
-        data = data.removeprefix(_BOM)
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n")
-    if junk := _JUNK.search(data):
-        line = first + data.count(b"\n", 0, junk.start())
-        raise _error(name, line, f"byte {data[junk.start()]:#x} is not text; expected a table.")
+    Fields may be quoted, and blanks around them are removed. A column of counts is appended, of
+    ones if the table has none.
+    """
+    name, number, empty = str(path), 0, 0
+    header: Fields = ()
+    reader = csv.reader(_lines(path), strict=True, skipinitialspace=True)
     try:
-        lines = data.decode().split("\n")
-    except UnicodeDecodeError as error:
-        line = first + data.count(b"\n", 0, error.start)
-        message = f"byte {data[error.start]:#x} is not UTF-8 text; expected a table."
-        raise _error(name, line, message) from None
-    if not lines[-1]:
-        lines.pop()
-    reader = csv.reader(lines, strict=True, skipinitialspace=True)
-    try:
-        rows = list(reader)
+        for number, row in enumerate(reader, 1):
+            if reader.line_num > number:
+                raise _error(name, number, "a quote is not closed on its line.")
+            if number == 1:
+                header = tuple(map(str.strip, row))
+                _check_header(name, header, columns)
+                wanted = (*columns, count) if count in header else tuple(columns)
+                place = [header.index(x) for x in wanted]
+            elif len(row) < 2 and not "".join(row).strip():
+                empty = empty or number
+            elif empty:
+                raise _error(name, empty, "is empty; remove it.")
+            elif len(row) != len(header):
+                message = f"has {len(row)} fields, and the header {len(header)}."
+                raise _error(name, number, message)
+            else:
+                picked = tuple([row[i].strip() for i in place])
+                if picked == wanted:
+                    raise _error(name, number, "this line repeats the header; remove it.")
+                if "" in picked:
+                    column = wanted[picked.index("")]
+                    raise _error(name, number, f"the field of column {column!r} is empty.")
+                yield number, picked if len(picked) > len(columns) or not count else (*picked, "1")
     except csv.Error as error:
-        raise _error(name, first + max(reader.line_num, 1) - 1, f"{error}.") from None
-    if len(rows) < len(lines):  # a quoted field contains a line end
-        reader = csv.reader(lines, strict=True, skipinitialspace=True)
-        whole = next(i for i, _ in enumerate(reader) if reader.line_num > i + 1)
-        raise _error(name, first + whole, "a quote is not closed on its line.")
-    return rows
+        raise _error(name, number + 1, f"{error}.") from None
+    if not number:
+        raise _error(name, 1, f"the file is empty; it should begin with {','.join(columns)}.")
 
 
-def _stripped(fields: Iterable[str]) -> tuple[str, ...]:
-    return tuple(map(str.strip, fields))
-
-
-def _is_empty(row: list[str]) -> bool:
-    return not row or (len(row) == 1 and not row[0].strip())
-
-
-def _places(
-    name: str, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
-) -> tuple[int, ...]:
-    """Indices of the requested columns in the header."""
-    twice = [x for i, x in enumerate(header) if x and x in header[:i]]
-    if twice:
+def _check_header(name: str, header: Fields, columns: Sequence[str]) -> None:
+    if twice := [x for i, x in enumerate(header) if x and x in header[:i]]:
         raise _error(name, 1, f"the header has the column {twice[0]!r} twice; rename one.")
-    missing = [x for x in columns if x not in header]
-    if missing:
-        listed = ", ".join(map(repr, header))[:200] or "nothing"
+    if missing := [x for x in columns if x not in header]:
+        present = ", ".join(map(repr, header))[:200] or "nothing"
         raise _error(
             name,
             1,
             f"the header has no column {missing[0]!r}; it must name {', '.join(columns)}, "
-            f"separated by commas, and has {listed}.",
+            f"separated by commas, and has {present}.",
         )
-    return tuple(header.index(x) for x in (*columns, *optional) if x in header)
 
 
-def _check_widths(name: str, first: int, rows: list[list[str]], width: int) -> None:
-    if set(map(len, rows)) == {width}:
-        return
-    i = next(i for i, row in enumerate(rows) if len(row) != width)
-    if _is_empty(rows[i]):
-        raise _error(name, first + i, "is empty; remove it.")
-    raise _error(name, first + i, f"has {len(rows[i])} fields, and the header {width}.")
+def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
+    """Lines of a text file without their ends, checked for length and encoding."""
+    name, number, held = str(path), 1, b""
+    for part in streamed(path):
+        data = (held + part).replace(b"\r\n", b"\n")
+        *whole, held = data.split(b"\n")
+        yield from _decoded(name, number, whole)
+        number += len(whole)
+        if len(held) > _LONGEST:
+            break
+    yield from _decoded(name, number, [held] if held else [])
 
 
-def _picked(name: str, first: int, rows: list[list[str]], place: tuple[int, ...]) -> Lines:
-    fields = list(map(itemgetter(*place), rows))
-    times = Counter(fields)
-    texts = list(chain.from_iterable(times))
-    if list(map(str.strip, texts)) != texts:
-        fields = list(map(_stripped, fields))
-        times = Counter(fields)
-    return Lines(name, first, fields, times)
+def _decoded(name: str, first: int, lines: list[bytes]) -> Iterator[str]:
+    data = b"\n".join(lines)
+    if first == 1:
+        data = data.removeprefix(_BOM)
 
+    def error(place: int, message: str) -> ValueError:
+        return _error(name, first + data.count(b"\n", 0, place), message)
 
-def _check_fields(lines: Lines, columns: Sequence[str]) -> None:
-    header = tuple(columns)
-    if header in lines.times:
-        raise lines.error(header, "this line repeats the header; remove it.")
-    if "" in chain.from_iterable(lines.times):
-        fields = next(x for x in lines.times if "" in x)
-        raise lines.error(fields, f"the field of column {columns[fields.index('')]!r} is empty.")
+    if max(map(len, lines), default=0) > _LONGEST:
+        long = next(i for i, line in enumerate(lines) if len(line) > _LONGEST)
+        raise _error(name, first + long, f"is longer than {_LONGEST} bytes.")
+    if junk := _JUNK.search(data):
+        raise error(junk.start(), f"byte {junk[0][0]:#x} is not text; expected a table.")
+    try:
+        return iter(data.decode().split("\n") if lines else [])
+    except UnicodeDecodeError as problem:
+        byte = data[problem.start]
+        raise error(problem.start, f"byte {byte:#x} is not UTF-8 text; expected a table.") from None

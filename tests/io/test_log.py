@@ -15,8 +15,7 @@ import pytest
 from jaxltl.core.models.construct.counts import align_counts
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.io import log
-from jaxltl.io import log as _columns
+from jaxltl.io import files
 from jaxltl.io.log import read_labels, read_log
 
 NAMES = ("hall", "kitchen, lower", "bath", 'the "den"', "Büro", "0", "1", "x y")
@@ -68,8 +67,7 @@ def random_log(rng, num_lines):
 
 @pytest.mark.parametrize("step", [7, 100, 2**13])
 def test_logs_as_a_slow_reader_has_them(tmp_path, monkeypatch, step):
-    monkeypatch.setattr(_columns, "_STEP", step)
-    monkeypatch.setattr(log, "_HELD", 3)
+    monkeypatch.setattr(files, "_STEP", step)
     rng, path = np.random.default_rng(step), tmp_path / "log.csv"
     for i in range(60):
         text = random_log(rng, int(rng.integers(1, 40)))
@@ -156,7 +154,7 @@ def test_what_is_refused(tmp_path, data, line, message):
 
 @pytest.mark.parametrize("step", range(1, 12))
 def test_empty_lines_wherever_the_parts_end(tmp_path, monkeypatch, step):
-    monkeypatch.setattr(_columns, "_STEP", step)
+    monkeypatch.setattr(files, "_STEP", step)
     path = tmp_path / "log.csv"
     path.write_bytes(HEAD + b"a,b,c\n" + b"\n" * 5)
     assert read_log(path).num_samples == 1
