@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
-import itertools
+import io
 import lzma
 import os
 import zlib
@@ -14,6 +14,7 @@ from typing import BinaryIO, Literal
 
 from jaxltl.core.files import atomic_write
 from jaxltl.core import validation
+from jaxltl.core.validation import errors_in
 
 Compression = Literal["gzip", "xz"]
 
@@ -35,7 +36,37 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     size.
     """
     data = raw_bytes(path, limit)
-    return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
+    if compression_of(data) is None:
+        return data
+    with errors_in(f"{str(path)!r}: "):
+        return b"".join(pieces(io.BytesIO(data), limit))
+
+
+def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
+    """Contents of a file without decompression, at most `limit` bytes."""
+    with opened(path) as file:
+        return b"".join(_parts(file, limit))
+
+
+def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
+    """Decompressed contents of a file in pieces."""
+    with opened(path) as file:
+        yield from pieces(file, limit)
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Opens a file for reading; errors become ValueErrors with its name."""
+    _check_path(path)
+    try:
+        file = open(path, "rb")  # noqa: SIM115 - a null byte in the name is a ValueError here only
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from None
+    try:
+        with file, errors_in(f"{str(path)!r}: "):
+            yield file
+    except (OSError, MemoryError) as error:
+        raise _unreadable(path, error) from None
 
 
 def _check_path(path: object) -> None:
@@ -43,91 +74,103 @@ def _check_path(path: object) -> None:
         raise ValueError(f"path is {validation.shorten(path)}; give the name of a file.")
 
 
-def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
-    """Contents of a file without decompression, at most `limit` bytes."""
-    parts = list(_parts(path, limit, 2**24))
-    try:
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-    except MemoryError as error:
-        raise _unreadable(str(path), error) from None
-
-
-def _parts(path: str | os.PathLike[str], limit: int, step: int) -> Iterator[bytes]:
-    """Contents of a file in parts, without decompression; ValueError beyond `limit` bytes."""
-    _check_path(path)
-    size = 0
-    try:
-        with open(path, "rb") as file:
-            while part := file.read(step):
-                size += len(part)
-                if size > limit:
-                    break
-                yield part
-    except (OSError, ValueError, MemoryError) as error:
-        raise _unreadable(str(path), error) from None
-    if size > limit:
-        raise ValueError(f"{str(path)!r} has more than {limit} bytes, the most that are read.")
-
-
-class FileBytes:
-    """Lazy read-only view of an open file: ``file[a:b]`` reads these bytes."""
-
-    def __init__(self, file: BinaryIO):
-        self._file, self._size = file, os.fstat(file.fileno()).st_size
-
-    def __len__(self) -> int:
-        return self._size
-
-    def __getitem__(self, place: slice) -> bytes:
-        start, stop, _ = place.indices(self._size)
-        self._file.seek(start)
-        return self._file.read(max(stop - start, 0))
-
-
-@contextlib.contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[FileBytes]:
-    """Opens a file of any size without reading it; I/O errors become ValueErrors."""
-    _check_path(path)
-    try:
-        file = open(path, "rb")  # noqa: SIM115 - a null byte in the name is a ValueError here only
-    except (OSError, ValueError) as error:
-        raise _unreadable(str(path), error) from None
-    try:
-        with file:
-            yield FileBytes(file)
-    except OSError as error:
-        raise _unreadable(str(path), error) from None
-
-
-def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
-    """Decompressed contents of a file in pieces, with the size bounds of :func:`read_bytes`."""
-    kind = compression_of(data)
-    if kind is None:
-        yield from (data[i : i + _STEP] for i in range(0, len(data), _STEP))
-        return
-    allowed = min(limit, ALWAYS_ALLOWED + MAX_RATIO * len(data))
-    try:
-        yield from _decompressed(data, kind, allowed, name)
-    except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
-        raise ValueError(
-            f"{name!r} has the header of {kind} and is damaged: {error or 'out of memory'}."
-        ) from None
-
-
-def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
-    """Decompressed contents of a file in pieces; only compressed input is held in memory."""
-    parts = _parts(path, limit, _STEP)
-    first = next(parts, b"")
-    if compression_of(first):
-        yield from pieces(b"".join([first, *parts]), str(path), limit)
-    else:
-        yield from itertools.chain([first] if first else [], parts)
-
-
-def _unreadable(name: str, error: Exception) -> ValueError:
+def _unreadable(path: str | os.PathLike[str], error: Exception) -> ValueError:
     # A null byte in the name makes a ValueError.
     reason = getattr(error, "strerror", None) or str(error) or "too large for the memory"
-    return ValueError(f"cannot read {name!r}: {reason}.")
+    return ValueError(f"cannot read {str(path)!r}: {reason}.")
+
+
+def _parts(file: BinaryIO, limit: int) -> Iterator[bytes]:
+    """Contents of a file as they are; ValueError beyond `limit` bytes."""
+    size = 0
+    while part := file.read(_STEP):
+        size += len(part)
+        if size > limit:
+            raise ValueError(f"it has more than {limit} bytes, the most that are read.")
+        yield part
+
+
+def pieces(file: BinaryIO, limit: int = MAX_BYTES) -> Iterator[bytes]:
+    """Decompressed contents of an open file, with the size bounds of :func:`read_bytes`."""
+    parts = _parts(file, limit)
+    first = next(parts, b"")
+    kind = compression_of(first)
+    if kind is None:
+        yield first
+        yield from parts
+        return
+    if not file.seekable():
+        file = io.BytesIO(b"".join([first, *parts]))
+    packed, size = file.seek(0, io.SEEK_END), 0
+    file.seek(0)
+    allowed = min(limit, ALWAYS_ALLOWED + MAX_RATIO * packed)
+    try:
+        for part in _decompressed(file, kind):
+            size += len(part)
+            if size > allowed:
+                raise ValueError(
+                    f"it is {packed} bytes of {kind} and holds more than {allowed} bytes; decompress "
+                    "it first if this size is intended."
+                )
+            yield part
+    except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
+        reason = error or "out of memory"
+        raise ValueError(f"it has the header of {kind} and is damaged: {reason}.") from None
+
+
+def _decompressed(file: BinaryIO, kind: Compression) -> Iterator[bytes]:
+    unpack: zlib._Decompress | lzma.LZMADecompressor
+    while data := file.read(_FED):  # streams one after another, and zeros as padding
+        if not data.startswith(_BEGINS[kind]):
+            data += file.read()
+            if any(data):
+                raise ValueError(f"{len(data)} bytes follow the {kind} data; remove them.")
+            return
+        if kind == "gzip":
+            unpack = zlib.decompressobj(wbits=31)
+        else:
+            unpack = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
+        while not unpack.eof:
+            yield unpack.decompress(data, _STEP)
+            data = getattr(unpack, "unconsumed_tail", b"")
+            if not data and not unpack.eof and getattr(unpack, "needs_input", True):
+                data = file.read(_FED)  # lzma's decompressor holds its input itself
+                if not data:
+                    raise EOFError("it ends before its end is marked")
+        file.seek(-len(unpack.unused_data), io.SEEK_CUR)
+
+
+class _Forward(io.RawIOBase):
+    """Pieces of bytes as a file that is read forwards."""
+
+    def __init__(self, parts: Iterator[bytes]) -> None:
+        self._parts, self._held, self._position = parts, memoryview(b""), 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, target: memoryview) -> int:  # type: ignore[override]
+        while not self._held and (part := next(self._parts, None)) is not None:
+            self._held = memoryview(part)
+        count = min(len(target), len(self._held))
+        target[:count] = self._held[:count]
+        self._held = self._held[count:]
+        self._position += count
+        return count
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        while whence == io.SEEK_SET and self._position < offset:
+            if not self.read(min(offset - self._position, _STEP)):
+                break
+        return self._position
+
+
+def decompressed(file: BinaryIO, limit: int = MAX_BYTES) -> BinaryIO:
+    """A file with the decompressed contents of another, to be read forwards."""
+    return io.BufferedReader(_Forward(pieces(file, limit)), _STEP)
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
@@ -143,58 +186,14 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
         ) from None
 
 
-def compression_of(data: bytes | FileBytes) -> Compression | None:
+def compression_of(data: bytes) -> Compression | None:
     """Compression of a file by its first bytes, or None."""
-    return next((kind for kind in _BEGINS if _begins(data, 0, kind)), None)
-
-
-def _begins(data: bytes | FileBytes, place: int, kind: Compression) -> bool:
-    return data[place : place + len(_BEGINS[kind])] == _BEGINS[kind]
+    return next((kind for kind, begin in _BEGINS.items() if data.startswith(begin)), None)
 
 
 def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
     """Compression of a file by its suffix, or None."""
     return _SUFFIX.get(Path(path).suffix.lower())
-
-
-def _decompressed(
-    data: bytes | FileBytes, kind: Compression, allowed: int, name: str
-) -> Iterator[bytes]:
-    size = place = 0
-    while place < len(data):  # concatenated streams with zero padding
-        if not _begins(data, place, kind):
-            rest = data[place:]
-            if rest.count(0) == len(rest):
-                break
-            raise ValueError(f"{name!r}: {len(rest)} bytes follow the {kind} data; remove them.")
-        for part, place in _stream(data, place, kind):  # noqa: B007, B020 - the place moves on
-            size += len(part)
-            if size > allowed:
-                raise ValueError(
-                    f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; decompress "
-                    "it first if this size is intended."
-                )
-            yield part
-
-
-def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
-    """Decompresses one stream; yields each piece with the input offset after it."""
-    unpack: zlib._Decompress | lzma.LZMADecompressor
-    if kind == "gzip":
-        unpack = zlib.decompressobj(wbits=31)
-    else:
-        unpack = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
-    held = b""
-    while not unpack.eof:
-        chunk = held
-        if not held and getattr(unpack, "needs_input", True):  # lzma's holds its input itself
-            chunk = data[place : place + _FED]
-            place += len(chunk)
-            if not chunk:
-                raise EOFError("it ends before its end is marked")
-        part = unpack.decompress(chunk, _STEP)
-        held = getattr(unpack, "unconsumed_tail", b"")
-        yield part, place - len(unpack.unused_data)
 
 
 @contextlib.contextmanager

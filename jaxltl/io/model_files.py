@@ -9,7 +9,7 @@ from typing import Literal
 
 from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
-from jaxltl.io.files import pieces, raw_bytes, suffix_of, write_bytes
+from jaxltl.io.files import decompressed, opened, suffix_of, write_bytes
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
@@ -147,14 +147,11 @@ def _by_name(path: str | os.PathLike[str]) -> Format | None:
 
 def _by_beginning(path: str | os.PathLike[str]) -> Format:
     """Format detected by content; PRISM files require their suffix."""
-    name, data = str(path), raw_bytes(path)
-    if data.startswith(b"PK"):
-        return _named("numpy")
-    start = b""
-    for piece in pieces(data, name):
-        start += piece[:_BEGINNING]
-        if len(start) >= _BEGINNING:
-            break
+    with opened(path) as file:
+        if file.read(2) == b"PK":
+            return _named("numpy")
+        file.seek(0)
+        start = decompressed(file).read(_BEGINNING)
     if start[257:262] == b"ustar":
         return _named("UMB")
     words = start.split(maxsplit=1)
@@ -166,7 +163,7 @@ def _by_beginning(path: str | os.PathLike[str]) -> Format:
     if first.startswith(b"@") or b"\n@type:" in start:
         return _named("DRN")
     raise ValueError(
-        f"{name!r}: neither the suffix nor the contents name a known format; known are {_known()}."
+        f"{str(path)!r}: neither the suffix nor the contents name a known format; known are {_known()}."
     )
 
 

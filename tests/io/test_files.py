@@ -43,7 +43,9 @@ def test_damage_is_named(tmp_path, pack):
         packed[:30] + b"?" + packed[31:],
     ):
         path.write_bytes(bad)
-        with pytest.raises(ValueError, match=r"model' has the header of (gzip|xz) and is damaged"):
+        with pytest.raises(
+            ValueError, match=r"model': it has the header of (gzip|xz) and is damaged"
+        ):
             read_bytes(path)
     path.write_bytes(packed + b"and more")
     with pytest.raises(ValueError, match="8 bytes follow the"):
@@ -69,7 +71,7 @@ def test_what_cannot_be_read_or_written_is_named(tmp_path):
         with pytest.raises(ValueError, match="cannot read"):
             read_bytes(path)
     (tmp_path / "long").write_bytes(TEXT)
-    with pytest.raises(ValueError, match=r"long' has more than 9999 bytes"):
+    with pytest.raises(ValueError, match=r"long': it has more than 9999 bytes"):
         read_bytes(tmp_path / "long", limit=9999)
     with pytest.raises(ValueError, match="cannot write"), write_bytes(tmp_path / "no" / "x"):
         pass

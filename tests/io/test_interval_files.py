@@ -228,7 +228,7 @@ def test_umb_as_others_write_it(tmp_path):
         ),
         (
             {"ends": pairs(), "kind": "rational-interval", "size": 128},
-            "branch-probability-type is rational-interval of 128 bits",
+            "branch-probability-type: its type is rational-interval of 128 bits",
         ),
         ({"ends": pairs(), "kind": "double-interval", "size": 64}, "double-interval of 64 bits"),
     ],

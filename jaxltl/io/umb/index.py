@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
+
+from jaxltl.core.validation import errors_in
 
 _SIZES = {  # default size of each type in bits
     "bool": 1,
@@ -20,6 +23,7 @@ _SIZES = {  # default size of each type in bits
     "rational-interval": 256,
     "string": 64,
 }
+_REALS = ("double", "rational", "double-interval", "rational-interval")
 PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as Rewards names them
 # Groups specific to jaxltl. A label reserved by other tools has its position as its id.
 OTHER_LABELS = "other-aps"
@@ -167,30 +171,25 @@ def bit_bytes(count: int) -> int:
     return -(-count // 64) * 8
 
 
-def parse_index(content: bytes, place: str) -> Index:
-    """Parses and validates the index; errors start with `place`."""
+def parse_index(content: bytes) -> Index:
+    """Parses and validates the index."""
     try:
         data = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{place}this is not JSON: {error}.") from None
-    index = _Table(data, "the index", place)
+        raise ValueError(f"this is not JSON: {error}.") from None
+    index = _Table(data, "the index")
     if (version := index.count("format-version")) != 1:
-        raise ValueError(f"{place}format-version is {version}; version 1 is read.")
+        raise ValueError(f"format-version is {version}; version 1 is read.")
     system = index.table("transition-system")
     kinds = ("players", "states", "choices", "branches", "choice-actions", "observations")
     counts = {name: system.count(f"#{name}") for name in kinds}
-    names = system.data.get("player-names", [])
-    if not isinstance(names, list) or not all(isinstance(x, str) for x in names):
-        raise ValueError(f"{place}player-names is {_shown(names)}; expected a list of texts.")
+    names = system.get("player-names", "a list of texts", _are_texts, [])
     _check_kind(system, counts)
     probability = None
     if "branch-probability-type" in system.data:
-        probability = system.type("branch-probability-type", "branch-probability-type", place)
-        _check_number(probability, "branch-probability-type", place)
-    annotations = _annotations(index)
-    for one in annotations:
-        if one.type.name not in ("bool", "int", "uint"):
-            _check_number(one.type, f"the annotation {one.name!r}", place)
+        with errors_in("branch-probability-type: "):
+            probability = system.type("branch-probability-type")
+            _check_type(probability, _REALS)
     players, states, choices, branches, actions, _ = counts.values()
     return Index(
         players,
@@ -199,200 +198,172 @@ def parse_index(content: bytes, place: str) -> Index:
         branches,
         actions,
         probability,
-        annotations,
+        _annotations(index.table("annotations", {})),
         *_records(index),
         tuple(names),
     )
 
 
 class _Table:
-    """An object of the index, with the place that errors name."""
+    """An object of the index."""
 
-    def __init__(self, data: object, subject: str, place: str) -> None:
+    def __init__(self, data: object, name: str) -> None:
         if not isinstance(data, dict):
-            raise ValueError(f"{place}{subject} is {_shown(data)}; expected an object.")
+            raise ValueError(f"{name} is {_shown(data)}; expected an object.")
         self.data: Mapping[str, object] = data
-        self.place = place
 
-    def get(self, key: str) -> object:
-        if key not in self.data:
-            raise ValueError(f"{self.place}{key!r} is missing.")
-        return self.data[key]
-
-    def table(self, key: str, subject: str = "", default: object = None) -> _Table:
-        """A table in this one, required unless it has a default."""
-        data = self.get(key) if default is None else self.data.get(key, default)
-        return _Table(data, subject or key, self.place)
-
-    def within(self, subject: str) -> _Table:
-        """The same table, with a subject in its place."""
-        return _Table(self.data, subject, f"{self.place}{subject}: ")
-
-    def count(self, key: str) -> int:
-        value = self.get(key)
-        if type(value) is not int or not 0 <= value < 2**64:
-            raise ValueError(
-                f"{self.place}{key} is {_shown(value)}; expected a whole number from 0 to 2^64 - 1."
-            )
+    def get(
+        self, key: str, expected: str, valid: Callable[[Any], bool], default: object = None
+    ) -> Any:
+        """A value, which must be valid, or its default; None for a value that is required."""
+        value = self.data.get(key, default)
+        if value is None and key not in self.data:
+            raise ValueError(f"{key!r} is missing.")
+        if not valid(value):
+            raise ValueError(f"{key} is {_shown(value)}; expected {expected}.")
         return value
 
-    def type(self, key: str, subject: str, place: str) -> Type:
-        """The type of values of a subject."""
-        data = _Table(self.get(key), f"the type of {subject}", place).within(subject)
-        name, place = data.get("type"), data.place
-        if not isinstance(name, str) or name not in _SIZES:
-            raise ValueError(
-                f"{place}the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
-            )
-        size = data.count("size") if "size" in data.data else _SIZES[name]
+    def table(self, key: str, default: object = None) -> _Table:
+        return _Table(self.get(key, "", lambda _: True, default), key)
+
+    def count(self, key: str, default: int | None = None, below: int = 2**64) -> int:
+        expected = "a whole number from 0 to 2^64 - 1"
+        value: int = self.get(key, expected, lambda x: type(x) is int and 0 <= x < 2**64, default)
+        if value >= below:
+            raise ValueError(f"{key} is {value}; at most {below - 1} are read.")
+        return value
+
+    def text(self, key: str, default: str | None = None) -> str:
+        value: str = self.get(key, "a text", lambda x: isinstance(x, str), default)
+        return value
+
+    def type(self, key: str = "type") -> Type:
+        """A type of values."""
+        data = self.table(key)
+        name = data.get(
+            "type", f"one of {', '.join(_SIZES)}", lambda x: _are_texts([x]) and x in _SIZES
+        )
+        size = data.count("size", _SIZES[name])
         fixed = name in ("double", "double-interval", "string")
         if not 0 < size < 2**32 or (fixed and size != _SIZES[name]):
-            raise ValueError(f"{place}a {name} of {size} bits; expected {_SIZES[name]}.")
+            raise ValueError(f"a {name} of {size} bits; expected {_SIZES[name]}.")
         if name == "rational" and size % 2:
-            raise ValueError(f"{place}a rational of {size} bits; expected an even number.")
+            raise ValueError(f"a rational of {size} bits; expected an even number.")
         return Type(name, size)
 
 
-def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
-    place, time = system.place, system.get("time")
-    if time != "discrete":
+def _are_texts(values: object) -> bool:
+    return isinstance(values, list) and all(isinstance(x, str) for x in values)
+
+
+def _check_type(kind: Type, names: Sequence[str]) -> None:
+    """Raises ValueError unless a type has one of the names and whole words of the usual size."""
+    usual = _SIZES[kind.name]
+    fits = kind.size % usual == 0 if kind.name.startswith("rational") else kind.size == usual
+    if kind.name not in names or not fits:
         raise ValueError(
-            f"{place}time is {_shown(time)}; expected discrete, models with rates are not supported."
+            f"its type is {kind.name} of {kind.size} bits; expected {' or '.join(names)} of the "
+            "usual size, or of a multiple of it for rationals."
         )
+
+
+def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
+    system.get("time", "discrete, models with rates are not supported", lambda x: x == "discrete")
     if counts["observations"]:
         raise ValueError(
-            f"{place}the model has {counts['observations']} observations; POMDPs are not supported."
+            f"the model has {counts['observations']} observations; POMDPs are not supported."
         )
     if not counts["states"]:
-        raise ValueError(f"{place}#states is 0; a model needs at least one.")
+        raise ValueError("#states is 0; a model needs at least one.")
     for name in ("states", "choices", "choice-actions"):
-        if counts[name] > _MOST_STATES:
-            raise ValueError(f"{place}#{name} is {counts[name]}; at most {_MOST_STATES} are read.")
-    if counts["branches"] >= 2**60:
-        raise ValueError(f"{place}#branches is {counts['branches']}; expected less than 2^60.")
+        system.count(f"#{name}", below=_MOST_STATES + 1)
+    system.count("#branches", below=2**60)
 
 
-def _annotations(index: _Table) -> tuple[Annotation, ...]:
+def _annotations(groups: _Table) -> tuple[Annotation, ...]:
     """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
-    groups = index.table("annotations", default={})
     annotations: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
-        table = groups.table(group, f"the group {group}", {})
-        annotations += [_annotation(group, key, table) for key in table.data]
+        table = groups.table(group, {})
+        annotations += [_annotation(group, key, data) for key, data in table.data.items()]
     named = [(x.group == "rewards", x.name) for x in annotations if x.group != INITIAL]
     if twice := [name for name, times in Counter(named).items() if times > 1]:
-        raise ValueError(
-            f"{index.place}two annotations are named {twice[0][1]!r}; expected distinct names."
-        )
+        raise ValueError(f"two annotations are named {twice[0][1]!r}; expected distinct names.")
     return tuple(annotations)
 
 
-def _annotation(group: str, key: str, table: _Table) -> Annotation:
+def _annotation(group: str, key: str, data: object) -> Annotation:
     path = f"annotations/{group}/{key}"
     if not re.fullmatch(r"[0-9a-z_-]{1,100}", key):
         raise ValueError(
-            f"{table.place}{_shown(path)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
+            f"{_shown(path)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
         )
-    value = table.table(key, path).within(path)
-    place, name = value.place, value.data.get("alias", key)
-    if not isinstance(name, str):
-        raise ValueError(f"{place}alias is {_shown(name)}; expected a text.")
-    applies = value.get("applies-to")
-    parts = ["states"] if group != "rewards" else list(PARTS)
-    if (
-        not isinstance(applies, list)
-        or not applies
-        or any(x not in parts for x in applies)
-        or len(set(applies)) < len(applies)
-    ):
-        raise ValueError(
-            f"{place}applies-to is {_shown(applies)}; expected a list of {', '.join(parts)}."
+    parts = list(PARTS) if group == "rewards" else ["states"]
+    types = {"rewards": (*_REALS, "int", "uint"), INITIAL: ("double",)}.get(group, ("bool",))
+    with errors_in(f"{path}: "):
+        table = _Table(data, "it")
+        name = table.text("alias", key)
+        applies = table.get(
+            "applies-to",
+            f"a list of {', '.join(parts)}",
+            lambda x: _are_texts(x) and x and {*x} <= {*parts} and len({*x}) == len(x),
         )
-    if "probability-type" in value.data:
-        raise ValueError(f"{place}random values are not supported; expected numbers.")
-    kind = value.type("type", path, table.place)
-    numbers = ("double", "rational", "int", "uint", "double-interval", "rational-interval")
-    types = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))
-    longer = kind.name.startswith("rational")  # than usual, it may be
-    if kind.name not in types or (not longer and kind.size != _SIZES[kind.name]):
-        raise ValueError(
-            f"{place}its type is {kind.name} of {kind.size} bits; expected "
-            f"{' or '.join(types)} of the usual size."
-        )
+        if "probability-type" in table.data:
+            raise ValueError("random values are not supported; expected numbers.")
+        kind = table.type()
+        _check_type(kind, types)
     return Annotation(group, key, name, tuple(applies), kind)
 
 
 def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
     """Record layouts of the classes of states, and the number of strings."""
-    valuations = index.table("valuations", default={})
+    valuations = index.table("valuations", {})
     if "states" not in valuations.data:
         return (), 0
-    states = valuations.table("states", VALUATIONS).within(VALUATIONS)
-    classes = states.get("classes")
-    if not isinstance(classes, list) or not classes:
-        raise ValueError(f"{states.place}classes is {_shown(classes)}; expected a list.")
-    texts = states.count("#strings") if "#strings" in states.data else 0
-    if texts > _MOST_STATES:
-        raise ValueError(f"{states.place}#strings is {texts}; at most {_MOST_STATES} are read.")
     # Integer variables that jaxltl uses as string indices; Storm refuses the type string.
     ours: object = index.data
     for key in ("file-data", "parameters", TEXTS):
-        ours = ours.get(key, {}) if isinstance(ours, dict) else {}
-    names = [name for name in ours if isinstance(name, str)] if isinstance(ours, list) else []
-    return tuple(_record(one, names, states.place) for one in classes), texts
+        ours = ours.get(key, []) if isinstance(ours, dict) else []
+    with errors_in(f"{VALUATIONS}: "):
+        states = valuations.table("states")
+        classes = states.get("classes", "a list", lambda x: isinstance(x, list) and x)
+        texts = states.count("#strings", 0, below=_MOST_STATES + 1)
+        return tuple(_record(one, ours if isinstance(ours, list) else []) for one in classes), texts
 
 
-def _record(data: object, names_of_texts: Sequence[str], place: str) -> Record:
-    variables = _Table(data, "a class", place).get("variables")
-    if not isinstance(variables, list):
-        raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
+def _record(data: object, names_of_texts: Sequence[object]) -> Record:
+    variables = _Table(data, "a class").get("variables", "a list", lambda x: isinstance(x, list))
     variable_of_name: dict[str, Variable] = {}
     start = 0
     for each in variables:
-        one = _Table(each, "a variable", place)
+        one = _Table(each, "a variable")
         if "padding" in one.data:
             start += one.count("padding")
         else:
-            name = one.get("name")
-            if not isinstance(name, str) or name in variable_of_name:
-                raise ValueError(
-                    f"{place}a variable is named {_shown(name)}; expected distinct texts."
-                )
-            kind = one.type("type", f"the variable {name!r}", place)
-            offset, optional = one.data.get("offset", 0), one.data.get("is-optional", False)
-            if type(offset) is not int or not -(2**63) <= offset < 2**63:
-                raise ValueError(
-                    f"{place}the offset of {name!r} is {_shown(offset)}; expected a "
-                    "whole number of 64 bits."
-                )
-            if not isinstance(optional, bool):
-                raise ValueError(
-                    f"{place}is-optional of {name!r} is {_shown(optional)}; expected true or false."
-                )
+            name = one.text("name")
+            if name in variable_of_name:
+                raise ValueError(f"a variable is named {name!r}; expected distinct texts.")
+            with errors_in(f"the variable {name!r}: "):
+                kind = one.type()
+                offset = one.get("offset", "a whole number of 64 bits", _is_integer, 0)
+                optional = one.get("is-optional", "true or false", lambda x: type(x) is bool, False)
             presence, start = (start, start + 1) if optional else (None, start)
             is_text = kind.name == "uint" and name in names_of_texts
             variable_of_name[name] = Variable(name, kind, offset, start, presence, is_text)
             start += kind.size
         if start > 8 * _MOST_RECORD:
             raise ValueError(
-                f"{place}a state's variables take more than {8 * _MOST_RECORD} bits; "
-                "no more are read."
+                f"a state's variables take more than {8 * _MOST_RECORD} bits; no more are read."
             )
     if start % 8:
         raise ValueError(
-            f"{place}a state's variables take {start} bits; expected a multiple of 8, with padding."
+            f"a state's variables take {start} bits; expected a multiple of 8, with padding."
         )
     return Record(tuple(variable_of_name.values()), start // 8)
 
 
-def _check_number(kind: Type, subject: str, place: str) -> None:
-    """Raises ValueError unless the type is numeric, with a size in whole words."""
-    types = ("double", "rational", "double-interval", "rational-interval")
-    if kind.name not in types or kind.size % _SIZES[kind.name]:
-        raise ValueError(
-            f"{place}{subject} is {kind.name} of {kind.size} bits; expected double of 64, rational of "
-            "a multiple of 128, double-interval of 128 or rational-interval of a multiple of 256."
-        )
+def _is_integer(value: object) -> bool:
+    return type(value) is int and -(2**63) <= value < 2**63
 
 
 def _shown(value: object) -> str:

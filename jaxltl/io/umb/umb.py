@@ -5,6 +5,7 @@ https://github.com/pmc-tools/umb: a tar archive of a JSON index and little-endia
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io.files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
+from jaxltl.io.files import Compression, compression_by_name, decompressed, raw_bytes, write_bytes
 from jaxltl.io.umb.index import (
     ACTIONS,
     INITIAL,
@@ -45,7 +46,7 @@ from jaxltl.io.umb.members import (
     texts_of,
     uniform,
 )
-from jaxltl.io.umb.tar import Stream, tar_pieces, write_gzip
+from jaxltl.io.umb.tar import fill, tar_pieces, write_gzip
 from jaxltl.io.umb.values import (
     Bytes,
     read_bits,
@@ -83,59 +84,49 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
       ValueError: with file and member, for unreadable, damaged or inconsistent files, interval
         games, rates, observations, more than two players with choices, and missing probabilities.
     """
-    name = str(path)
-    place = f"{name!r}: "
     data = raw_bytes(path)
-    try:
-        index = read_index(Stream(pieces(data, name), place))
-        contents = _read_members(data, index, name, place)
-        del data
-        return _model(contents, index, place)
-    except MemoryError:
-        raise ValueError(f"{place}the model does not fit into the memory.") from None
+    with errors_in(f"{str(path)!r}: "):
+        try:
+            index = read_index(decompressed(io.BytesIO(data)))
+            check_memory(sum(largest for _, largest in index.bounds().values()))
+            file, contents = decompressed(io.BytesIO(data)), {}
+            del data
+            for member, size in known_members(file, index):
+                contents[member] = np.empty(size, np.uint8)
+                fill(file, contents[member], member)
+            return _model(contents, index)
+        except MemoryError:
+            raise ValueError("the model does not fit into the memory.") from None
 
 
-def _read_members(data: bytes, index: Index, name: str, place: str) -> dict[str, Bytes]:
-    """Contents of all indexed members, checked for size."""
-    check_memory(sum(largest for _, largest in index.bounds().values()), place)
-    contents: dict[str, Bytes] = {}
-    stream = Stream(pieces(data, name), place)
-    for member, size in known_members(stream, index):
-        contents[member] = np.empty(size, np.uint8)
-        stream.fill(contents[member], member)
-    return contents
-
-
-def _model(contents: dict[str, Bytes], index: Index, place: str) -> SparseMDP | IntervalMDP | Game:
-    row_start = starts_of(contents, "state-to-choices.bin", index.states, index.choices, place)
-    entry_start = starts_of(
-        contents, "choice-to-branches.bin", index.choices, index.branches, place
-    )
-    target = needed(contents, "branch-to-target.bin", place).view("<u8")
+def _model(contents: dict[str, Bytes], index: Index) -> SparseMDP | IntervalMDP | Game:
+    row_start = starts_of(contents, "state-to-choices.bin", index.states, index.choices)
+    entry_start = starts_of(contents, "choice-to-branches.bin", index.choices, index.branches)
+    target = needed(contents, "branch-to-target.bin").view("<u8")
     if index.players == 0:
-        check_chain(row_start, place)
-    annotations = annotations_of(contents, index, place)
+        check_chain(row_start)
+    annotations = annotations_of(contents, index)
     if (member := f"{VALUATIONS}/valuations.bin") in contents:
         of_class = contents.get(f"{VALUATIONS}/valuation-to-class.bin")
-        annotations["valuation"] = read_variables(
-            contents.pop(member),
-            None if of_class is None else of_class.view("<u4"),
-            index.records,
-            index.states,
-            texts_of(contents, VALUATIONS, place),
-            f"{place}{member}: ",
-        )
-    probability = probability_of(contents, index, entry_start, place)
+        texts = texts_of(contents, VALUATIONS)
+        with errors_in(f"{member}: "):
+            annotations["valuation"] = read_variables(
+                contents.pop(member),
+                None if of_class is None else of_class.view("<u4"),
+                index.records,
+                index.states,
+                texts,
+            )
+    probability = probability_of(contents, index, entry_start)
     initial = _initial(contents, index)
-    owner = _owners(contents, index, row_start, place)
+    owner = _owners(contents, index, row_start)
     rows = row_start, entry_start, target
     interval = None
-    with errors_in(place):
-        if probability.ndim > 1:
-            interval = interval_rows(*rows, *probability.T, initial=initial, **annotations)
-            model = interval.nominal
-        else:
-            model = make_sparse(*rows, probability, initial=initial, **annotations)
+    if probability.ndim > 1:
+        interval = interval_rows(*rows, *probability.T, initial=initial, **annotations)
+        model = interval.nominal
+    else:
+        model = make_sparse(*rows, probability, initial=initial, **annotations)
     exact = exact_initial(contents)
     if exact is not None:  # validation may have rescaled it
         model = replace(model, initial=exact)
@@ -154,7 +145,7 @@ def _initial(contents: dict[str, Bytes], index: Index) -> NDArray[np.float64] | 
 
 
 def _owners(
-    contents: dict[str, Bytes], index: Index, row_start: NDArray[np.int64], place: str
+    contents: dict[str, Bytes], index: Index, row_start: NDArray[np.int64]
 ) -> NDArray[np.bool_] | None:
     """Mask of the system's states in a two-player game; None for other models."""
     if index.players < 2:
@@ -165,15 +156,14 @@ def _owners(
         player = contents[member].view("<u4")
     if player.max() >= index.players:
         raise ValueError(
-            f"{place}{member}: a state is of player {player.max()}; expected 0 to "
-            f"{index.players - 1}."
+            f"{member}: a state is of player {player.max()}; expected 0 to {index.players - 1}."
         )
     # Storm assigns states with one choice to a third player; their owner is irrelevant.
     more = np.flatnonzero((player > 1) & (np.diff(row_start) > 1))
     if more.size:
         names = ", ".join(map(repr, index.player_names[:9])) or "no names"
         raise ValueError(
-            f"{place}the game has {index.players} players ({names}), and player "
+            f"the game has {index.players} players ({names}), and player "
             f"{player[more[0]]} chooses in state {more[0]}; games of two are read."
         )
     return player != 1
@@ -216,7 +206,8 @@ def write_umb(
         raise ValueError(
             f"compression is {compression!r}; expected 'gzip', 'xz', None or 'by name'."
         )
-    contents = _contents(model, f"{str(path)!r}: ")
+    with errors_in(f"{str(path)!r}: "):
+        contents = _contents(model)
     if compression == "by name":
         compression = compression_by_name(path) or "gzip"
     if compression == "gzip":
@@ -228,7 +219,7 @@ def write_umb(
                 file.write(piece)
 
 
-def _contents(model: Model, place: str) -> Members:
+def _contents(model: Model) -> Members:
     """Members of the output, the index first."""
     system: NDArray[np.bool_] | None = None
     interval = None
@@ -271,7 +262,7 @@ def _contents(model: Model, place: str) -> Members:
         action, names = np.asarray(sparse.action), sparse.action_names
         counts["#choice-actions"] = len(names) or int(action.max()) + 1
         contents.append((f"{ACTIONS}/values.bin", _packed(action, "<u4")))
-        contents += _written_texts(names, ACTIONS, place)
+        contents += _written_texts(names, ACTIONS)
     annotations, more = _annotations(sparse, initial, interval is not None)
     metadata: dict[str, object] = {"tool": "jaxltl"}
     index: dict[str, object] = {
@@ -283,7 +274,7 @@ def _contents(model: Model, place: str) -> Members:
     }
     contents += more
     if sparse.valuation:
-        variables = write_variables(sparse.valuation, place)
+        variables = write_variables(sparse.valuation)
         classes = [{"variables": variables.variables}]
         states: dict[str, object] = {"unique": False, "classes": classes}
         if variables.named:
@@ -291,7 +282,7 @@ def _contents(model: Model, place: str) -> Members:
             metadata["parameters"] = {TEXTS: variables.named}
         index["valuations"] = {"states": states}
         contents.append((f"{VALUATIONS}/valuations.bin", variables.records))
-        contents += _written_texts(variables.texts, VALUATIONS, place)
+        contents += _written_texts(variables.texts, VALUATIONS)
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
 
 
@@ -299,11 +290,12 @@ def _packed(array: ArrayLike, dtype: str) -> Bytes:
     return np.ascontiguousarray(array, np.dtype(dtype)).view(np.uint8)
 
 
-def _written_texts(texts: Sequence[str], folder: str, place: str) -> Members:
+def _written_texts(texts: Sequence[str], folder: str) -> Members:
     """Members of an array of strings; none if it is empty."""
     if not texts:
         return []
-    start, content = write_texts(texts, f"{place}{folder}: ")
+    with errors_in(f"{folder}: "):
+        start, content = write_texts(texts)
     return [(f"{folder}/string-mapping.bin", start), (f"{folder}/strings.bin", content)]
 
 

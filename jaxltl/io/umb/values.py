@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.validation import errors_in
 from jaxltl.io.umb.index import Record, Type, Variable, bit_bytes
 
 Bytes = NDArray[np.uint8]
@@ -23,15 +24,6 @@ def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
     return np.unpackbits(content, count=count, bitorder="little").view(bool)
 
 
-def count_bits(content: Bytes, count: int) -> int:
-    """Number of ones among the first `count` bits."""
-    step, total = 2**20, 0
-    for begin in range(0, count, 8 * step):
-        block = content[begin // 8 : begin // 8 + step]
-        total += int(read_bits(block, min(count - begin, 8 * step)).sum())
-    return total
-
-
 def write_bits(bits: NDArray[np.bool_]) -> Bytes:
     """Bit vector padded to 64-bit words."""
     content = np.zeros(bit_bytes(bits.size), np.uint8)
@@ -40,54 +32,51 @@ def write_bits(bits: NDArray[np.bool_]) -> Bytes:
     return content
 
 
-def read_starts(content: Bytes, total: int, place: str) -> NDArray[np.int64]:
+def read_starts(content: Bytes, total: int) -> NDArray[np.int64]:
     """Offsets ``int64[n + 1]``, checked to ascend from 0 to `total`."""
     start = content.view("<u8")
     if start[0] != 0 or start[-1] != total:
-        raise ValueError(
-            f"{place}it goes from {start[0]} to {start[-1]}; expected from 0 to {total}."
-        )
+        raise ValueError(f"it goes from {start[0]} to {start[-1]}; expected from 0 to {total}.")
     if (start[1:] < start[:-1]).any():
         i = int(np.flatnonzero(start[1:] < start[:-1])[0])
         raise ValueError(
-            f"{place}it falls from {start[i]} to {start[i + 1]} at {i + 1}; expected "
-            "numbers that ascend."
+            f"it falls from {start[i]} to {start[i + 1]} at {i + 1}; expected numbers that ascend."
         )
     return start.view("<i8").astype(np.int64, copy=False)
 
 
-def read_numbers(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
+def read_numbers(content: Bytes, kind: Type) -> NDArray[np.float64]:
     """Numbers as doubles; rationals are rounded to nearest."""
     if kind.name == "rational":
-        return _read_rationals(content.reshape(-1, kind.size // 8), place)
+        return _read_rationals(content.reshape(-1, kind.size // 8))
     code = {"double": "<f8", "int": "<i8", "uint": "<u8"}[kind.name]
     return content.view(code).astype(np.float64, copy=False)
 
 
-def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
+def read_ends(content: Bytes, kind: Type) -> NDArray[np.float64]:
     """Interval bounds ``float64[n, 2]``; numbers become point intervals."""
     if kind.end is None:
-        numbers = read_numbers(content, kind, place)
+        numbers = read_numbers(content, kind)
         return np.stack([numbers, numbers], 1)
-    return read_numbers(content, kind.end, place).reshape(-1, 2)
+    return read_numbers(content, kind.end).reshape(-1, 2)
 
 
-def read_points(content: Bytes, kind: Type, place: str, *, first: int = 0) -> NDArray[np.float64]:
+def read_points(content: Bytes, kind: Type, *, first: int = 0) -> NDArray[np.float64]:
     """Numbers or point intervals as doubles; `first` is the first index, for messages."""
     if kind.end is None:
-        return read_numbers(content, kind, place)
-    ends = read_ends(content, kind, place)
+        return read_numbers(content, kind)
+    ends = read_ends(content, kind)
     wrong = ~(ends[:, 0] == ends[:, 1])
     if wrong.any():
         i = int(wrong.argmax())
         raise ValueError(
-            f"{place}number {first + i} is the interval [{ends[i, 0]:.9g}, {ends[i, 1]:.9g}]; "
+            f"number {first + i} is the interval [{ends[i, 0]:.9g}, {ends[i, 1]:.9g}]; "
             "single numbers, or intervals of one point, are read."
         )
     return ends[:, 0].copy()
 
 
-def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
+def _read_rationals(content: Bytes) -> NDArray[np.float64]:
     """Rationals (numerator and denominator, half a record each) as doubles."""
     half = content.shape[1] // 2
     doubles = np.zeros(len(content))
@@ -100,29 +89,29 @@ def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
         np.divide(above, below, out=doubles, where=~hard)
     if hard.any():
         records, which = np.unique(content[hard], axis=0, return_inverse=True)
-        values = np.array([_quotient(record.tobytes(), half, place) for record in records])
+        values = np.array([_quotient(record.tobytes(), half) for record in records])
         doubles[hard] = values[which.ravel()]
     return doubles
 
 
-def _quotient(record: bytes, half: int, place: str) -> float:
+def _quotient(record: bytes, half: int) -> float:
     above = int.from_bytes(record[:half], "little", signed=True)
     below = int.from_bytes(record[half:], "little")
     try:
         return above / below
     except ZeroDivisionError:
-        raise ValueError(f"{place}a rational has the denominator 0.") from None
+        raise ValueError("a rational has the denominator 0.") from None
     except OverflowError:
-        raise ValueError(f"{place}a rational is beyond the largest double.") from None
+        raise ValueError("a rational is beyond the largest double.") from None
 
 
-def read_texts(start: NDArray[np.int64], content: Bytes, place: str) -> tuple[str, ...]:
+def read_texts(start: NDArray[np.int64], content: Bytes) -> tuple[str, ...]:
     """Strings between the offsets."""
     data = content.tobytes()
     try:
         return tuple(data[i:j].decode() for i, j in itertools.pairwise(start.tolist()))
     except UnicodeDecodeError as error:
-        raise ValueError(f"{place}a text is not UTF-8: {error}.") from None
+        raise ValueError(f"a text is not UTF-8: {error}.") from None
 
 
 # --- variables of states --------------------------------------------------------------------
@@ -134,7 +123,6 @@ def read_variables(
     records: Sequence[Record],
     count: int,
     texts: Sequence[str],
-    place: str,
 ) -> dict[str, Values]:
     """State variables by name, ``[S]`` each; absent values are NaN (as doubles) or empty strings.
 
@@ -144,12 +132,11 @@ def read_variables(
     if of_class is None:
         of_class = np.zeros(count, np.uint32)
     if of_class.max() >= len(records):
-        raise ValueError(f"{place}a state is of class {of_class.max()}; there are {len(records)}.")
+        raise ValueError(f"a state is of class {of_class.max()}; there are {len(records)}.")
     end = np.array([record.size for record in records])[of_class].cumsum()
     if end[-1] != content.size:
         raise ValueError(
-            f"{place}it has {content.size} bytes; expected {end[-1]}, the records of "
-            f"the {count} states."
+            f"it has {content.size} bytes; expected {end[-1]}, the records of the {count} states."
         )
     parts: dict[str, list[_Part]] = {}
     for i, record in enumerate(records):
@@ -161,30 +148,29 @@ def read_variables(
         else:
             raw = content[(end[chosen] - record.size)[:, None] + np.arange(record.size)]
         for variable in record.variables:
-            subject = f"{place}the variable {variable.name!r} "
-            values = _read_variable(raw, variable, texts, subject)
+            with errors_in(f"the variable {variable.name!r} "):
+                values = _read_variable(raw, variable, texts)
             if values is None:
                 continue
+            there = slice(None)
             if variable.presence is not None:
                 there = _field(raw, variable.presence, 1)[:, 0] > 0
-                parts.setdefault(variable.name, []).append((chosen[there], values[there]))
-            else:
-                parts.setdefault(variable.name, []).append((chosen, values))
-    return {
-        name: _joined(part, count, f"{place}the variable {name!r} ") for name, part in parts.items()
-    }
+            parts.setdefault(variable.name, []).append((chosen[there], values[there]))
+    joined = {}
+    for name, part in parts.items():
+        with errors_in(f"the variable {name!r} "):
+            joined[name] = _joined(part, count)
+    return joined
 
 
 _Part = tuple[NDArray[np.intp], Values]  # some states, and the values there
 
 
-def _read_variable(
-    raw: Bytes, variable: Variable, texts: Sequence[str], subject: str
-) -> Values | None:
+def _read_variable(raw: Bytes, variable: Variable, texts: Sequence[str]) -> Values | None:
     """Value of a variable in each record, or None if it is unsupported."""
     kind = variable.type
     if kind.name.endswith("-interval"):
-        raise ValueError(f"{subject}is {kind.name}; expected single values.")
+        raise ValueError(f"is {kind.name}; expected single values.")
     if kind.name in ("int", "uint") and kind.size > 64:
         return None
     field = _field(raw, variable.start, kind.size)
@@ -193,24 +179,24 @@ def _read_variable(
     if kind.name == "double":
         return np.ascontiguousarray(field).view("<f8")[:, 0].astype(np.float64, copy=False)
     if kind.name == "string":
-        return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts, subject)
+        return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts)
     if kind.name != "rational":
-        values = _whole_numbers(field, variable, subject)
-        return _texts(values, texts, subject) if variable.is_text else values
+        values = _whole_numbers(field, variable)
+        return _texts(values, texts) if variable.is_text else values
     if kind.size % 16:
-        raise ValueError(f"{subject}is a rational of {kind.size} bits; expected whole bytes.")
+        raise ValueError(f"is a rational of {kind.size} bits; expected whole bytes.")
     values = np.full(len(raw), np.nan)
     there = np.ones(len(raw), bool)
     if variable.presence is not None:  # absent values may have denominator 0
         there = _field(raw, variable.presence, 1)[:, 0] > 0
-    values[there] = _read_rationals(field[there], subject)
+    values[there] = _read_rationals(field[there])
     return values
 
 
-def _texts(number: Values, texts: Sequence[str], subject: str) -> Values:
+def _texts(number: Values, texts: Sequence[str]) -> Values:
     used, which = np.unique(number, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(texts):
-        raise ValueError(f"{subject}has the text {used[-1]}; there are {len(texts)}.")
+        raise ValueError(f"has the text {used[-1]}; there are {len(texts)}.")
     chosen = [texts[i] for i in used.tolist()]
     # NumPy pads every string to the longest one.
     dtype = object if 4 * number.size * max(map(len, chosen)) > _MOST_TEXT else str
@@ -231,7 +217,7 @@ def _field(raw: Bytes, start: int, size: int) -> Bytes:
     return field
 
 
-def _whole_numbers(field: Bytes, variable: Variable, subject: str) -> Values:
+def _whole_numbers(field: Bytes, variable: Variable) -> Values:
     """Integers with offset, in the smallest of int32, int64 and uint64 that fits the type."""
     size, offset, signed = variable.type.size, variable.offset, variable.type.name == "int"
     wide = np.zeros((len(field), 8), np.uint8)
@@ -256,16 +242,16 @@ def _whole_numbers(field: Bytes, variable: Variable, subject: str) -> Values:
         return total.view(np.int64)
     if smallest >= 0 and largest < 2**64:
         return total
-    raise ValueError(f"{subject}goes from {smallest} to {largest}; expected numbers of 64 bits.")
+    raise ValueError(f"goes from {smallest} to {largest}; expected numbers of 64 bits.")
 
 
-def _joined(parts: Sequence[_Part], count: int, subject: str) -> Values:
+def _joined(parts: Sequence[_Part], count: int) -> Values:
     """Values of a variable, merged over all classes of states."""
     if len(parts) == 1 and parts[0][0].size == count:
         return parts[0][1]
     texts = {values.dtype.kind in "UO" for _, values in parts}
     if len(texts) > 1:
-        raise ValueError(f"{subject}is a text in some states only; expected one type.")
+        raise ValueError("is a text in some states only; expected one type.")
     dtype = np.result_type(*(values.dtype for _, values in parts))
     joined: Values = np.full(count, "" if True in texts else 0, dtype)
     if sum(states.size for states, _ in parts) < count and True not in texts:
@@ -285,7 +271,7 @@ class Written:
     named: list[str]  # names of the variables that hold strings
 
 
-def write_variables(valuation: Mapping[str, ArrayLike], place: str) -> Written:
+def write_variables(valuation: Mapping[str, ArrayLike]) -> Written:
     """Encodes state variables; each starts at a byte boundary of the record."""
     described: list[dict[str, object]] = []
     fields: list[Values] = []
@@ -300,7 +286,7 @@ def write_variables(valuation: Mapping[str, ArrayLike], place: str) -> Written:
             kind = "string"
         if kind is None or (kind != "string" and values.dtype.itemsize > 8):
             raise ValueError(
-                f"{place}the variable {name!r} holds {values.dtype}; UMB files hold "
+                f"the variable {name!r} holds {values.dtype}; UMB files hold "
                 "truth values, numbers of up to 64 bits and texts."
             )
         if kind == "double":
@@ -323,10 +309,10 @@ def write_variables(valuation: Mapping[str, ArrayLike], place: str) -> Written:
     return Written(described, records.view(np.uint8), texts, named)
 
 
-def write_texts(texts: Sequence[str], place: str) -> tuple[Bytes, bytes]:
+def write_texts(texts: Sequence[str]) -> tuple[Bytes, bytes]:
     """Offsets and UTF-8 bytes of strings."""
     try:
         encoded = [text.encode() for text in texts]
     except UnicodeEncodeError as error:
-        raise ValueError(f"{place}a text is no Unicode: {error}.") from None
+        raise ValueError(f"a text is no Unicode: {error}.") from None
     return np.cumsum([0, *map(len, encoded)], dtype="<u8").view(np.uint8), b"".join(encoded)
