@@ -102,8 +102,9 @@ def read_log(
     if support is not None and (wrong := place_of(support, *table)[1]):
         line = list(line_of.values())[wrong[0]]
         raise _error(name, line, f"the model does not have it: {wrong[1]}.")
+    state, action, successor = table
     counts = np.array(list(times.values()))
-    return make_counts(*table, counts, states=state_names, actions=action_names)
+    return make_counts(state, action, successor, counts, states=state_names, actions=action_names)
 
 
 def read_labels(

@@ -306,7 +306,7 @@ def _annotation(group: str, key: str, data: object) -> Annotation:
         applies = table.get(
             "applies-to",
             f"a list of {', '.join(parts)}",
-            lambda x: _are_texts(x) and x and {*x} <= {*parts} and len({*x}) == len(x),
+            lambda x: _are_texts(x) and set() < {*x} <= {*parts} and len({*x}) == len(x),
         )
         if "probability-type" in table.data:
             raise ValueError("random values are not supported; expected numbers.")
@@ -326,7 +326,7 @@ def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
         ours = ours.get(key, []) if isinstance(ours, dict) else []
     with errors_in(f"{VALUATIONS}: "):
         states = valuations.table("states")
-        classes = states.get("classes", "a list", lambda x: isinstance(x, list) and x)
+        classes = states.get("classes", "a list", lambda x: isinstance(x, list) and bool(x))
         texts = states.count("#strings", 0, below=_MOST_STATES + 1)
         return tuple(_record(one, ours if isinstance(ours, list) else []) for one in classes), texts
 

@@ -163,12 +163,14 @@ class _Archive:
 
     def part(self, span: _Span, num_initial: int) -> ModelPart:
         """The part of the model for one range of states."""
-        counts, spans, starts = self.index.counts, {"states": span}, []
+        index, spans = self.index, {"states": span}
+        starts = {}
         for part, member, ahead in _MAPS:
-            start = self.starts(member, counts[part], counts[ahead], spans[part])
+            start = self.starts(member, index.counts[part], index.counts[ahead], spans[part])
             spans[ahead] = int(start[0]), int(start[-1])
-            starts.append(start - start[0])
-        index = self.index.of(*(spans[part] for part in counts))
+            starts[part] = start - start[0]
+        row_start, entry_start = starts["states"], starts["choices"]
+        index = index.of(*spans.values())
         contents = {
             member: self.elements(member, item, spans[item.part])
             for member, item in self.index.items().items()
@@ -177,16 +179,17 @@ class _Archive:
         contents |= {member: self.whole(member) for member in _TEXTS if member in self.places}
         target = needed(contents, "branch-to-target.bin").view("<u8")
         if index.players == 0:
-            check_chain(starts[0], first=span[0])
+            check_chain(row_start, first=span[0])
         annotations = annotations_of(contents, index)
-        probability = probability_of(contents, index, starts[1])
+        probability = probability_of(contents, index, entry_start)
         initial = exact_initial(contents)
         if initial is None:
             initial = np.full(index.states, 1 / self.index.states)
             if 0 < num_initial < self.index.states:
                 initial = read_bits(contents[_IS_INITIAL], index.states) / num_initial
+        num_states = self.index.states
         model = sparse_part(
-            *starts, target, probability, index.begins, self.index.states, **annotations
+            row_start, entry_start, target, probability, index.begins, num_states, **annotations
         )
         refuse_negative(initial, first=span[0])
         return ModelPart(

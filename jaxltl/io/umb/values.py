@@ -152,7 +152,7 @@ def read_variables(
                 values = _read_variable(raw, variable, texts)
             if values is None:
                 continue
-            there = slice(None)
+            there = np.ones(len(raw), bool)
             if variable.presence is not None:
                 there = _field(raw, variable.presence, 1)[:, 0] > 0
             parts.setdefault(variable.name, []).append((chosen[there], values[there]))
