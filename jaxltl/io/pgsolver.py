@@ -67,30 +67,30 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
     return _Reader(str(path), read_text(path, "a game of PGSolver's format")).game()
 
 
-def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> Integers:
+def min_even(priority: Integers) -> Integers:
     """Converts max-even to min-even priorities, compressed to the fewest values."""
-    decides = np.ones(priority.shape, bool) if neutral is None else ~neutral
-    values = np.unique(priority[decides])[::-1]
-    number = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)]).cumsum()
-    converted = np.full(priority.shape, number[-1] if number.size else 0, np.int32)
-    converted[decides] = number[::-1][np.searchsorted(values[::-1], priority[decides])]
-    return converted
+    values, place = np.unique(-priority, return_inverse=True)
+    number = np.cumsum([*(values[:1] % 2), *(np.diff(values) % 2)])
+    return number[place.reshape(priority.shape)].astype(np.int32)
 
 
 _SPACE = re.compile(r"(?:\s+|//[^\n]*)*")
-_HEAD = re.compile(r"parity\s+([0-9]+)\s*;")
-_START = re.compile(r"start\s+([0-9]+)\s*;")
-_VERTEX = re.compile(
-    r"([0-9]{1,18})\s+([0-9]{1,18})\s+([01])\s+([0-9]+(?:\s*,\s*[0-9]+)*)"
-    r'(?:\s*"([^"]*)")?\s*;\s*'
+_HEAD = re.compile(r"(?:parity\s+[0-9]+\s*;(?:\s+|//[^\n]*)*)?(?:start\s+([0-9]+)\s*;)?")
+_FIELDS = (  # of a vertex
+    (re.compile(r"([0-9]+)\s*"), "the number of a vertex, after 'parity MAX;' and 'start VERTEX;'"),
+    (re.compile(r"([0-9]+)\s*"), "its priority, a number of at least 0"),
+    (re.compile(r"([01])(?![0-9])\s*"), "its owner, 0 or 1"),
+    (re.compile(r"([0-9]+\s*(?:,\s*[0-9]+\s*)*)(?![\s,])"), "its successors, as in 1,2"),
+    (re.compile(r'(?:"([^"]*)"\s*)?;'), 'a name in double quotes, or ";"'),
 )
-_EXPECTED = (
-    (re.compile(r"[0-9]+\s*"), "the number of a vertex"),
-    (re.compile(r"[0-9]+\s*"), "its priority, a number of at least 0"),
-    (re.compile(r"[01](?![0-9])\s*"), "its owner, 0 or 1"),
-    (re.compile(r"[0-9]+\s*(?:,\s*[0-9]+\s*)*(?![\s,])"), "its successors, as in 1,2"),
-    (re.compile(r'(?:"[^"]*"\s*)?(?=;)'), 'a name in double quotes, or ";"'),
-)
+
+
+class _Vertex(NamedTuple):
+    place: int  # in the text
+    priority: int
+    owner: str
+    successors: list[int]
+    name: str
 
 
 class _Reader:
@@ -98,121 +98,87 @@ class _Reader:
 
     def __init__(self, name: str, text: str) -> None:
         self.name, self.text = name, text
-        self.start: int | None = None
-        # Of each vertex: where it is defined, its number, priority, owner, successors and name.
-        self.rows: list[tuple[int, int, int, bool, str, str]] = []
 
     def error(self, place: int, problem: str) -> ValueError:
-        line = self.text.count("\n", 0, place) + 1
-        return ValueError(f"{self.name}, line {line}: {problem}")
+        return ValueError(f"{self.name}, line {self.line(place)}: {problem}")
+
+    def line(self, place: int) -> int:
+        return self.text.count("\n", 0, place) + 1
+
+    def number(self, digits: str, kind: str, place: int) -> int:
+        if len(digits) > 10 or int(digits) > MAX_NUMBER:
+            raise self.error(
+                place, f"{kind} {digits:.30} is beyond {MAX_NUMBER}; number them from 0."
+            )
+        return int(digits)
+
+    def skipped(self, pattern: re.Pattern[str], at: int) -> int:
+        match = pattern.match(self.text, at)
+        return at if match is None else match.end()
+
+    def vertices(self, at: int) -> dict[int, _Vertex]:
+        """The vertices from an offset on, by number, in the order of the file."""
+        found: dict[int, _Vertex] = {}
+        while at < len(self.text):
+            place, fields = at, []
+            for pattern, expected in _FIELDS:
+                match = pattern.match(self.text, at)
+                if match is None:
+                    rest = self.text[at : at + 20]
+                    actual = repr(rest) if rest else "the end of the file"
+                    raise self.error(at, f"found {actual}; expected {expected}.")
+                fields.append(match[1] or "")
+                at = match.end()
+            number = self.number(fields[0], "vertex", place)
+            if number in found:
+                raise self.error(
+                    place,
+                    f"vertex {number} is defined a second time, first in line "
+                    f"{self.line(found[number].place)}; keep one of them.",
+                )
+            priority = self.number(fields[1], "priority", place)
+            targets = [self.number(x.strip(), "a successor:", place) for x in fields[3].split(",")]
+            found[number] = _Vertex(place, priority, fields[2], targets, fields[4])
+            at = self.skipped(_SPACE, at)
+        if not found:
+            raise self.error(
+                at, "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'."
+            )
+        return found
 
     def game(self) -> ParityGame:
-        self._statements()
-        if not self.rows:
-            raise self.error(
-                len(self.text),
-                "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'.",
-            )
-        place, *numbers, owner, successors, names = zip(*self.rows, strict=True)
-        vertex, priority = map(np.array, numbers)
-        for values, kind in ((vertex, "vertex"), (priority, "priority")):
-            if values.max() > MAX_NUMBER:
-                i = int(np.argmax(values > MAX_NUMBER))
-                raise self.error(
-                    place[i], f"{kind} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
-                )
-        order = np.argsort(vertex, kind="stable")
-        ordered = vertex[order]
-        if (twice := np.flatnonzero(ordered[1:] == ordered[:-1])).size:
-            first, again = order[twice[0]], order[twice[0] + 1]
-            line = self.text.count("\n", 0, place[first]) + 1
-            raise self.error(
-                place[again],
-                f"vertex {vertex[again]} is defined a second time, "
-                f"first in line {line}; keep one of them.",
-            )
-        degree = np.array([text.count(",") + 1 for text in successors])
-        try:
-            target = np.array([int(x) for x in ",".join(successors).split(",")], np.int64)
-        except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63
-            long = next(i for i, text in enumerate(successors) if re.search("[0-9]{11}", text))
-            raise self.error(
-                place[long], f"a successor is beyond {MAX_NUMBER}; give the number of a vertex."
-            ) from None
-        where = np.searchsorted(ordered, target)
-        missing = (where == ordered.size) | (ordered[np.minimum(where, ordered.size - 1)] != target)
-        if missing.any():
-            edge = int(np.argmax(missing))
-            source = int(np.searchsorted(degree.cumsum(), edge, "right"))
-            raise self.error(
-                place[source],
-                f"vertex {vertex[source]} leads to vertex "
-                f"{target[edge]}, which is not defined; define it.",
-            )
-        valuation = {"vertex": vertex, "priority": priority}
+        begin = self.skipped(_SPACE, 0)
+        head = _HEAD.match(self.text, begin)
+        assert head is not None
+        found = self.vertices(self.skipped(_SPACE, head.end()))
+        start = None if head[1] is None else self.number(head[1], "the start", begin)
+        if start is not None and start not in found:
+            raise self.error(begin, f"the start, vertex {start}, is not defined; define it.")
+        index = {number: i for i, number in enumerate(found)}
+        target = []
+        for number, vertex in found.items():
+            for other in vertex.successors:
+                if other not in index:
+                    raise self.error(
+                        vertex.place,
+                        f"vertex {number} leads to vertex {other}, which is not defined; define it.",
+                    )
+                target.append(index[other])
+        numbers = np.array(list(found))
+        valuation = {"vertex": numbers, "priority": np.array([v.priority for v in found.values()])}
+        names = [vertex.name for vertex in found.values()]
         if any(names):
             valuation["name"] = np.array(names, object)
         model = make_sparse(
-            np.concatenate([[0], degree.cumsum()]),
-            np.arange(target.size + 1),
-            order[where],
-            np.ones(target.size),
-            initial=None if self.start is None else (vertex == self.start).astype(np.float64),
+            np.cumsum([0, *(len(vertex.successors) for vertex in found.values())]),
+            np.arange(len(target) + 1),
+            np.array(target),
+            np.ones(len(target)),
+            initial=None if start is None else (numbers == start).astype(np.float64),
             valuation=valuation,
         )
-        game = make_game(model, np.array(owner))
+        game = make_game(model, np.array([vertex.owner == "0" for vertex in found.values()]))
         return ParityGame(game, objective_of(game))
-
-    def _statements(self) -> None:
-        text = self.text
-        at = self._skipped(0)
-        if head := _HEAD.match(text, at):
-            at = self._skipped(head.end())
-        start = _START.match(text, at)
-        start_place = at
-        if start:
-            at = self._skipped(start.end())
-        while at < len(text):
-            match = _VERTEX.match(text, at)
-            if match is None:
-                raise self._broken(at)
-            number, priority, owner, successors, name = match.groups()
-            row = at, int(number), int(priority), owner == "0", successors, name or ""
-            self.rows.append(row)
-            at = match.end()
-            if text.startswith("/", at):
-                at = self._skipped(at)
-        if start:
-            digits = start[1]
-            self.start = int(digits) if len(digits) < 19 else MAX_NUMBER + 1
-            if all(row[1] != self.start for row in self.rows):
-                raise self.error(
-                    start_place, f"the start, vertex {digits:.30}, is not defined; define it."
-                )
-
-    def _skipped(self, at: int) -> int:
-        match = _SPACE.match(self.text, at)
-        return at if match is None else match.end()
-
-    def _broken(self, at: int) -> ValueError:
-        """ValueError for the malformed statement at an offset."""
-        text, begin = self.text, at
-        if not self.rows and re.match("[a-z]", text[at]):
-            return self.error(
-                at,
-                f"found {text[at : at + 20]!r}; expected 'parity MAX;', "
-                "'start VERTEX;', or the number of a vertex.",
-            )
-        for pattern, expected in _EXPECTED:
-            match = pattern.match(text, at)
-            if match is None:
-                actual = repr(text[at : at + 20]) if at < len(text) else "the end of the file"
-                return self.error(at, f"found {actual}; expected {expected}.")
-            at = match.end()
-        return self.error(
-            begin,
-            f"a number of this vertex has more than 18 digits; numbers go up to {MAX_NUMBER}.",
-        )
 
 
 def write_pgsolver(

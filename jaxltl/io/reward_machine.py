@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.automata.automaton import Automaton, make_alphabet, make_automaton
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
 from jaxltl.core.models.product import read_probability
@@ -24,7 +24,6 @@ from jaxltl.core.models import Game, Product, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
-from jaxltl.io.hoa.table import alphabet_of
 
 
 @brief
@@ -77,10 +76,7 @@ def read_reward_machine(
     reader = _Reader(place, str(source) if is_text else read_text(source, "a reward machine"))
     initial, terminal, transitions = reader.statements()
     names = tuple(sorted({name for x in transitions for name in x.guard.propositions}))
-    try:
-        alphabet = alphabet_of(names, letters, reader.last)
-    except ValueError as error:
-        raise ValueError(f"{place}: {str(error).removeprefix('read_hoa: ')}") from None
+    alphabet = make_alphabet(names, letters, f"{place}: line {reader.last}")
     return _machine(initial, terminal, transitions, names, alphabet)
 
 

@@ -5,7 +5,7 @@ An automaton reads one letter per step; a letter is the set of the propositions 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -31,6 +31,7 @@ CONDITIONS = {
     "parity": Condition("priority"),
 }
 ACCEPTANCES = tuple(CONDITIONS)
+MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 
 
 def _facts(automaton: Automaton) -> Iterator[str]:
@@ -271,6 +272,34 @@ def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> N
             f"Pass booleans of shape {shape}."
         )
     return array
+
+
+def make_alphabet(
+    names: Sequence[str], letters: Iterable[Letter] | None, place: str
+) -> NDArray[np.bool_]:
+    """Letters `[L, P]` in the order of the binary numbers with proposition p as bit p.
+
+    All of them for None, else those given, without names that are not among the propositions.
+    """
+    if letters is None:
+        if len(names) > MAX_FREE_PROPOSITIONS:
+            raise ValueError(
+                f"{place}: {len(names)} propositions make 2^{len(names)} letters; the limit is "
+                f"2^{MAX_FREE_PROPOSITIONS}. Pass letters=, the sets of propositions that can hold "
+                "at once."
+            )
+        numbers = list(range(2 ** len(names)))
+    else:
+        given = as_letters(letters, f"{place.partition(':')[0]}: letters")
+        sums = (sum(1 << p for p, name in enumerate(names) if name in letter) for letter in given)
+        numbers = sorted(set(sums))
+    if not numbers:
+        raise ValueError(
+            f"{place}: letters is empty. Pass at least one letter, such as set(), or None for all "
+            "of them."
+        )
+    rows = [[bool(number >> p & 1) for p in range(len(names))] for number in numbers]
+    return np.array(rows, bool).reshape(len(rows), len(names))
 
 
 # ---------------------------------------------------------------------------------------------

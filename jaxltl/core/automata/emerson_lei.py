@@ -94,7 +94,8 @@ def parity_condition(num_priorities: int, first: int = 0) -> Condition:
     return condition
 
 
-def _members(colors: int) -> list[int]:
+def members(colors: int) -> list[int]:
+    """The colors of a set."""
     return [color for color in range(colors.bit_length()) if colors >> color & 1]
 
 
@@ -163,10 +164,10 @@ class CycleTree:
         inf, fin = polarities(residual(self._condition, ~colors, 0))
         choices, others = (inf, fin) if accepting else (fin, inf)
         if not inf & fin:
-            for color in _members(choices):
+            for color in members(choices):
                 if self._holds(1 << color | others) == accepting:
                     return [color]
-        return _members(choices)
+        return members(choices)
 
     def lowest(self, node: int, admits: Callable[[int], bool]) -> int:
         """The first lowest admitted node below a node."""
@@ -202,7 +203,7 @@ class ZielonkaTree(CycleTree):
         def without(part: Part, color: int) -> list[Part]:
             return [part - {color}]
 
-        whole = frozenset(_members(self.colors))
+        whole = frozenset(members(self.colors))
         super().__init__(whole, condition, colors_of, without, max_states)
         self.missing = [self.colors & ~colors_of(label) for label in self.labels]
 

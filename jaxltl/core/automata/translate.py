@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain, combinations
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import Automaton, make_alphabet
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.parity import is_weak, reduce_table
 from jaxltl.core.automata.products import EVEN, ODD
@@ -30,7 +29,6 @@ from jaxltl.core.logic.ltl import (
     Formula,
     Letter,
     as_formula,
-    as_letters,
     is_syntactically_cosafe,
     is_syntactically_safe,
     negation_normal_form,
@@ -42,7 +40,6 @@ from jaxltl.core.logic.simplify import simplify
 Acceptance = Literal["auto", "dfa", "buchi", "parity"]
 Task = Automaton | Formula | str
 
-MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 GOOD_ENOUGH = 3  # states up to which no other combination is tried
 WORTHWHILE = 3  # how many times as much the other combinations may track
 MAX_STEPS = 200_000  # of rewriting
@@ -95,7 +92,7 @@ def to_automaton(
             f"to_automaton: acceptance = {acceptance!r}. Pass one of auto, dfa, buchi, parity."
         )
     formula = as_formula(formula)
-    alphabet = _alphabet(formula.propositions, letters)
+    alphabet = make_alphabet(formula.propositions, letters, "to_automaton")
     normal = negation_normal_form(formula)
     try:
         if is_syntactically_cosafe(normal):
@@ -110,30 +107,6 @@ def to_automaton(
             "Split the formula into parts that are tracked side by side."
         ) from None
     return _with_acceptance(formula, automaton, acceptance)
-
-
-def _alphabet(propositions: tuple[str, ...], letters: Iterable[Letter] | None) -> NDArray[np.bool_]:
-    """The letters over the propositions, distinct, by binary number: bool `[L, P]`."""
-    if letters is None:
-        if len(propositions) > MAX_FREE_PROPOSITIONS:
-            raise ValueError(
-                f"to_automaton: the formula has {len(propositions)} propositions, so "
-                f"2^{len(propositions)} letters; the limit is 2^{MAX_FREE_PROPOSITIONS}. "
-                "Pass letters=, the sets of propositions that can hold at once."
-            )
-        sizes = range(len(propositions) + 1)
-        letters = chain.from_iterable(combinations(propositions, size) for size in sizes)
-    bit = {name: 1 << p for p, name in enumerate(propositions)}
-    given = as_letters(letters, "to_automaton: letters")
-    distinct = {letter.intersection(bit) for letter in given}
-    if not distinct:
-        raise ValueError(
-            "to_automaton: letters is empty. Pass at least one letter, such as set(), or None "
-            "for all of them."
-        )
-    rows = sorted(distinct, key=lambda letter: sum(bit[name] for name in letter))
-    table = [[name in letter for name in propositions] for letter in rows]
-    return np.array(table, bool).reshape(len(rows), len(propositions))
 
 
 # ---------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformu
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
-from jaxltl.io.hoa.header import Header, condition_given, decisive_sets, edge_priority, read_header
+from jaxltl.io.hoa.header import Header, decisive_sets, edge_priority, read_header
 from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
 from jaxltl.io.hoa.table import by_number, guarded_edges, label_reader, marks_of, nondeterminism
 from jaxltl.io.hoa.hoa import header_lines, parity_text
@@ -203,7 +203,7 @@ class _Reader:
         self.guards = _Guards([order.index(p) for p in range(len(order))])
         self.texts: dict[int, str] = {}
         self.length = 0  # total number of paths of the written guards
-        sets_by_importance = decisive_sets(condition_given(header.condition, -1, True))
+        sets_by_importance = decisive_sets(header.condition)
         if sets_by_importance is None:
             raise error_at(
                 header.line, "the acceptance formula is no parity condition. Let the tool that "

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
+from jaxltl.core.automata.emerson_lei import MAX_COLORS, members, polarities, residual
 from jaxltl.io.hoa.grammar import FALSE, KNOWN_HEADERS, TRUE, Item, Tree, error_at, unquoted
 
 if TYPE_CHECKING:
@@ -143,9 +146,6 @@ def set_number(number: Token, sets: int) -> int:
 # --- acceptance ------------------------------------------------------------------------------
 
 
-MAX_COLORS = 62  # acceptance sets as bits of one int64
-
-
 def acceptance_of(header: Header, delta: Integers, priority: Integers) -> str:
     """Acceptance type that the priorities allow and the `write_hoa` header names."""
     own = header.tool == "jaxltl"
@@ -159,58 +159,29 @@ def acceptance_of(header: Header, delta: Integers, priority: Integers) -> str:
     return "buchi"
 
 
-def condition_given(condition: Tree, number: int, visited: bool) -> Tree:
-    """Substitutes Inf(number) by `visited` and Fin(number) by its negation, and simplifies."""
-    operator = condition[0]
-    if operator in ("inf", "fin"):
-        if condition[1] != number:
-            return condition
-        return TRUE if (operator == "inf") == visited else FALSE
-    if operator not in ("and", "or"):
-        return condition
-    neutral, decisive = (TRUE, FALSE) if operator == "and" else (FALSE, TRUE)
-    parts = []
-    for operand in condition[1:]:
-        part = condition_given(operand, number, visited)
-        if part[0] == decisive[0]:
-            return decisive
-        if part[0] != neutral[0]:
-            parts.append(part)
-    if len(parts) > 1:
-        return (operator, *parts)
-    return parts[0] if parts else neutral
-
-
-def _sets_of(condition: Tree) -> list[int]:
-    sets: set[int] = set()
-    stack = [condition]
-    while stack:
-        node = stack.pop()
-        if node[0] in ("inf", "fin"):
-            sets.add(node[1])
-        else:
-            stack += node[1:]
-    return sorted(sets)
-
-
 def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None:
     """Order of acceptance sets by importance if the condition is a parity condition, else None.
 
     A set is decisive if visiting it infinitely often settles acceptance, given that the more
     important sets are not.
     """
+    condition = residual(condition, 0, 0)
     order = []
     while condition not in (TRUE, FALSE):
         sets = _sets_of(condition)
         for number in dict.fromkeys((sets[0], sets[-1], *sets)):  # min or max parity, mostly
-            outcome = condition_given(condition, number, True)
+            outcome = residual(condition, 0, 1 << number)
             if outcome in (TRUE, FALSE):
                 break
         else:
             return None
         order.append((number, outcome == TRUE))
-        condition = condition_given(condition, number, False)
+        condition = residual(condition, 1 << number, 0)
     return order, condition == TRUE
+
+
+def _sets_of(condition: Tree) -> list[int]:
+    return members(reduce(or_, polarities(condition)))
 
 
 def edge_priority(
@@ -233,6 +204,7 @@ def colors_of(
     condition: Tree, marks: list[frozenset[int]], header: Header
 ) -> tuple[NDArray[np.int64], Tree]:
     """Acceptance sets of each edge as bit masks, and the condition over bit numbers."""
+    condition = residual(condition, 0, 0)
     sets = _sets_of(condition)
     if len(sets) > MAX_COLORS:
         raise error_at(

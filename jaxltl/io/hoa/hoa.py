@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import CONDITIONS, Automaton, make_automaton
+from jaxltl.core.automata.automaton import CONDITIONS, Automaton, make_alphabet, make_automaton
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.logic.diagram import Cube
@@ -22,13 +22,12 @@ from jaxltl.io.hoa.header import (
     Header,
     acceptance_of,
     colors_of,
-    condition_given,
     decisive_sets,
     edge_priority,
     read_header,
 )
 from jaxltl.io.hoa.grammar import error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.table import Table, alphabet_of, by_number, read_table
+from jaxltl.io.hoa.table import Table, by_number, read_table
 
 if TYPE_CHECKING:
     from lark import Token
@@ -215,7 +214,7 @@ def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
         (version, items), states = parse_tokens(tokens)
         header = read_header(version, items)
         names = tuple(sorted(header.propositions))
-        alphabet = alphabet_of(names, letters, header.line)
+        alphabet = make_alphabet(names, letters, f"read_hoa: line {header.line}")
         # Columns of the sorted alphabet in the order of AP.
         columns = alphabet[:, [names.index(name) for name in header.propositions]]
         table = read_table(header, by_number(header, states), columns)
@@ -234,14 +233,13 @@ def _automaton(
     delta: Integers = table.target[table.edge_of]
     initial = int(header.start)
     base: Integers = np.arange(len(delta))
-    condition = condition_given(header.condition, -1, True)
-    order = decisive_sets(condition)
+    order = decisive_sets(header.condition)
     priority: Integers
     if order is not None:
         of_edge = [edge_priority(marks, header.sets, *order) for marks in table.marks]
         priority = np.array(of_edge, np.int64)[table.edge_of]
     else:
-        colors, compact = colors_of(condition, table.marks, header)
+        colors, compact = colors_of(header.condition, table.marks, header)
         colors = colors[table.edge_of]
         delta, priority, initial, base = to_parity(delta, colors, initial, compact)
     # The added sink rejects, even if the condition accepts runs without marks.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, TypeVar
@@ -12,39 +12,10 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import letter_text
-from jaxltl.core.logic.ltl import Letter, as_letters
 from jaxltl.io.hoa.grammar import Edge, State, Tree, error_at
 from jaxltl.io.hoa.header import Header, only_target, set_number
 
 LetterSet = TypeVar("LetterSet")
-
-MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
-
-
-def alphabet_of(
-    names: tuple[str, ...], letters: Iterable[Letter] | None, line: int
-) -> NDArray[np.bool_]:
-    """Letters `[L, P]`, ordered as binary numbers with proposition p as bit p."""
-    if letters is None:
-        if len(names) > MAX_FREE_PROPOSITIONS:
-            raise error_at(
-                line,
-                f"the automaton has {len(names)} propositions, so 2^{len(names)} letters; the "
-                f"limit is 2^{MAX_FREE_PROPOSITIONS}. Pass letters=, the sets of propositions "
-                "that can hold at once.",
-            )
-        numbers = list(range(2 ** len(names)))
-    else:
-        bit = {name: 1 << p for p, name in enumerate(names)}
-        sets = as_letters(letters, "read_hoa: letters")
-        numbers = sorted({sum(bit[name] for name in bit if name in letter) for letter in sets})
-    if not numbers:
-        raise ValueError(
-            "read_hoa: letters is empty. Pass at least one letter, such as set(), or None for "
-            "all of them."
-        )
-    rows = [[bool(number >> p & 1) for p in range(len(names))] for number in numbers]
-    return np.array(rows, bool).reshape(len(rows), len(names))
 
 
 def by_number(header: Header, states: list[State]) -> list[State]:
