@@ -478,25 +478,19 @@ def _by_counter(arena: _Arena, region: Array, stay: Array, bound: int | None) ->
             "accepting states are met again."
         )
     (game, _, objective), origin = _explicit(arena, region, stay)
-    accepting = objective.priority == 0
     # Memory 2 c + b: c moves since the last accepting state, and b whether the state that is
     # left is the system's; 2 m is too late. Letters tell both of the state that is entered.
     count, mover = np.divmod(np.arange(2 * bound), 2)
-    delta = np.empty((2 * bound + 1, 4), int)
-    for entered_accepts in (0, 1):
-        for entered_system in (0, 1):
-            moved = np.where(entered_accepts, 0, count + mover)
-            late = moved >= bound
-            step = np.where(late, 2 * bound, 2 * moved + entered_system)
-            delta[:-1, 2 * entered_accepts + entered_system] = step
-    delta[-1] = 2 * bound
-    letter = 2 * accepting + game.system
-    joint = _beside(game, delta, 0, letter, "entry")
-    late = np.arange(2 * bound + 1) == 2 * bound
+    delta = np.full((2 * bound + 1, 4), 2 * bound)
+    for letter in range(4):
+        accepts, enters_system = divmod(letter, 2)
+        moved = np.where(accepts, 0, count + mover)
+        delta[:-1, letter] = np.where(moved >= bound, 2 * bound, 2 * moved + enters_system)
+    letters = 2 * (objective.priority == 0) + game.system
+    joint = _beside(game, delta, 0, letters, "entry")
     return _safe_beside(
         joint,
         objective,
-        late,
         bound,
         origin,
         f"not maximal: it includes every strategy that surely meets the accepting states again "
@@ -519,12 +513,10 @@ def _by_parity(arena: _Arena, region: Array, stay: Array, bound: int | None) -> 
     caps = caps if bound is None else [bound] * len(caps)
     delta = budgets(caps, objective.num_priorities)
     joint = _beside(game, delta, len(delta) - 2, objective.priority, "exit")
-    spent = np.arange(len(delta)) == len(delta) - 1
     counts = ", ".join(f"{cap} of priority {p}" for p, cap in zip(odd, caps, strict=True))
     return _safe_beside(
         joint,
         objective,
-        spent,
         bound,
         origin,
         (
@@ -568,12 +560,12 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
 def _safe_beside(
     joint: Game,
     objective: Parity,
-    spent: np.ndarray,
     bound: int | None,
     origin: Restriction | None,
     reason: str,
 ) -> Permissive:
-    """The strategy restricted to states that win without some memory states."""
+    """The strategy restricted to states that win without the last memory state."""
+    spent = np.arange(joint.state_shape[1]) == joint.state_shape[1] - 1
     # The objective itself still counts: the environment may move for ever where the system
     # does not, and then no counter of the system's moves runs out.
     kept = Parity(

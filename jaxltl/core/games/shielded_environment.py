@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import chex
@@ -124,20 +124,7 @@ def shield_environment(
         _require_actions(mask, environment.actions.num)
         _require_places(environment, place, mask.ndim - 1)
         made = replace(environment, allowed=Partial(_looked_up, mask, place, environment.allowed))
-    return make_environment(
-        made.reset,
-        made.step,
-        made.observe,
-        actions=made.actions,
-        labels=made.labels,
-        propositions=made.propositions,
-        allowed=made.allowed,
-        observations=made.observations,
-        horizon=made.horizon,
-        starts=made.starts,
-        outcomes=made.outcomes,
-        ending=made.ending,
-    )
+    return make_environment(**{field.name: getattr(made, field.name) for field in fields(made)})
 
 
 def _require_actions(mask: Array, num_actions: int) -> None:

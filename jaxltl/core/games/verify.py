@@ -17,10 +17,9 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import Winning
-from jaxltl.core.models.compiled import compiled_form
+from jaxltl.core.models.compiled import is_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game, as_game
-from jaxltl.core.models.mdp import DenseMDP, support
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
@@ -142,7 +141,7 @@ def _claim(winning: Winning) -> _Claim:
 
     return _Claim(
         shape,
-        _moves(compiled_form(game)[0]),
+        _moves(game),
         np.asarray(game.system).ravel(),
         flat("region", 0)[:, 0].astype(bool),
         won.ravel(),
@@ -297,35 +296,11 @@ def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _
 
 
 def _moves(game: Game) -> _Moves:
-    """All moves of a game, with sparse products made explicit."""
-    model = game.mdp
-    if isinstance(model, SparseMDP):
-        host = model.host
-        row = np.arange(host.num_rows)
-        return _Moves(*(x.astype(int) for x in (host.state, row, host.row, host.successor)))
-    world = getattr(model, "mdp", model)
-    s, a, k = support(world).nonzero()
-    t = k if isinstance(world, DenseMDP) else np.asarray(world.successor)[s, a, k].astype(int)
-    new = np.ones(s.size, bool)
-    new[1:] = (s[1:] != s[:-1]) | (a[1:] != a[:-1])
-    move, first = new.cumsum() - 1, np.flatnonzero(new)
-    if world is model:
-        return _Moves(s[first], a[first], move, t)
-    step = np.asarray(model.next_memory)
-    memories = step.shape[1]
-    memory = np.arange(memories)
-    after = step[t if model.label_on == "entry" else s]
-    # Moves of (s, q) are numbered by s, q and action.
-    count = np.bincount(s[first], minlength=step.shape[0])
-    begin = count.cumsum() - count
-    rank = np.arange(first.size) - begin[s[first]]
-    number = (begin * memories)[s[first], None] + memory * count[s[first], None] + rank[:, None]
-    state, action = np.empty(number.size, int), np.empty(number.size, int)
-    state[number] = s[first, None] * memories + memory
-    action[number] = a[first, None]
-    moves, target = number[move].ravel(), (t[:, None] * memories + after).ravel()
-    order = np.argsort(moves, kind="stable")
-    return _Moves(state, action, moves[order], target[order])
+    """All moves of a game; the actions of a sparse one are its rows."""
+    model = to_sparse(game.mdp)
+    host, row = model.host, np.arange(model.num_rows)
+    action = row if is_sparse(game.mdp) else np.asarray(model.action)
+    return _Moves(*(x.astype(int) for x in (host.state, action, host.row, host.successor)))
 
 
 def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -146,6 +147,11 @@ class _Guards(Diagrams):
         for _, low, high in self.nodes[len(self.paths) :]:  # children precede their parents
             self.paths.append(min(self.paths[low] + self.paths[high], 2**40))
         return self.paths[guard]
+
+    def text(self, names: Sequence[str], guard: int, true: str) -> str:
+        """A guard as a disjunction of prime cubes."""
+        cubes, _ = prime_cubes(guard, guard, self)
+        return _disjunction([[("" if v else "!") + names[p] for p, v in x] for x in cubes], true)
 
     def constant(self, value: bool) -> int:
         return TRUE if value else FALSE
@@ -307,10 +313,8 @@ class _Reader:
             self.texts[guard] = f"condition {len(self.texts)}"
             self.length -= length
         else:
-            cubes, _ = prime_cubes(guard, guard, self.guards)
-            self.texts[guard] = _disjunction(
-                [[("" if v else "!") + proposition_text(self.names[p]) for p, v in cube]
-                 for cube in cubes], "true")  # fmt: skip
+            names = [proposition_text(name) for name in self.names]
+            self.texts[guard] = self.guards.text(names, guard, "true")
         return self.texts[guard]
 
 
@@ -488,7 +492,7 @@ def _numbered(row_start: Integers, system: NDArray[np.bool_]) -> _Labels:
 def _named(
     game: Game, row_start: Integers, inputs: Sequence[str], outputs: Sequence[str]
 ) -> _Labels | None:
-    """Labels from action names that are guards; None if they are not a partition."""
+    """Labels from action names that are guards; None if they are long, or no partition."""
     model = game.mdp
     if not isinstance(model, SparseMDP) or model.action is None or not model.action_names:
         return None
@@ -508,38 +512,33 @@ def _named(
         return None
     place = {name: i for i, name in enumerate(names)}
     guards = _Guards(list(range(len(names))))
-    read = [_read_guard(formula, place, guards) for formula in formulas]
+    read = [_diagram(formula, place, guards) for formula in formulas]
     for s in range(system.size):
         taken = FALSE
-        for a in action[row_start[s] : row_start[s + 1]]:
-            guard = read[a]
-            if guard is None or guards.both(taken, guard[1]) != FALSE:
+        for guard in (read[a] for a in action[row_start[s] : row_start[s + 1]]):
+            if guard is None or guards.num_paths(guard) > _LONGEST or guards.both(taken, guard):
                 return None
-            taken = guards.either(taken, guard[1])
+            taken = guards.either(taken, guard)
         if taken != TRUE:
             return None
-    return _Labels(sides[0], sides[1], [read[a][0] for a in action])
+    texts = [guards.text([str(i) for i in range(len(names))], x or FALSE, "t") for x in read]
+    return _Labels(sides[0], sides[1], [texts[a] for a in action])
 
 
-def _read_guard(formula: Formula, place: dict[str, int], guards: _Guards) -> tuple[str, int] | None:
-    """Label and diagram of a Boolean formula; None for temporal operators."""
-    translated: dict[Formula, tuple[str, int]] = {}
+def _diagram(formula: Formula, place: dict[str, int], guards: _Guards) -> int | None:
+    """The diagram of a Boolean formula; None for other operators."""
+    found: dict[Formula, int] = {}
     for node in subformulas(formula):
-        parts = [translated[x] for x in node.operands]
-        if node.operator == "ap":
-            p = place[node.proposition]
-            translated[node] = str(p), guards.proposition(p)
-        elif node.operator in ("true", "false"):
-            translated[node] = node.operator[0], guards.constant(node.operator == "true")
-        elif node.operator == "!":
-            translated[node] = f"!({parts[0][0]})" if " " in parts[0][0] else f"!{parts[0][0]}", (
-                guards.negation(parts[0][1]))  # fmt: skip
-        elif node.operator in ("&", "|"):
-            combine, whole = (guards.both if node.operator == "&" else guards.either), parts[0][1]
-            for _, guard in parts[1:]:
-                whole = combine(whole, guard)
-            grouped = [f"({text})" if " " in text else text for text, _ in parts]
-            translated[node] = f" {node.operator} ".join(grouped), whole
-        else:
-            return None
-    return translated[formula]
+        parts = [found[x] for x in node.operands]
+        match node.operator:
+            case "ap":
+                found[node] = guards.proposition(place[node.proposition])
+            case "true" | "false":
+                found[node] = guards.constant(node.operator == "true")
+            case "!":
+                found[node] = guards.negation(parts[0])
+            case "&" | "|":
+                found[node] = reduce(guards.both if node.operator == "&" else guards.either, parts)
+            case _:
+                return None
+    return found[formula]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -217,10 +217,7 @@ def label_reader(header: Header, algebra: Algebra[LetterSet]) -> Callable[[Tree]
         if operator == "not":
             return algebra.negation(truth(operands[0]))
         combine = algebra.both if operator == "and" else algebra.either
-        result = truth(operands[0])
-        for operand in operands[1:]:
-            result = combine(result, truth(operand))
-        return result
+        return reduce(combine, map(truth, operands))
 
     for name, label in header.aliases:
         if name in aliases:
