@@ -34,10 +34,9 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import linen as nn
 
-from jaxltl.algos.common import learner, trees
+from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.learner import Best, stop_early
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
@@ -291,7 +290,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         key=key,
         step=jnp.int32(0),
         parameters=parameters,
-        optimizer=trees.strong(_optimizer(hparams).init(parameters)),
+        optimizer=optimizers.start(hparams, parameters),
         best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
@@ -301,26 +300,21 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     """One step of Adam on a minibatch, drawn with replacement from the demonstrated pairs."""
     pairs = _draw(learner.step_key(state), problem.counts, hparams.batch)
 
-    def loss_of(parameters: PyTree) -> jax.Array:
+    def objective(parameters: PyTree) -> tuple[jax.Array, None]:
         w, s, q, a = pairs
         memory = jax.nn.one_hot(q, problem.counts.shape[2], dtype=problem.observation.dtype)
         scores: PyTree = problem.network.apply(parameters, problem.observation[w, s], memory)
         log_policy = _log_policy(scores, problem.available[w, s])
         fit = -jnp.mean(jnp.take_along_axis(log_policy, a[:, None], axis=-1))
         squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
-        return fit + hparams.l2 / 2 * squares / jnp.sum(problem.counts)
+        return fit + hparams.l2 / 2 * squares / jnp.sum(problem.counts), None
 
-    loss, gradient = jax.value_and_grad(loss_of)(state.parameters)
-    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
-    parameters = optax.apply_updates(state.parameters, updates)
+    loss, _, norm, *new = optimizers.descend(objective, state, hparams)
     held_out = neg_log_likelihood(state.parameters, problem, problem.held_out)
     best, stopped = stop_early(
-        state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience
+        state, new[0], held_out, jnp.any(problem.held_out > 0), hparams.patience
     )
-    parameters, optimizer = trees.choose(
-        stopped, (state.parameters, state.optimizer), (parameters, optimizer)
-    )
-    norm = optax.tree.norm(gradient)
+    parameters, optimizer = trees.choose(stopped, [state.parameters, state.optimizer], new)
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     metrics = Metrics(
         loss=loss,
@@ -346,10 +340,6 @@ def _draw(key: Key, counts: jax.Array, num: int) -> tuple[jax.Array, ...]:
     last = jnp.searchsorted(total, total[-1])
     index = jnp.minimum(jnp.searchsorted(total, point, side="right"), last)
     return jnp.unravel_index(index, counts.shape)
-
-
-def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
-    return optax.chain(optax.scale_by_adam(), optax.scale_by_learning_rate(hparams.learning_rate))
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -10,7 +10,6 @@ from scipy.sparse.csgraph import connected_components
 import jaxltl as jl
 from jaxltl.algos import interval_learning as learning
 from jaxltl.algos.common import loops
-from jaxltl.algos.interval_learning import learner as intervals
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.statistics.confidence_sets import intervals_from_counts
@@ -265,7 +264,7 @@ def test_intervals_with_a_confidence_hold_those_of_any_time_and_only_shrink():
 
 def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
     shares = np.array([-3e-16, 0.0, 0.5, 1.0, 1 + 3e-16])
-    ends = np.asarray(jax.jit(intervals.kl_lower_end)(shares, 0.01))
+    ends = np.asarray(jax.jit(learning._kl_lower_end)(shares, 0.01))
     assert (ends[:2] == 0).all() and (ends[3:] > 0.9).all() and 0.4 < ends[2] < 0.45
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import maximin_q
-from jaxltl.algos.common.play import alias_table
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
@@ -370,21 +369,6 @@ def test_unknown_answers_may_count_or_not():
     np.testing.assert_allclose(low.value, [1.0, 0.0], atol=1e-9)
     high, _ = train(problem, replace(hparams, initial_value=100.0), 20)
     np.testing.assert_allclose(high.value, [2.0, 2.0], atol=1e-9)
-
-
-def test_alias_tables_hold_the_distribution():
-    rng = np.random.default_rng(0)
-    rows = rng.dirichlet(np.ones(7), size=200) * (rng.random((200, 7)) < 0.6)
-    rows[:, 2] += 1e-3
-    rows[0] = [0, 0, 1, 0, 0, 0, 0]
-    rows /= rows.sum(-1, keepdims=True)
-    table = alias_table(rows)
-    threshold, alias = (table >> 8) / 2.0**24, table & 0xFF
-    found = threshold / 7
-    for a in range(7):
-        found[np.arange(200), alias[:, a]] += (1 - threshold[:, a]) / 7
-    np.testing.assert_allclose(found, rows, atol=1e-6)
-    assert not found[rows == 0].any()
 
 
 def test_starts_are_drawn_as_given():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.algos.common.play import cumulative, draw
+from jaxltl.algos.common.play import cumulative, draw, draw_weighted
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 16, 17])
@@ -23,3 +23,15 @@ def test_states_are_drawn_by_the_inverse_of_the_cumulative_weights(size):
         jax.vmap(draw, (None, 0))(jnp.asarray(table), jnp.asarray(words)), expected
     )
     assert np.all(weight[expected] > 0)
+
+
+def test_actions_are_drawn_by_their_weights():
+    rng = np.random.default_rng(0)
+    weight = rng.dirichlet(np.ones(7), size=50) * (rng.random((50, 7)) < 0.6)
+    weight[:, 2] += 1e-3
+    words = np.linspace(0, 2**32 - 1, 20_001).astype(np.uint32)
+    rows = jnp.asarray(weight, jnp.float32)[:, None], jnp.asarray(words)
+    drawn = np.asarray(draw_weighted(*rows))
+    share = np.stack([(drawn == a).mean(1) for a in range(7)], axis=1)
+    np.testing.assert_allclose(share, weight / weight.sum(-1, keepdims=True), atol=1e-3)
+    assert not share[weight == 0].any()

@@ -20,7 +20,7 @@ from jaxltl.algos.common.actor_critic import orthogonal
 from jaxltl.algos.common.moments import scale_of, updated_moments
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.algos.ppo import _collect as collecting
-from jaxltl.algos.ppo import _update as updating
+from jaxltl.algos.ppo import learner as updating
 from jaxltl.core.environments.environment import Finite, Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.types import Status
@@ -340,12 +340,11 @@ def test_the_slope_of_the_loss_is_that_of_a_slow_one():
     }
     weights, worth = rng.normal(size=(5, num)), rng.normal(size=5)
     problem = ppo.Problem(WALK.replace(actions=Finite(num)), (), Table(num))
-    hparams = ppo.Hparams(discount=0.9, value_weight=0.7, entropy_weight=0.05)
-    limits = updating.Limits(0.2, 0.1)
+    hparams = ppo.Hparams(discount=0.9, value_weight=0.7, entropy_weight=0.05, value_clip=0.1)
     given = collecting.Rows(**{k: jnp.asarray(v) for k, v in rows.items()})
-    found, slope = jax.value_and_grad(
-        lambda p: updating.loss(p, given, (), problem, hparams, limits)[0]
-    )({"scores": jnp.asarray(weights), "worth": jnp.asarray(worth)})
+    found, slope = jax.value_and_grad(lambda p: updating.loss(p, given, (), problem, hparams)[0])(
+        {"scores": jnp.asarray(weights), "worth": jnp.asarray(worth)}
+    )
     np.testing.assert_allclose(found, slow_loss(weights, worth, rows, hparams), rtol=1e-9)
     flat = np.concatenate([weights.ravel(), worth])
 

@@ -10,7 +10,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.algos import rmax
 from jaxltl.algos.common import pac
-from jaxltl.algos.rmax import _rollout
+from jaxltl.algos.rmax.learner import exploration, required_visits
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.minimax import minimax_value
@@ -349,8 +349,8 @@ def test_the_adversary_plays_the_minimax_answer():
 
 def test_the_constants_of_the_theorem_are_used():
     hparams = settings()
-    assert float(_rollout.required_visits(example(), hparams)) == pytest.approx(1.4193e19, rel=1e-4)
-    explore = float(_rollout.exploration(example(), hparams))
+    assert float(required_visits(example(), hparams)) == pytest.approx(1.4193e19, rel=1e-4)
+    explore = float(exploration(example(), hparams))
     assert explore == pytest.approx(5.33333e-7, rel=1e-5)
     state = rmax.init(jax.random.key(0), example(), hparams)
     assert float(state.value.max()) == pytest.approx(1 / 0.4**2)

@@ -16,14 +16,15 @@ from jax.tree_util import Partial
 from jaxltl.algos import trust_region
 from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import Moments, scale_of, updated_moments
-from jaxltl.algos.trust_region import Hparams
-from jaxltl.algos.trust_region import _policy_networks as nets
+from jaxltl.algos.trust_region import Hparams, learner
+from jaxltl.algos.trust_region import policies as nets
 from jaxltl.algos.trust_region._step import (
     Case,
     Dual,
-    cpo_dual,
-    cpo_weights,
+    cpo_step,
     fisher_product,
+    kl_divergence,
+    log_density,
     surrogate,
 )
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
@@ -204,7 +205,7 @@ def random_problem(rng, size=None):
     return g, b, h, c, delta
 
 
-dual_of, weights_of = jax.jit(cpo_dual), jax.jit(cpo_weights)
+step_of = jax.jit(cpo_step)
 
 
 def numbers_of(g, b, h, c, delta):
@@ -214,8 +215,8 @@ def numbers_of(g, b, h, c, delta):
 
 def solved(*problem):
     numbers, x, y = numbers_of(*problem)
-    reward, cost = map(float, weights_of(*numbers))
-    return Dual(*map(float, dual_of(*numbers))), reward * x + cost * y
+    dual, (reward, cost) = jax.tree.map(np.asarray, step_of(*numbers))
+    return Dual(*map(float, dual)), reward * x + cost * y
 
 
 def by_slsqp(target, b, h, c, delta, start, *, limited=True):
@@ -300,7 +301,7 @@ def test_the_multipliers_are_those_of_the_papers_comparison():
     for _ in range(500):
         numbers, _, _ = numbers_of(*random_problem(rng, size=4))
         q, r, s, c, delta = numbers
-        dual = dual_of(*numbers)
+        dual, _ = step_of(*numbers)
         parallel = q * s - r * r < 1e-9 * q * s
         touching = abs(c * c / s - 2 * delta) < 1e-9 * delta
         if dual.case not in (Case.ACTIVE, Case.INACTIVE) or parallel or touching or c == 0:
@@ -308,10 +309,6 @@ def test_the_multipliers_are_those_of_the_papers_comparison():
         seen.add(int(dual.case))
         np.testing.assert_allclose((dual.trust, dual.cost), printed(*numbers), rtol=1e-6)
     assert len(seen) == 2
-
-
-def dual_and_weights(*numbers):
-    return cpo_dual(*numbers), cpo_weights(*numbers)
 
 
 def test_opposite_gradients_at_the_edge_have_a_multiplier():
@@ -322,7 +319,7 @@ def test_opposite_gradients_at_the_edge_have_a_multiplier():
     delta = rng.lognormal(size=2000)
     q, r, s = (g * g).sum(1), -(g * g).sum(1) * scale, (g * g).sum(1) * scale**2
     edge = np.sqrt(2 * delta * s) * (1 + rng.integers(-3, 3, 2000) * 1.1e-16)
-    dual = jax.tree.map(np.asarray, jax.vmap(cpo_dual)(q, r, s, edge, delta))
+    dual, _ = jax.tree.map(np.asarray, jax.vmap(cpo_step)(q, r, s, edge, delta))
     assert (dual.case != Case.FREE).all() and (dual.trust + dual.cost > 0).all()
 
 
@@ -332,10 +329,10 @@ def test_multipliers_certify_the_step():
     problems = [random_problem(rng, size=3) for _ in range(2000)]
     parts = [numbers_of(*p) for p in problems]
     numbers = tuple(np.array([p[0][i] for p in parts]) for i in range(5))
-    duals, weights = jax.tree.map(np.asarray, jax.vmap(dual_and_weights)(*numbers))
+    duals, weights = jax.tree.map(np.asarray, jax.vmap(cpo_step)(*numbers))
     for i, (g, b, h, c, delta) in enumerate(problems):
         trust, cost, case = (x[i] for x in duals)
-        step = weights[0][i] * parts[i][1] + weights[1][i] * parts[i][2]
+        step = weights[i][0] * parts[i][1] + weights[i][1] * parts[i][2]
         # Lengths in H, so that the tolerances have the scale of the problem.
         q, _, s, *_ = parts[i][0]
         edge = np.sqrt(2 * delta)
@@ -376,7 +373,7 @@ def test_multipliers_certify_the_step():
     ],
 )
 def test_boundary_cases(numbers, case, weights):
-    solve = jax.jit(dual_and_weights)
+    solve = jax.jit(cpo_step)
     dual, found = solve(*numbers)
     assert int(dual.case) == case
     np.testing.assert_allclose(found, weights, atol=1e-12)
@@ -408,7 +405,7 @@ def test_fisher_products_are_those_of_the_hessian(small):
 
     def divergence(x):
         new = nets.gaussian(unravel(x), SMALL, inputs)
-        return nets.kl_divergence(old, new).mean()
+        return kl_divergence(old, new).mean()
 
     @jax.jit
     def products(x, directions):
@@ -452,7 +449,7 @@ def test_gradients_of_the_gains_are_finite_differences(small):
     np.testing.assert_allclose(gains(flat), 0, atol=1e-15)  # but for rounding in sums
     slope = jax.jit(jax.jacrev(gains))(flat)
     score = jax.jit(
-        jax.jacrev(lambda x: nets.log_density(action, *nets.gaussian(unravel(x), SMALL, inputs)))
+        jax.jacrev(lambda x: log_density(action, *nets.gaussian(unravel(x), SMALL, inputs)))
     )(flat)
     np.testing.assert_allclose(slope, weighted @ score, rtol=1e-10)
     for key in jax.random.split(jax.random.key(4), 3):
@@ -467,10 +464,10 @@ def test_divergence_and_density_are_those_of_gaussians():
     spread, wide = np.exp(rng.normal(size=(2, 3)))
     x = mean + spread * rng.normal(size=(200_000, 3))
     one, two = (
-        nets.log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
+        log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
         for m, s in ((mean, spread), (other, wide))
     )
-    found = nets.kl_divergence((mean, spread), (other, wide))
+    found = kl_divergence((mean, spread), (other, wide))
     error = np.std(one - two) / np.sqrt(len(x))
     assert abs(np.mean(one - two) - found) < 4 * error
     exact = [scipy.stats.norm(m, s).logpdf(x).sum(1) for m, s in ((mean, spread), (other, wide))]
@@ -533,7 +530,7 @@ def test_new_moments_do_not_change_the_policy(hidden):
     network = nets.mean_network(hparams, 2, jnp.float64)
     points = 3 * np.random.default_rng(0).normal(size=(10, 3))
     before = jax.jit(network.init)(jax.random.key(1), points)["params"]
-    after = jax.jit(nets.refolded)(before, old, new)
+    after = jax.jit(learner.refolded)(before, old, new)
     said = jax.jit(lambda p, m: network.apply({"params": p}, nets.normalized(m, hparams, points)))
     np.testing.assert_allclose(said(before, old), said(after, new), rtol=1e-9, atol=1e-12)
     change = jax.tree.map(lambda x, y: np.abs(np.subtract(x, y)).max(), before, after)
@@ -648,13 +645,13 @@ def ended_step(ends, world, action, key):
 @jax.jit
 def estimated(state, batch):
     inputs = nets.normalized(state.moments, SMALL, batch.observation)
-    return trust_region.learner._estimated(state, batch, inputs, SMALL)
+    return learner._estimated(state, batch, inputs, SMALL)
 
 
 @jax.jit
 def values_of(state, observation, progress):
     seen = nets.normalized(state.moments, SMALL, observation)
-    return nets.values_at(state.values, SMALL, jnp.append(seen, progress))
+    return learner.values_at(state.values, SMALL, jnp.append(seen, progress))
 
 
 @pytest.mark.parametrize(
@@ -725,7 +722,9 @@ def test_values_of_what_is_cut_off_are_those_of_what_goes_on(time_limit, horizon
     state, metrics = trust_region.train(jax.random.key(0), problem, hparams, num_steps=60)
     inputs = nets.normalized(state.moments, hparams, jnp.arange(4.0)[:, None, None])
     mean, deviation = state.value_moments[..., None, None]
-    found = nets.values_at(state.values, hparams, nets.value_inputs(inputs)) * deviation + mean
+    found = (
+        learner.values_at(state.values, hparams, learner.value_inputs(inputs)) * deviation + mean
+    )
     np.testing.assert_allclose(found[0, :, 0], values, atol=0.05)
     np.testing.assert_allclose(found[1, :, 0], [15 / 8, 7 / 4, 3 / 2, 1], atol=0.05)
     np.testing.assert_allclose(metrics.cost, 15 / 8, rtol=1e-6)

@@ -61,7 +61,7 @@ def chosen(
     allowed: jax.Array | None,
     *,
     sampled: bool,
-    squash: str,
+    squash: str | None,
 ) -> jax.Array:
     """The action of an agent: sampled, or the most likely one."""
     kind = jax.tree.leaves(parameters)[0].dtype

@@ -8,11 +8,14 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.tree_util import Partial
 
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
+from jaxltl.core import struct
 from jaxltl.core.array_types import Key, Numeric, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, allowed_in
+from jaxltl.core.environments.episodes import Agent
 
 CarryT = TypeVar("CarryT")
 FiguresT = TypeVar("FiguresT")
@@ -71,6 +74,32 @@ def transition(
             last=environment.observe(after.world),
         ),
     )
+
+
+def acting(
+    evaluate: Partial,
+    actions: actions_of.Actions,
+    how: tuple[bool, str | None],
+    memory: PyTree = (),
+) -> Agent:
+    """The agent of an actor `evaluate`; `how`: whether actions are sampled, and their squash."""
+    return Agent(Partial(_act, struct.Static(how), actions, evaluate), memory)
+
+
+def _act(
+    how: struct.Static,
+    actions: actions_of.Actions,
+    evaluate: Evaluate,
+    memory: PyTree,
+    observation: PyTree,
+    allowed: jax.Array | None,
+    key: Key,
+) -> tuple[jax.Array, PyTree]:
+    """An action; a sampled one fails without a key, by which proofs refuse it."""
+    sampled, squash = how.value
+    output = evaluate(memory, observation)
+    action = actions_of.chosen(key, actions, output.action, allowed, sampled=sampled, squash=squash)
+    return action, output.memory
 
 
 def generalized_advantages(

@@ -1,60 +1,70 @@
-"""Gradient transformations of optax by name."""
+"""Gradient transformations of optax by name, and steps of gradient descent."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator
+from collections.abc import Callable
+from typing import NamedTuple
 
+import jax
 import optax
 
+from jaxltl.algos.common.trees import strong
 from jaxltl.core.array_types import Numeric, PyTree
 
-_SCALINGS = {"adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity}
-# With their own search, with a random key, deprecated.
-_OTHERS = ("lbfgs", "noisy_sgd", "optimistic_adam")
+_SCALINGS = {
+    "adam": optax.scale_by_adam,
+    "rmsprop": optax.scale_by_rms,
+    "sgd": optax.identity,
+    "sign": optax.scale_by_sign,
+}
+_KNOWN = (
+    "adabelief adadelta adafactor adagrad adam adamax adamaxw adamw adan amsgrad fromage lamb lars "
+    "lion nadam nadamw novograd optimistic_adam_v2 optimistic_gradient_descent radam rmsprop rprop "
+    "sgd sign_sgd signum sm3 yogi"
+)
+NAMES = tuple(name for name in _KNOWN.split() if hasattr(optax, name))  # with a learning rate alone
 
 
-def _names() -> Iterator[str]:
-    """The optimizers of optax that need a learning rate alone."""
-    for name in dir(optax):
-        made = getattr(optax, name)
-        if name in _OTHERS or name.startswith("scale") or not callable(made):
-            continue
-        if inspect.isclass(made):
-            continue
-        try:
-            first, *rest = inspect.signature(made).parameters.values()
-        except ValueError:  # no signature, or no parameters
-            continue
-        if first.name == "learning_rate" and all(x.default is not x.empty for x in rest):
-            yield name
+class Descent(NamedTuple):
+    """A gradient step: the loss and its parts before it, parameters and optimizer's state after it."""
 
-
-NAMES = tuple(_names())
+    loss: jax.Array
+    parts: PyTree
+    gradient_norm: jax.Array
+    parameters: PyTree
+    optimizer: PyTree
 
 
 def optimizer_of(hparams: PyTree) -> optax.GradientTransformationExtraArgs:
-    """The optimizer of hyperparameters ``optimizer`` and ``learning_rate``."""
-    return optimizer(hparams.optimizer, hparams.learning_rate)
+    """The optimizer of hyperparameters ``optimizer``, by default Adam, and ``learning_rate``."""
+    return optimizer(getattr(hparams, "optimizer", "adam"), hparams.learning_rate)
 
 
-def descended(
-    hparams: PyTree, gradient: PyTree, state: PyTree, **more: PyTree
-) -> tuple[PyTree, PyTree]:
-    """Parameters of a learner's state, and its optimizer's state, after a step along a gradient."""
+def start(hparams: PyTree, parameters: PyTree) -> PyTree:
+    """The initial state of the optimizer of hyperparameters."""
+    return strong(optimizer_of(hparams).init(parameters))
+
+
+def descend(
+    objective: Callable[[PyTree], tuple[jax.Array, PyTree]], state: PyTree, hparams: PyTree
+) -> Descent:
+    """A step on the loss of `objective`, from the parameters and the optimizer of a `state`."""
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(state.parameters)
+    line_search = {"value": loss, "grad": gradient, "value_fn": lambda x: objective(x)[0]}
     updates, memory = optimizer_of(hparams).update(
-        gradient, state.optimizer, state.parameters, **more
+        gradient, state.optimizer, state.parameters, **line_search
     )
-    return optax.apply_updates(state.parameters, updates), memory
+    parameters = optax.apply_updates(state.parameters, updates)
+    return Descent(loss, parts, optax.tree.norm(gradient), parameters, memory)
 
 
 def optimizer(name: str, learning_rate: Numeric) -> optax.GradientTransformationExtraArgs:
-    """An optimizer of optax; ``"lbfgs"`` ignores the rate."""
+    """An optimizer of optax, or ``"sign"`` of the gradient's signs; ``"lbfgs"`` ignores the rate."""
     if name == "lbfgs":
         return optax.lbfgs()
+    if name in _SCALINGS:
+        rate = optax.scale_by_learning_rate(learning_rate)
+        return optax.with_extra_args_support(optax.chain(_SCALINGS[name](), rate))
     if name not in NAMES:
         raise ValueError(f"optimizer={name!r}; choose one of {', '.join(('lbfgs', *NAMES))}.")
-    if name not in _SCALINGS:
-        return optax.with_extra_args_support(getattr(optax, name)(learning_rate))
-    rate = optax.scale_by_learning_rate(learning_rate)
-    return optax.with_extra_args_support(optax.chain(_SCALINGS[name](), rate))
+    return optax.with_extra_args_support(getattr(optax, name)(learning_rate))

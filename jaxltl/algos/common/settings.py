@@ -159,6 +159,24 @@ def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> Metrics
     return dataclasses.replace(cast(Any, metrics), status=status)
 
 
+def require_own(*given: tuple[object, type]) -> None:
+    """Validation that each object of `given` is of a learner's type: State, Problem or Hparams.
+
+    Raises:
+      ValueError: naming the function that makes such an object.
+
+    >>> from jaxltl.algos import ppo
+    >>> require_own((0.5, ppo.Hparams))
+    Traceback (most recent call last):
+    ValueError: hparams is float; give ppo.Hparams.
+    """
+    makers = {"State": "one of {0}.init or {0}.train", "Problem": "one of {0}.make_problem"}
+    for value, kind in given:
+        learner, name = kind.__module__.split(".")[2], kind.__name__
+        remedy = makers.get(name, "{0}.Hparams").format(learner)
+        validation.instance(name.lower(), value, kind, remedy)
+
+
 def require_arrays(**trees: PyTree) -> None:
     """Validation of `trees` by name: every leaf is an array or a number.
 

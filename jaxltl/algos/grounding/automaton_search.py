@@ -32,15 +32,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.algos.common.settings import Number
-from jaxltl.algos.grounding.hypotheses import step_log_likelihood
+from jaxltl.algos.grounding.hypotheses import batch_log_likelihood
 from jaxltl.algos.grounding.problem import LinearGrounding, Problem, joined_demonstrations
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.models import MDP, Trajectories, stack_products
 from jaxltl.core.models.product import distinct_labels
 
 SCALES = (10.0, 25.0, 50.0, 100.0)
-_BATCH = 32
 _PENALTY = 2.0  # nats for each moving transition and each event: suppresses chance improvements
 _MOST_STEPS = 60
 _SEQUENCES = 500  # starts of each kind that are scored, drawn if there are more
@@ -190,31 +188,16 @@ def _reachable(moves: np.ndarray) -> set[int]:
 
 def _scores(problem: Problem, discount: float, moves: np.ndarray, event: np.ndarray) -> np.ndarray:
     """Log-likelihoods ``float64[C, B]`` of candidates at all scales."""
-    found = np.zeros((len(moves), len(SCALES)))
-    for first in range(0, len(moves), _BATCH):
-        part = np.arange(first, min(first + _BATCH, len(moves)))
-        filled = np.resize(part, _BATCH)
-        table = _batch(problem, discount, jnp.asarray(moves[filled]), jnp.asarray(event[filled]))
-        found[part] = np.asarray(table, float)[: len(part)]
-    return found
+    changes = (moves.astype(np.int32), event.astype(problem.model.dtype))
+    return batch_log_likelihood(_with_table, problem, discount, SCALES, changes).sum(-1)
 
 
-@jax.jit
-def _batch(problem: Problem, discount: Number, moves: jax.Array, event: jax.Array) -> jax.Array:
-    def one(delta: jax.Array, rewarded: jax.Array) -> jax.Array:
-        model = problem.model
-        wide = jnp.broadcast_to(delta, (len(model.letter), *delta.shape)).astype(jnp.int32)
-        model = replace(
-            model, automaton=replace(model.automaton, delta=cast(NDArray[np.int32], wide))
-        )
-        own = replace(problem, model=model, event=rewarded.astype(model.dtype))
-        return jax.vmap(
-            lambda scale: jnp.sum(
-                step_log_likelihood(own, discount, jnp.asarray(model.letter), scale)
-            )
-        )(jnp.asarray(SCALES, model.dtype))
-
-    return jax.vmap(one)(moves, event)
+def _with_table(problem: Problem, change: tuple[jax.Array, jax.Array]) -> Problem:
+    delta, event = change
+    model = problem.model
+    wide = cast(NDArray[np.int32], jnp.broadcast_to(delta, (len(model.letter), *delta.shape)))
+    model = replace(model, automaton=replace(model.automaton, delta=wide))
+    return replace(problem, model=model, event=event)
 
 
 def _as_automaton(

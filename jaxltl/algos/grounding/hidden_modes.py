@@ -29,7 +29,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import learner, optimizers, trees
@@ -201,18 +200,15 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         "move": jnp.zeros((modes, modes), dtype),
         "move_in": jnp.zeros((problem.world.num_states, modes, modes), dtype),
     }
-    optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
-    return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
+    parameters = trees.strong(parameters)
+    return State(key, jnp.int32(0), parameters, optimizers.start(hparams, parameters))
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One step of the optimiser on :func:`objective`; deterministic given the state."""
-    (loss, (_, status)), gradient = jax.value_and_grad(objective, has_aux=True)(
-        state.parameters, problem, hparams
-    )
-    parameters, optimizer = optimizers.descended(hparams, gradient, state)
-    metrics = Metrics(loss, optax.tree.norm(gradient), status)
-    return State(state.key, state.step + 1, parameters, optimizer), metrics
+    loss_of = partial(objective, problem=problem, hparams=hparams)
+    loss, (_, status), norm, *new = optimizers.descend(loss_of, state, hparams)
+    return State(state.key, state.step + 1, *new), Metrics(loss, norm, status)
 
 
 # Metrics describe the state before a step.

@@ -36,6 +36,7 @@ from jaxltl.algos.common.settings import Number
 from jaxltl.algos.grounding.likelihood import certain_memory, motive_log_policy
 from jaxltl.algos.grounding.problem import Hparams, Problem
 from jaxltl.core import struct
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata import Automaton, is_equivalent
 from jaxltl.core.models.product import Product
 
@@ -257,24 +258,50 @@ def _scores(
     letters = letters_of(automaton_of(problem), np.moveaxis(meaning[rows], 1, -1))  # [C, W, S]
     possible = (letters >= 0).all((1, 2))
     found = np.full((len(rows), len(scales), len(problem.length)), -np.inf)
-    chosen = np.flatnonzero(possible)
-    size = min(_BATCH, 1 << max(len(chosen) - 1, 0).bit_length())
-    for first in range(0, len(chosen), size):
-        part = chosen[first : first + size]
-        filled = np.resize(part, size)  # one program for all batches
-        table = _batch(problem, discount, jnp.asarray(letters[filled]), jnp.asarray(scales))
-        found[part] = np.asarray(table, float)[: len(part)]
+    found[possible] = batch_log_likelihood(
+        _with_letters, problem, discount, scales, letters[possible]
+    )
     return found
 
 
-@jax.jit
-def _batch(problem: Problem, discount: Number, letters: jax.Array, scales: jax.Array) -> jax.Array:
-    def one(letter: jax.Array) -> jax.Array:
-        return jax.vmap(
-            lambda scale: jnp.sum(step_log_likelihood(problem, discount, letter, scale), axis=1)
-        )(scales.astype(problem.model.dtype))
+def _with_letters(problem: Problem, letter: jax.Array) -> Problem:
+    return replace(problem, model=replace(problem.model, letter=letter))
 
-    return jax.vmap(one)(letters)
+
+def batch_log_likelihood(
+    candidate: Callable[[Problem, PyTree], Problem],
+    problem: Problem,
+    discount: Number,
+    scales: ArrayLike,
+    changes: PyTree,
+) -> np.ndarray:
+    """Log-likelihoods ``float64[C, B, N]`` of candidates, each made of a problem and a row of `changes`."""
+    count = len(jax.tree.leaves(changes)[0])
+    size = min(_BATCH, 1 << max(count - 1, 0).bit_length())
+    grid, found = jnp.asarray(scales, problem.model.dtype), []
+    for first in range(0, count, size):
+        part = np.arange(first, min(first + size, count))
+        filled = np.resize(part, size)  # one program for all batches
+        rows = jax.tree.map(lambda x, filled=filled: jnp.asarray(x[filled]), changes)
+        table = _batch(candidate, problem, discount, grid, rows)
+        found.append(np.asarray(table, float)[: len(part)])
+    return np.concatenate(found) if found else np.zeros((0, len(grid), len(problem.length)))
+
+
+@partial(jax.jit, static_argnames="candidate")
+def _batch(
+    candidate: Callable[[Problem, PyTree], Problem],
+    problem: Problem,
+    discount: Number,
+    scales: jax.Array,
+    changes: PyTree,
+) -> jax.Array:
+    def one(change: PyTree) -> jax.Array:
+        made = candidate(problem, change)
+        likelihood = partial(step_log_likelihood, made, discount, jnp.asarray(made.model.letter))
+        return jnp.sum(jax.vmap(likelihood)(scales), axis=2)
+
+    return jax.vmap(one)(changes)
 
 
 def step_log_likelihood(

@@ -29,7 +29,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.settings import RunState
@@ -168,24 +167,22 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         "log_scale": jnp.log(jnp.asarray(hparams.scale, dtype)),
         "weights": jnp.zeros(problem.features.shape[-1], dtype),
     }
-    optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
-    return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
+    parameters = trees.strong(parameters)
+    return State(key, jnp.int32(0), parameters, optimizers.start(hparams, parameters))
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One step of the optimiser on :func:`objective`; deterministic given the state."""
-    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
-        state.parameters, problem, hparams
-    )
-    parameters, optimizer = optimizers.descended(hparams, gradient, state)
+    loss_of = partial(objective, problem=problem, hparams=hparams)
+    loss, parts, norm, *new = optimizers.descend(loss_of, state, hparams)
     metrics = Metrics(
         loss=loss,
         neg_log_likelihood=-jnp.sum(parts.log_likelihood),
         entropy=parts.entropy,
-        gradient_norm=optax.tree.norm(gradient),
+        gradient_norm=norm,
         status=parts.status,
     )
-    return State(state.key, state.step + 1, parameters, optimizer), metrics
+    return State(state.key, state.step + 1, *new), metrics
 
 
 # Metrics describe the state before a step.

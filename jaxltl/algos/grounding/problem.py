@@ -20,7 +20,7 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import MDP, Product, Trajectories, make_trajectories
 from jaxltl.core.models.construct.batch import stack_observations, stack_products, unstack_product
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.validation import Range
+from jaxltl.core.validation import Range, errors_in
 
 _MAX_SYMBOLS = 10  # 2^P letters
 
@@ -213,31 +213,19 @@ def joined_demonstrations(
         )
     batches, number = [], []
     for w, (world, given) in enumerate(zip(worlds, several, strict=True)):
-        rows = [
-            list(zip(s[:n], a[:n], strict=True))
-            for s, a, n in zip(
-                np.asarray(given.state).tolist(),
-                np.asarray(given.action).tolist(),
-                np.asarray(given.length).tolist(),
-                strict=True,
-            )
-            if n
-        ]
+        columns = (np.asarray(x).tolist() for x in (given.state, given.action, given.length))
+        rows = [list(zip(s[:n], a[:n], strict=True)) for s, a, n in zip(*columns, strict=True) if n]
         if rows:
-            try:
+            with errors_in(f"demonstrations in world {w}: "):
                 batches.append(make_trajectories(world, rows))
-            except ValueError as error:
-                raise ValueError(f"demonstrations in world {w}: {error}") from error
             number += [w] * len(rows)
     if not batches:
         raise ValueError("there are no demonstrations; give at least one.")
     width = max(x.state.shape[1] for x in batches)
-
-    def wide(rows: jax.Array) -> np.ndarray:
-        return np.pad(np.asarray(rows), ((0, 0), (0, width - rows.shape[1])))
-
-    state = np.concatenate([wide(x.state) for x in batches])
-    action = np.concatenate([wide(x.action) for x in batches])
+    state, action = (
+        np.concatenate([np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in tables])
+        for tables in ([x.state for x in batches], [x.action for x in batches])
+    )
     length = np.concatenate([np.asarray(x.length) for x in batches])
     return to_jax((np.asarray(number, np.int32), state, action, length))
 

@@ -33,6 +33,7 @@ Example: two demonstrations that reach the goal, and two features.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
-from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common import learner, optimizers
 from jaxltl.algos.common.settings import Number, RunState, static, traced
 from jaxltl.algos.mlirl import _line_search as line_search
 from jaxltl.algos.mlirl.features import (
@@ -337,7 +338,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
             parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
         )
     else:
-        optimizer = trees.strong(optimizers.optimizer_of(hparams).init(parameters))
+        optimizer = optimizers.start(hparams, parameters)
     return State(key, jnp.int32(0), parameters, value, optimizer)
 
 
@@ -364,17 +365,18 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
             return _evaluate(parameters, problem, hparams, _usable(before.parts))
 
         optimizer, before = line_search.step(evaluate, state.optimizer)
+        loss, parts, norm = before.loss, before.parts, optax.tree.norm(before.gradient)
         parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
     else:
-        before = _evaluate(state.parameters, problem, hparams, state.value)
-        parameters, optimizer = optimizers.descended(hparams, before.gradient, state)
-        value = _usable(before.parts)
+        loss_of = partial(objective, problem=problem, hparams=hparams, initial=state.value)
+        loss, parts, norm, parameters, optimizer = optimizers.descend(loss_of, state, hparams)
+        value = _usable(parts)
     metrics = Metrics(
-        loss=before.loss,
-        neg_log_likelihood=before.parts.neg_log_likelihood,
-        satisfaction=before.parts.satisfaction,
-        gradient_norm=optax.tree.norm(before.gradient),
-        status=before.parts.status,
+        loss=loss,
+        neg_log_likelihood=parts.neg_log_likelihood,
+        satisfaction=parts.satisfaction,
+        gradient_norm=norm,
+        status=parts.status,
     )
     return State(state.key, state.step + 1, parameters, value, optimizer), metrics
 

@@ -44,18 +44,20 @@ for seconds, so only shapes are shown.)
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
+from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import action_distributions as actions_of, learner, trees
 from jaxltl.algos.common.actor_critic import (
     ActorCritic as ActorCritic,
+    Output,
     RecurrentActorCritic as RecurrentActorCritic,
     default_network,
     evaluated,
@@ -64,10 +66,11 @@ from jaxltl.algos.common.actor_critic import (
     initial_memory,
     require_network,
 )
-from jaxltl.algos.common.moments import no_moments, normalized
-from jaxltl.algos.common.schedules import at as _at
-from jaxltl.algos.ppo._collect import collected
-from jaxltl.algos.ppo._update import descent, improved
+from jaxltl.algos.common.collection import acting, minibatch_epochs
+from jaxltl.algos.common.moments import no_moments
+from jaxltl.algos.common.schedules import at
+from jaxltl.algos.common.settings import require_own
+from jaxltl.algos.ppo._collect import Rows, collected, evaluate
 from jaxltl.algos.ppo.state import Hparams, Metrics, Problem, State, Walkers
 from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
@@ -137,13 +140,8 @@ def make_problem(
     return Problem(environment=environment, memory=memory, network=network)
 
 
-def _require_ours(problem: Problem, hparams: Hparams) -> None:
-    validation.instance("problem", problem, Problem, "one of ppo.make_problem")
-    validation.instance("hparams", hparams, Hparams, "ppo.Hparams")
-
-
 def _check(problem: Problem, hparams: Hparams) -> None:
-    _require_ours(problem, hparams)
+    require_own((problem, Problem), (hparams, Hparams))
     validation.integer(
         "num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1
     )
@@ -180,28 +178,9 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> Agent:
-    validation.instance("state", state, State, "one of ppo.init or ppo.train")
-    _require_ours(problem, hparams)
-    run = (problem, state.parameters, state.moments)
-    return Agent(Partial(_actor(sampled, hparams.squash), run), problem.memory)
-
-
-@cache  # the same function each time, so that what runs an agent is compiled once
-def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, PyTree]]:
-    def act(
-        run: tuple[Problem, PyTree, PyTree],
-        memory: PyTree,
-        observation: PyTree,
-        allowed: jax.Array | None,
-        key: Key,
-    ) -> tuple[jax.Array, PyTree]:
-        problem, parameters, moments = run
-        output = evaluated(problem, parameters, memory, normalized(moments, observation))
-        actions, given = problem.environment.actions, output.action
-        action = actions_of.chosen(key, actions, given, allowed, sampled=sampled, squash=squash)
-        return action, output.memory
-
-    return act
+    require_own((state, State), (problem, Problem), (hparams, Hparams))
+    run = Partial(evaluate, (problem, state.parameters, state.moments))
+    return acting(run, problem.environment.actions, (sampled, hparams.squash), problem.memory)
 
 
 # --- learning -------------------------------------------------------------------------------------
@@ -250,7 +229,9 @@ def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """T transitions of N environments, and some epochs of minibatches of them."""
     _check(problem, hparams)
-    validation.instance("state", state, State, "one of ppo.init or ppo.train")
+    require_own((state, State))
+    schedules = {name: getattr(hparams, name) for name in ("learning_rate", "clip", "value_clip")}
+    hparams = replace(hparams, **{name: at(x, state.step) for name, x in schedules.items()})
     collect_key, update_key = jax.random.split(learner.step_key(state))
     after, begun, rows, figures = collected(collect_key, state, problem, hparams)
     permitted, finite = figures.pop("permitted"), figures.pop("finite")
@@ -267,9 +248,129 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         **figures,
         **losses,
         transitions=made,
-        learning_rate=jnp.asarray(_at(hparams.learning_rate, state.step), losses["kl"].dtype),
+        learning_rate=jnp.asarray(hparams.learning_rate, losses["kl"].dtype),
         status=jnp.where(permitted, status, Status.INVALID).astype(jnp.int32),
     )
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)
+
+
+# --- the update -----------------------------------------------------------------------------------
+
+Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, or means
+
+
+def descent(hparams: Hparams) -> optax.GradientTransformation:
+    """Adam without its learning rate, which a schedule supplies."""
+    return optax.scale_by_adam(eps=hparams.adam_epsilon)
+
+
+def loss(
+    parameters: PyTree,
+    rows: Rows,
+    begun: PyTree,
+    problem: Problem,
+    hparams: Hparams,
+) -> tuple[jax.Array, Figures]:
+    """The loss (Schulman et al. 2017, equation 9) and its parts, of rows ``[N', ...]``::
+
+        mean of -min(r A, clip(r, 1 - c, 1 + c) A)
+              + value_weight (V - target)^2 / 2 - entropy_weight H,
+
+    with r the ratio of the new to the old probability of the action, and A the advantage. For a
+    network with memory, rows are ``[T, N', ...]`` of whole environments and `begun` their memories.
+    """
+    actions = problem.environment.actions
+    said = _said(parameters, rows, begun, problem)
+    batched = jax.vmap if rows.value.ndim == 1 else lambda f: jax.vmap(jax.vmap(f))
+    density = batched(partial(actions_of.log_density, actions))(said.action, rows.allowed, rows.raw)
+    entropy = batched(partial(actions_of.entropy, actions, squash=hparams.squash))(
+        said.action, rows.allowed
+    ).mean()
+    change = density - rows.log_density
+    ratio, advantage = jnp.exp(change), rows.advantage
+    target = advantage + rows.value
+    if hparams.normalize_advantage:
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    near = jnp.clip(ratio, 1 - hparams.clip, 1 + hparams.clip)
+    gain = jnp.minimum(ratio * advantage, near * advantage).mean()
+    value = said.value.astype(rows.value.dtype)
+    error = (value - target) ** 2
+    if hparams.value_clip is not None:
+        shift = jnp.clip(value - rows.value, -hparams.value_clip, hparams.value_clip)
+        error = jnp.maximum(error, (rows.value + shift - target) ** 2)
+    error = error.mean() / 2
+    total = -gain + hparams.value_weight * error - hparams.entropy_weight * entropy
+    return total, {
+        "policy_loss": -gain,
+        "value_loss": error,
+        "entropy": entropy,
+        "kl": jnp.mean(ratio - 1 - change),
+        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > hparams.clip, dtype=ratio.dtype),
+    }
+
+
+def _said(parameters: PyTree, rows: Rows, begun: PyTree, problem: Problem) -> Output:
+    say = jax.vmap(partial(evaluated, problem, parameters))
+    if not has_memory(problem):
+        return say((), rows.observation)
+
+    def on(memory: PyTree, row: PyTree) -> tuple[PyTree, Output]:
+        start, observation = row
+        memory = jax.vmap(lambda s, m: trees.choose(s, problem.memory, m))(start, memory)
+        said = say(memory, observation)
+        return said.memory, said._replace(memory=())
+
+    return lax.scan(on, begun, (rows.start, rows.observation))[1]
+
+
+def improved(
+    key: Key, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
+) -> tuple[PyTree, PyTree, Figures]:
+    """Parameters and optimiser state after the epochs, up to `target_kl`, and mean figures."""
+    recurrent, over = has_memory(problem), hparams.sharding
+    rows, begun = lanes.replicate((rows, begun), over)  # a minibatch may contain any of them
+    if not recurrent:
+        rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+
+    def update(carry: PyTree, chosen: jax.Array) -> tuple[PyTree, PyTree]:
+        *before, stopped = carry
+        some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
+        memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
+        some, memory = lanes.split_axis(some, over, int(recurrent)), lanes.split_axis(memory, over)
+        (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
+            before[0], some, memory, problem, hparams
+        )
+        slope, told = lanes.replicate((slope, told), over)
+        norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
+        told = told | {"gradient_norm": norm}
+        if hparams.target_kl is not None:
+            stopped |= told["kl"] > hparams.target_kl
+        finite = jnp.isfinite(norm)
+        if hparams.max_gradient_norm is not None:
+            shorter = jnp.minimum(1, hparams.max_gradient_norm / jnp.maximum(norm, 1e-38))
+            slope = jax.tree.map(lambda x: x * shorter.astype(x.dtype), slope)
+        change, optimizer = descent(hparams).update(slope, before[1])
+        parameters = jax.tree.map(
+            lambda x, u: x - (hparams.learning_rate * u).astype(x.dtype), before[0], change
+        )
+        made = finite & ~stopped
+        new = trees.choose(made, (parameters, optimizer), tuple(before))
+        return (*new, stopped), (told, made, ~finite & ~stopped)
+
+    (parameters, optimizer, _), (told, made, lost) = minibatch_epochs(
+        key,
+        update,
+        (state.parameters, state.optimizer, jnp.bool_(False)),
+        hparams.num_envs if recurrent else len(rows.value),
+        num_epochs=hparams.num_epochs,
+        num_minibatches=hparams.num_minibatches,
+    )
+    number = made.sum()
+    figures = {
+        name: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan)
+        for name, x in told.items()
+    }
+    figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.sum().astype(jnp.int32)}
+    return parameters, optimizer, figures

@@ -51,23 +51,18 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, pac, splitmix
-from jaxltl.algos.common.play import draw
-from jaxltl.algos.rmax._rollout import (
-    Rules,
-    Transition,
-    exploration,
-    move,
-    pair_flags,
-    record,
-    record_last,
-    required_visits,
-    solver_tolerance,
-    start_rollout,
-    unknown_reward,
-    update_model,
+from jaxltl.algos.common.play import (
+    draw,
+    draw_weighted,
+    observed_reward,
+    successor_slot,
+    take,
 )
 from jaxltl.algos.rmax.problem import Hparams, Metrics, Problem, State, reward_error
+from jaxltl.core import struct
 from jaxltl.core.array_types import Key, Numeric
+from jaxltl.core.models.ops.operators import sample_successor
+from jaxltl.core.values.discounted.warm_start import Models, span_iteration
 
 
 @jax.jit
@@ -110,13 +105,9 @@ def _step_if(
     """A step, or the same state without copying its arrays."""
     moves = jnp.where(active, hparams.moves_per_step, 0)
     moves = jnp.minimum(moves, loops.MAX_STEPS - state.moves).astype(jnp.int32)
-    rollout = loops.while_active(
-        lambda r, _: r.remaining > 0,
-        move,
-        start_rollout(state, moves),
-        _rules(state, problem, hparams),
-    )
-    state = update_model(state, record_last(rollout, problem), problem, hparams)
+    begin, rules = _start_rollout(state, moves), _rules(state, problem, hparams)
+    rollout = loops.while_active(lambda r, _: r.remaining > 0, _move, begin, rules)
+    state = _update_model(rollout, problem, hparams)
     state = replace(state, step=state.step + active)
     return state, measure(state, problem, hparams)
 
@@ -186,32 +177,218 @@ def observe(
         )
     if not 0 <= reward <= float(hparams.reward_bound):
         raise reward_error(s, action, reward, hparams)
-    seen = Transition(
-        state=state.position,
-        action=jnp.int32(action),
-        successor=jnp.int32(successor),
-        reward=jnp.asarray(reward, game.dtype),
-    )
+    seen = (state.position, *map(jnp.int32, (action, successor)), jnp.asarray(reward, game.dtype))
     return _observe(state, problem, hparams, seen)
 
 
+_Transition = tuple[jax.Array, ...]  # state, action, successor and reward
+
+
 @jax.jit
-def _observe(state: State, problem: Problem, hparams: Hparams, seen: Transition) -> State:
-    rollout = start_rollout(state, jnp.int32(1))
-    rollout = record(rollout, seen, _rules(state, problem, hparams), jnp.bool_(True))
-    return update_model(state, record_last(rollout, problem), problem, hparams)
+def _observe(state: State, problem: Problem, hparams: Hparams, seen: _Transition) -> State:
+    rules = _rules(state, problem, hparams)
+    rollout = _record(_start_rollout(state, jnp.int32(1)), seen, rules, jnp.bool_(True))
+    return _update_model(rollout, problem, hparams)
 
 
-def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
-    dtype, key = problem.game.dtype, learner.step_key(state)
-    return Rules(
+# --- rollouts between two updates of the model ---------------------------------------------------
+
+# A rollout changes one entry of each array at a time, so that a loop under `vmap` copies no arrays.
+
+
+@struct.dataclass
+class _Rules:
+    """Constants of one step."""
+
+    problem: Problem
+    hparams: Hparams
+    key: jax.Array
+    stream: splitmix.Stream
+    explore: jax.Array
+    enough: jax.Array
+
+
+def _rules(state: State, problem: Problem, hparams: Hparams) -> _Rules:
+    key = learner.step_key(state)
+    return _Rules(
         problem=problem,
-        flags=pair_flags(state.best, state.known_at),
+        hparams=hparams,
         key=jax.random.fold_in(key, 1),
         stream=splitmix.streams(jax.random.fold_in(key, 0)),
         explore=exploration(problem, hparams),
         enough=required_visits(problem, hparams),
-        bound=jnp.asarray(hparams.reward_bound, dtype),
-        restart=jnp.asarray(hparams.restart, dtype),
-        every=jnp.bool_(hparams.update == "every"),
     )
+
+
+@struct.dataclass
+class _Rollout:
+    """A rollout, which ends with a change of the model or after `remaining` moves.
+
+    Its last move was of a `pair`, which became `known`, or had a `fresh` successor.
+    """
+
+    state: State
+    remaining: jax.Array
+    pair: jax.Array
+    known: jax.Array
+    fresh: jax.Array
+
+
+def _start_rollout(state: State, moves: jax.Array) -> _Rollout:
+    """A rollout of at most some moves from the current position."""
+    return _Rollout(state, moves, jnp.int32(0), jnp.bool_(False), jnp.bool_(False))
+
+
+def _move(rollout: _Rollout, rules: _Rules) -> _Rollout:
+    """One move, if any remain."""
+    state, problem, game = rollout.state, rules.problem, rules.problem.game
+    dtype = game.dtype
+    count = state.moves.astype(jnp.uint32)
+    words = [splitmix.words(rules.stream, 4 * count + i) for i in range(4)]
+    restarts = splitmix.uniform(words[0], dtype) < jnp.asarray(rules.hparams.restart, dtype)
+    s = jnp.where(restarts, draw(problem.start_table, words[1]), state.position)
+    explores = splitmix.uniform(words[2], dtype) < rules.explore
+    mine = jnp.where(explores, take(problem.allowed, s), take(state.best, s))
+    weight = jnp.where(take(game.system, s), mine, take(problem.environment, s))
+    action = draw_weighted(weight, words[3])
+    # A deterministic game needs no key.
+    key = rules.key if game.num_successors == 1 else jax.random.fold_in(rules.key, state.moves)
+    successor = sample_successor(game, key, s, action)
+    reward = observed_reward(game, problem.reward, s, action, successor)
+    return _record(rollout, (s, action, successor, reward), rules, rollout.remaining > 0)
+
+
+def _record(rollout: _Rollout, seen: _Transition, rules: _Rules, active: jax.Array) -> _Rollout:
+    """The rollout after an observed transition, or unchanged if it is not active."""
+    (s, action, successor, observed), state = seen, rollout.state
+    game, every = rules.problem.game, rules.hparams.update == "every"
+    # Not flat: arrays that are reshaped in a loop are copied in every iteration.
+    place = (s, action)
+    was_known = take(state.known_at, place) >= 0
+    entry = (*place, successor_slot(game, s, action, successor))
+    # Written before it is read, else the whole array would be copied.
+    counts = state.counts.at[entry].add(active.astype(jnp.int32), mode="promise_in_bounds")
+    row = take(counts, place)
+    single = jnp.sum(take(game.mdp.probability, place) > 0) == 1
+    enough = single | (jnp.sum(row).astype(game.dtype) >= rules.enough)
+    first = active & (row[entry[-1]] == 1)
+    known, fresh = active & ~was_known & enough, first & was_known & every
+    # In place of the optimistic reward, which is larger.
+    least = jnp.where(first if every else known, observed, jnp.inf).astype(state.reward.dtype)
+    wrong = active & ~((observed >= 0) & (observed <= rules.hparams.reward_bound))
+    pair = s * game.num_actions + action
+    after = replace(
+        state,
+        moves=state.moves + active,
+        position=jnp.where(active, successor, state.position),
+        counts=counts,
+        reward=state.reward.at[entry].min(least, mode="promise_in_bounds"),
+        fault=jnp.where(wrong & (state.fault < 0), pair, state.fault),
+    )
+    rest = jnp.where(known | fresh, 0, rollout.remaining - 1)
+    return _Rollout(
+        state=after,
+        remaining=jnp.where(active, rest, rollout.remaining),
+        pair=jnp.where(active, pair, rollout.pair),
+        known=known | (~active & rollout.known),
+        fresh=fresh | (~active & rollout.fresh),
+    )
+
+
+# --- the optimistic model ----------------------------------------------------------------------
+
+
+def _update_model(rollout: _Rollout, problem: Problem, hparams: Hparams) -> State:
+    """The state after a rollout, with the model solved again if it changed."""
+    state, game, changed = rollout.state, problem.game, rollout.known | rollout.fresh
+    place = jnp.divmod(rollout.pair, game.num_actions)
+    # Every listed successor counts as observed at least once, which keeps the graph.
+    listed = take(game.mdp.probability, place) > 0
+    count = jnp.where(listed, jnp.maximum(take(state.counts, place), 1), 0)
+    row = take(state.probability, place)
+    row = jnp.where(rollout.known, count / jnp.sum(count).astype(game.dtype), row)
+    gain = jnp.sum(row * take(state.reward, place))
+    gain = jnp.where(changed, gain, take(state.gain, place))
+    known_at = jnp.where(rollout.known, state.moves, take(state.known_at, place))
+    state = replace(
+        state,
+        probability=state.probability.at[place].set(row, mode="promise_in_bounds"),
+        known_at=state.known_at.at[place].set(known_at, mode="promise_in_bounds"),
+        gain=state.gain.at[place].set(gain, mode="promise_in_bounds"),
+        num_known=state.num_known + rollout.known,
+        last_update=jnp.where(changed, state.moves, state.last_update),
+        num_updates=state.num_updates + changed,
+    )
+    # A loop of one iteration, which is skipped if no lane has changed.
+    value, error, best, _ = loops.while_active(
+        lambda carry, _: carry[-1],
+        _solve,
+        (state.value, state.error, state.best, changed),
+        (state.gain, state.probability, problem, hparams),
+    )
+    # Every allowed action then has positive probability, unless that underflows.
+    sure = state.always_almost_sure & (exploration(problem, hparams) / game.num_actions > 0)
+    return replace(state, value=value, error=error, best=best, always_almost_sure=sure)
+
+
+_Values = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+
+
+def _solve(carry: _Values, model: tuple[jax.Array, jax.Array, Problem, Hparams]) -> _Values:
+    """Value, error and near-optimal actions of a model that has changed."""
+    value, error, best, changed = carry
+    gain, probability, problem, hparams = model
+    dtype = problem.game.dtype
+    value, width, quantity = span_iteration(
+        problem.game,
+        problem.allowed,
+        Models(
+            gain,
+            probability,
+            value,
+            jnp.asarray(hparams.discount, dtype),
+            solver_tolerance(problem, hparams),
+            changed,
+        ),
+    )
+    # Within eps_1 minus twice the error by these values implies within eps_1 by the exact values.
+    tolerance = pac.action_tolerance(hparams.epsilon, hparams.discount)
+    strict = jnp.maximum(tolerance - 2 * width, 0).astype(dtype)
+    near = pac.near_optimal(quantity, problem.allowed & problem.game.system[:, None], strict)
+    error, best = jnp.where(changed, width, error), jnp.where(changed, near, best)
+    return value, error, best, jnp.zeros_like(changed)
+
+
+def unknown_reward(hparams: Hparams) -> jax.Array:
+    """The optimistic reward ``R_max / (1 - discount)`` of an unknown pair."""
+    return jnp.asarray(hparams.reward_bound) / (1 - jnp.asarray(hparams.discount))
+
+
+def exploration(problem: Problem, hparams: Hparams) -> jax.Array:
+    """The probability of drawing any allowed action instead of a near-optimal one."""
+    p = pac.exploration(hparams.epsilon, hparams.discount, hparams.reward_bound)
+    return jnp.asarray(p, problem.game.dtype)
+
+
+def required_visits(problem: Problem, hparams: Hparams) -> jax.Array:
+    """The visits after which a pair is known."""
+    visits = hparams.known_after
+    if visits is None:
+        visits = pac.visits(
+            hparams.epsilon,
+            hparams.failure,
+            hparams.discount,
+            hparams.reward_bound,
+            jnp.sum(problem.region),
+            problem.game.num_actions,
+        )
+    return jnp.asarray(visits, problem.game.dtype)
+
+
+def solver_tolerance(problem: Problem, hparams: Hparams) -> jax.Array:
+    """The error of the optimistic value at which a solve stops."""
+    dtype = problem.game.dtype
+    tolerance = pac.action_tolerance(hparams.epsilon, hparams.discount) / 4
+    rest = 1 - jnp.asarray(hparams.discount, dtype)
+    rounding = 8 * jnp.finfo(dtype).eps * jnp.asarray(unknown_reward(hparams), dtype) / rest
+    return jnp.maximum(tolerance, rounding).astype(dtype)

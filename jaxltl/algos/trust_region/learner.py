@@ -60,47 +60,35 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner, trees
-from jaxltl.algos.common.collection import masked_advantages
-from jaxltl.algos.common.moments import no_moments, updated_moments
-from jaxltl.algos.trust_region._policy_networks import (
-    fitted,
-    gaussian,
-    inputs_at,
-    kl_divergence,
-    mean_network,
-    normalized,
-    positive,
-    refolded,
-    value_inputs,
-    value_network,
-    values_at,
-    weighted_variance,
-)
+from jaxltl.algos.common.collection import masked_advantages, minibatch_epochs
+from jaxltl.algos.common.moments import Moments, no_moments, scale_of, updated_moments
+from jaxltl.algos.common.settings import applied, require_own
 from jaxltl.algos.trust_region._step import (
-    Surrogate,
     direction,
     fisher_product,
+    kl_divergence,
     line_search,
+    positive,
     surrogate,
 )
 from jaxltl.algos.trust_region.policies import (
-    Batch,
-    act,
-    greedy,
-    policy,
-    require_run,
-    require_state,
-    rollout,
-)
-from jaxltl.algos.trust_region.state import (
     METHODS,
+    Batch,
     Hparams,
-    Metrics,
+    Network,
     Problem,
     State,
+    act,
+    gaussian,
+    greedy,
     make_problem,
+    mean_network,
+    normalized,
     observed_vector,
+    policy,
+    rollout,
 )
+from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import require_key, some_action
 
@@ -125,8 +113,48 @@ __all__ = [
 ]
 
 
+@struct.metrics
+class Metrics:
+    """Figures of a step; scalars; means over finite trajectories of the policy before the step.
+
+    Attributes:
+      trajectories: sampled so far.
+      reward, cost: mean sum of a trajectory's rewards, and of its costs discounted by `cost_discount`.
+      cost_error: standard error of `cost`.
+      length: mean number of steps.
+      deviation: geometric mean of the actions' standard deviations.
+      kl: mean divergence of the step.
+      reward_gain, cost_gain: of the step, estimated by importance weights; the reward gain in the
+        discounted advantage that is maximised.
+      scale: factor of the line search; 0 if no step was accepted.
+      case: a code of :class:`Case`.
+      trust_multiplier, cost_multiplier: lambda and nu, the dual variables.
+      unexplained: ``float[V]``, share of the variance of the values' targets that networks miss.
+      nonfinite: trajectories with a number that is not finite; no other figure includes them.
+      status: COMPLETED; MAX_STEPS if no step was accepted; NONFINITE if `nonfinite` is positive or the
+        step was not finite (the policy then stays unchanged).
+    """
+
+    trajectories: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    cost_error: jax.Array
+    length: jax.Array
+    deviation: jax.Array
+    kl: jax.Array
+    reward_gain: jax.Array
+    cost_gain: jax.Array
+    scale: jax.Array
+    case: jax.Array
+    trust_multiplier: jax.Array
+    cost_multiplier: jax.Array
+    unexplained: jax.Array
+    nonfinite: jax.Array
+    status: jax.Array
+
+
 def _check(problem: Problem, hparams: Hparams) -> None:
-    require_run(problem, hparams)
+    require_own((problem, Problem), (hparams, Hparams))
     if hparams.method == "cpo" and problem.limit is None:
         raise ValueError('method="cpo" needs a limit: pass one to make_problem, or use "trpo".')
     if hparams.method == "cpo" and hparams.penalty is not None:
@@ -150,7 +178,7 @@ def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
     mean_key, value_key, first_key = jax.random.split(learner.init_key(key), 3)
     mean = mean_network(hparams, num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
     log_deviation = jnp.full(num_actions, jnp.log(hparams.initial_deviation), dtype)
-    values = jax.vmap(lambda k: value_network(hparams, dtype).init(k, jnp.zeros(size + 1, dtype)))(
+    values = jax.vmap(lambda k: _value_network(hparams, dtype).init(k, jnp.zeros(size + 1, dtype)))(
         jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
     )["params"]
     state = State(
@@ -176,7 +204,7 @@ def _begun(key: Key, problem: Problem, hparams: Hparams) -> State:
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """N trajectories, one step of the policy, and a fit of the value networks to the same samples."""
     _check(problem, hparams)
-    require_state(state)
+    require_own((state, State))
     draw_key, fit_key = jax.random.split(learner.step_key(state))
     batch = rollout(draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories)
     inputs = normalized(state.moments, hparams, batch.observation)
@@ -202,15 +230,35 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         moments=moments,
         trajectories=learner.saturating_add(state.trajectories, hparams.num_trajectories),
     )
-    left_out = weighted_variance(found, batch.valid)
+    (_, left_out), (_, total) = (_moments(x, batch.valid) for x in (found, value + found))
     return state, replace(
         told,
         trajectories=state.trajectories,
-        unexplained=left_out / positive(weighted_variance(value + found, batch.valid)),
+        unexplained=left_out / positive(total),
     )
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)
+
+
+# --- values -----------------------------------------------------------------------------------
+
+
+def _value_network(hparams: Hparams, dtype: jax.typing.DTypeLike) -> Network:
+    return Network(hparams.value_hidden, 1, 0.1, dtype)
+
+
+def values_at(values: PyTree, hparams: Hparams, inputs: jax.Array) -> jax.Array:
+    """Values ``float[V, ...]`` before scaling."""
+    network = _value_network(hparams, inputs.dtype)
+    return jax.vmap(lambda p: jnp.asarray(applied(network, p, inputs))[..., 0])(values)
+
+
+def value_inputs(inputs: jax.Array) -> jax.Array:
+    """``float[T, N, O + 1]``: standardised observations and the time."""
+    time = jnp.linspace(-1, 1, inputs.shape[0], dtype=inputs.dtype)
+    time = jnp.broadcast_to(time[:, None, None], (*inputs.shape[:2], 1))
+    return jnp.concatenate([inputs, time], -1)
 
 
 def _estimated(
@@ -220,9 +268,11 @@ def _estimated(
     mean, deviation = state.value_moments[..., None, None]
     value = values_at(state.values, hparams, value_inputs(inputs)) * deviation + mean
     value = jnp.where(batch.valid, value, 0)
-    length = batch.valid.sum(0)
+    times = value_inputs(inputs)[:, 0, -1]
+    time = times[jnp.minimum(batch.valid.sum(0), len(times) - 1)]  # at most that of the last step
     ending = normalized(state.moments, hparams, batch.last)
-    ending = values_at(state.values, hparams, inputs_at(ending, length, batch.valid.shape[0]))
+    ending = jnp.concatenate([ending, time[:, None]], -1)
+    ending = values_at(state.values, hparams, ending)
     after = jnp.where(batch.truncated, ending[0] * deviation[0, 0] + mean[0, 0], 0)
     reward = batch.reward
     if hparams.penalty is not None:
@@ -236,6 +286,60 @@ def _estimated(
             )
         )
     return value, jnp.stack(parts)
+
+
+def refolded(network: PyTree, old: Moments, new: Moments) -> PyTree:
+    """Parameters of the same function of observations under new moments."""
+    first = "hidden_0" if "hidden_0" in network else "out"
+    kernel, bias = network[first]["kernel"], network[first]["bias"]
+    size, spread = old.mean.shape[0], scale_of(old)
+    head = kernel[:size]
+    bias = bias + ((new.mean - old.mean) / spread) @ head
+    head = head * (scale_of(new) / spread)[:, None]
+    return {**network, first: {"kernel": kernel.at[:size].set(head), "bias": bias}}
+
+
+def fitted(
+    key: Key, state: State, inputs: jax.Array, target: jax.Array, valid: jax.Array, hparams: Hparams
+) -> tuple[PyTree, PyTree, jax.Array]:
+    """Value networks after Adam's steps on the squared error to targets ``float[V, T, N]``."""
+    mean, variance = _moments(target, valid)
+    moments = jnp.stack([mean, positive(jnp.sqrt(variance))])
+    target = (target - moments[0][:, None, None]) / moments[1][:, None, None]
+    # Nothing finite was seen: nothing is learned.
+    moments = jnp.where(valid.any(), moments, state.value_moments)
+    inputs, target = inputs.reshape(-1, inputs.shape[-1]), target.reshape(len(target), -1)
+    weight = valid.reshape(-1).astype(inputs.dtype)
+    optimizer = optax.adam(hparams.value_rate)
+
+    def loss(values: PyTree, chosen: jax.Array) -> jax.Array:
+        error = values_at(values, hparams, inputs[chosen]) - target[:, chosen]
+        return jnp.sum(weight[chosen] * error**2) / jnp.maximum(weight[chosen].sum(), 1)
+
+    def descend(carry: PyTree, chosen: jax.Array) -> PyTree:
+        values, memory = carry
+        updates, memory = optimizer.update(jax.grad(loss)(values, chosen), memory)
+        return (optax.apply_updates(values, updates), memory), None
+
+    (values, memory), _ = minibatch_epochs(
+        key,
+        descend,
+        (state.values, state.optimizer),
+        len(weight),
+        num_epochs=hparams.value_epochs,
+        num_minibatches=hparams.value_batches,
+    )
+    return values, memory, moments
+
+
+def _moments(x: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and variance ``float[V]`` of ``float[V, T, N]`` over valid entries."""
+    number = jnp.maximum(valid.sum(), 1)
+    mean = jnp.where(valid, x, 0).sum((1, 2)) / number
+    return mean, jnp.where(valid, (x - mean[:, None, None]) ** 2, 0).sum((1, 2)) / number
+
+
+# --- the policy -------------------------------------------------------------------------------
 
 
 def _improved(
@@ -267,10 +371,9 @@ def _improved(
     flat, unravel = ravel_pytree(parameters)
     old = gaussian(parameters, hparams, samples[0])
 
-    def surrogate_of(flat: jax.Array) -> Surrogate:
+    def surrogate_of(flat: jax.Array) -> tuple[jax.Array, jax.Array]:
         new = gaussian(unravel(flat), hparams, samples[0])
-        gains, kl = surrogate(new, old, samples[1], weighted.reshape(len(weighted), -1), samples[2])
-        return Surrogate(gains[0], gains[1] if constrained else jnp.zeros((), dtype), kl)
+        return surrogate(new, old, samples[1], weighted.reshape(len(weighted), -1), samples[2])
 
     def divergence(flat: jax.Array) -> jax.Array:
         some = slice(None, None, hparams.fisher_stride)
@@ -279,9 +382,8 @@ def _improved(
         return kl.sum() / jnp.maximum(samples[2][some].sum(), 1)
 
     product = fisher_product(divergence, flat)
-    delta = jnp.asarray(hparams.delta, dtype)
-    change, dual = direction(surrogate_of, product, flat, excess, delta, hparams)
-    scale, after = line_search(surrogate_of, flat, change, excess, delta, hparams)
+    change, dual = direction(surrogate_of, product, flat, excess, hparams)
+    scale, gains, kl = line_search(surrogate_of, flat, change, excess, hparams)
     accepted = scale > 0
     new = jnp.where(accepted, flat + scale * change, flat)
     nonfinite = jnp.sum(~batch.finite).astype(jnp.int32)
@@ -294,9 +396,9 @@ def _improved(
         cost_error=jnp.sqrt(spread / number),
         length=batch.valid.sum() / number.astype(dtype),
         deviation=jnp.exp(parameters["log_deviation"].mean()),
-        kl=after.kl,
-        reward_gain=after.reward,
-        cost_gain=after.cost,
+        kl=kl,
+        reward_gain=gains[0],
+        cost_gain=gains[1] if constrained else jnp.zeros((), dtype),
         scale=scale,
         case=dual.case,
         trust_multiplier=dual.trust,

@@ -40,22 +40,182 @@ Example: in one state the system may stay or move to the other state, where it i
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.tree_util import Partial
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common import learner, loops, splitmix
-from jaxltl.algos.common.play import draw, draw_alias, observed_reward, take
+from jaxltl.algos.common.play import (
+    check_reward,
+    cumulative,
+    draw,
+    draw_weighted,
+    environment_policy,
+    explicit_game,
+    observed_reward,
+    start_distribution,
+    take,
+    uniform_rows,
+)
 from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
-from jaxltl.algos.maximin_q.problem import Problem
 from jaxltl.core import struct
-from jaxltl.core.models.game import Game
+from jaxltl.core.graphs.end_components import bottom_components
+from jaxltl.core.models import Game, restrict
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
-from jaxltl.core.models.protocols import Array, Key, Numeric
+from jaxltl.core.models.protocols import Array, Key, Model, Numeric
+from jaxltl.core.types import require_shape
 from jaxltl.core.validation import Range
+
+
+@struct.dataclass
+class Problem:
+    """A game with rewards that the learner observes only along its transitions.
+
+    Attributes:
+      game: on an explicit MDP, such as ``restrict`` returns.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      allowed: ``bool[S, A]``: the mask at the system's states, all actions at the environment's.
+      behavior: ``float[S, A]``, the exploring policy of both players.
+      start: ``float[S]``, distribution over the chains' initial states.
+      exact: ``float[S]``, the minimax value, to measure the error; or None.
+      measured: ``bool[S]``, the states over which the error is measured; None with `exact`.
+      start_table: ``uint32[S]``, `start` as cumulative weights.
+      method: ``"generalized"`` or ``"maximin"``; static.
+    """
+
+    game: Game
+    reward: jax.Array
+    allowed: jax.Array
+    behavior: jax.Array
+    start: jax.Array
+    exact: Array
+    measured: Array
+    start_table: jax.Array
+    method: str = struct.field(pytree_node=False, default="generalized")
+
+    @property
+    def is_maximin(self) -> bool:
+        """True if the table has an entry for each answer of the environment."""
+        return self.method == "maximin"
+
+
+def make_problem(
+    game: Model,
+    reward: ArrayLike,
+    *,
+    allowed: ArrayLike | None = None,
+    environment: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    method: Literal["generalized", "maximin"] = "generalized",
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      game: a Game on an explicit MDP, or an MDP, in which the system always moves.
+      reward: ``float[S, A]`` or ``float[S, A, K]``, of the actions of both players.
+      allowed: ``bool[S, A]``, such as a permissive strategy's mask; default the available
+        actions. Read at the system's states only.
+      environment: ``float[S, A]``, exploring policy of the environment; default uniform. It should
+        try every action, because the learned value is a minimum over all of them.
+      start: ``float[S]``, distribution of the chains' initial states; default the game's.
+      method: ``"generalized"`` or ``"maximin"``.
+
+    Raises:
+      ValueError: a wrong shape, a reward that is not finite, a mask that allows an unavailable
+        action or none in a reachable state, rows or a start that are no distributions, or a game
+        that does not fit the method.
+    """
+    if method not in ("generalized", "maximin"):
+        raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
+    game = explicit_game(game)
+    system, mask = np.asarray(game.system), _mask(game, allowed)
+    start = start_distribution(game, start)
+    reachable = np.asarray(restrict(game, start, allowed=mask).base_state)
+    if method == "maximin":
+        _check_alternating(game, reachable)
+    behavior = (
+        uniform_rows(mask) if environment is None else environment_policy(mask, system, environment)
+    )
+    return Problem(
+        game=game,
+        reward=check_reward(game, reward),
+        allowed=jnp.asarray(mask),
+        behavior=jnp.asarray(behavior, game.dtype),
+        start=jnp.asarray(start, game.dtype),
+        exact=None,
+        measured=None,
+        start_table=jnp.asarray(cumulative(start)),
+        method=method,
+    )
+
+
+def with_exact_value(
+    problem: Problem, exact: ArrayLike, measured: ArrayLike | None = None
+) -> Problem:
+    """The `problem` with its known value `exact`, ``float[S]``, for ``Metrics.error``.
+
+    `measured`, ``bool[S]``, are the states of the error, such as :func:`recurrent_states`; default all
+    with an allowed action (with maximin: of the system).
+    """
+    exact = jnp.asarray(exact, problem.game.dtype)
+    if measured is None:
+        measured = problem.allowed.any(-1) & (problem.game.system | (not problem.is_maximin))
+    measured = jnp.asarray(measured, bool)
+    for name, array in (("exact", exact), ("measured", measured)):
+        require_shape(name, array, problem.start.shape)
+    return replace(problem, exact=exact, measured=measured)
+
+
+def recurrent_states(problem: Problem) -> jax.Array:
+    """The states of bottom strongly connected components under the exploring policy: ``bool[S]``.
+
+    Chains of the `problem` without restarts and greedy moves visit exactly these infinitely often.
+    """
+    part = restrict(problem.game, problem.start, allowed=problem.behavior > 0)
+    inside = bottom_components(part.model, part.model.available).inside.any(-1)
+    recurrent = np.zeros(problem.game.num_states, bool)
+    recurrent[np.asarray(part.base_state)[np.asarray(inside)]] = True
+    return jnp.asarray(recurrent)
+
+
+def _mask(game: Game, allowed: ArrayLike | None) -> NDArray[np.bool_]:
+    """Actions of both players: allowed ones of the system, available ones of the environment."""
+    system, available = np.asarray(game.system)[:, None], np.asarray(game.available)
+    if allowed is None:
+        return available
+    mask = np.asarray(allowed)
+    require_shape("allowed", mask, available.shape)
+    if mask.dtype != bool:
+        raise ValueError(f"allowed has dtype {mask.dtype}; it must be bool.")
+    wrong = np.argwhere(mask & ~available & system)
+    if wrong.size:
+        s, a = wrong[0]
+        raise ValueError(f"allowed: state {s} has no action {a}; allow available actions only.")
+    return np.where(system, mask, available)
+
+
+def _check_alternating(game: Game, reachable: NDArray[np.integer]) -> None:
+    """Raises ValueError unless turns alternate and the system's actions are deterministic."""
+    system = np.asarray(game.system)
+    used = np.asarray(game.mdp.probability) > 0
+    same = used & (system[np.asarray(game.mdp.successor)] == system[:, None, None])
+    random = (used.sum(-1) > 1) & system[:, None]
+    for wrong, requirement, reason in (
+        (same, "strictly alternating turns", "leads to a state of the same player"),
+        (random, "system actions with one successor", "has several"),
+    ):
+        place = np.argwhere(wrong[reachable])
+        if place.size:
+            raise ValueError(
+                f"method='maximin' needs {requirement}, but in state {reachable[place[0][0]]} "
+                f"action {place[0][1]} {reason}; use method='generalized'."
+            )
+
 
 MOST_VISITS = 2**30  # counted; a step adds at most as many again
 _UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster
@@ -183,18 +343,15 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         jax.random.fold_in(learner.step_key(state), i) for i in range(3)
     )
     state = _restart(restart_key, state, problem, hparams)
-    sampling = _Sampling(
-        stream=splitmix.streams(action_key, (hparams.num_chains,)),
-        successor_key=successor_key,
-        epsilons=_epsilons(state.step, hparams),
-    )
+    stream = splitmix.streams(action_key, (hparams.num_chains,))
 
-    def move(chains: _Chains, i: jax.Array) -> tuple[_Chains, None]:
-        return _move(chains, i, problem, hparams, sampling), None
+    def move(chains: State, i: jax.Array) -> tuple[State, None]:
+        key = jax.random.fold_in(successor_key, i)
+        return _move(chains, i, problem, hparams, (stream, key)), None
 
     flat = replace(state, q=state.q.ravel(), visits=state.visits.ravel())
     count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
-    (flat, _), _ = lax.scan(move, (flat, take(problem.game.system, state.position)), count)
+    flat, _ = lax.scan(move, flat, count)
     q = flat.q.reshape(state.q.shape)
     updated = value(q, problem)
     after = replace(
@@ -250,9 +407,7 @@ def value(q: jax.Array, problem: Problem) -> jax.Array:
 
     Zero where no action is allowed, and with maximin at the environment's states.
     """
-    actions = _action_values(q)
-    least, most = _reduce(jnp.minimum, actions), _reduce(jnp.maximum, actions)
-    return _finite(jnp.where(problem.game.system, most, least))
+    return _state_values(q, problem.game.system)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
@@ -268,45 +423,38 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
 # --- one move of all chains -------------------------------------------------------------------
 
-_Chains = tuple[State, jax.Array]  # a state with flat tables, and where the system moves
-
-
-@struct.dataclass
-class _Sampling:
-    """Randomness of one step; an epsilon of None means never greedy."""
-
-    stream: splitmix.Stream
-    successor_key: jax.Array
-    epsilons: tuple[jax.Array | None, jax.Array | None]
-
 
 def _move(
-    chains: _Chains, i: jax.Array, problem: Problem, hparams: Hparams, sampling: _Sampling
-) -> _Chains:
-    """The i-th move of every chain, and the update of the table."""
-    state, is_system = chains
-    game, source = problem.game, state.position
-    action = _choose(chains, i, problem, sampling)
-    pair = source * game.num_actions + action
-    target = _sample(game, jax.random.fold_in(sampling.successor_key, i), source, action)
+    state: State,
+    i: jax.Array,
+    problem: Problem,
+    hparams: Hparams,
+    chance: tuple[splitmix.Stream, Key],
+) -> State:
+    """The i-th move of every chain, and the update of the table, which is flat here."""
+    game, source, num_actions = problem.game, state.position, problem.game.num_actions
+    stream, key = chance
+    is_system = take(game.system, source)
+    action = _choose(state, is_system, i, problem, hparams, stream)
+    pair = source * num_actions + action
+    target = _sample(game, key, source, action)
     reward = observed_reward(game, problem.reward, source, action, target)
     discount = jnp.asarray(hparams.discount, state.q.dtype)
     environment_discount = discount if hparams.per == "move" else jnp.ones_like(discount)
-    target_is_system = take(game.system, target)
-    ahead = _value_at(state.q, target, target_is_system, problem)
+    tail = (num_actions, num_actions) if problem.is_maximin else (num_actions,)
+    ahead = _state_values(take(state.q.reshape(-1, *tail), target), take(game.system, target))
     entry, pending, pending_reward = pair, None, None
     if problem.is_maximin:
         answered = ~is_system & (state.pending >= 0)
         # Only an answer completes an entry; others are out of bounds and dropped.
-        entry = jnp.where(answered, state.pending * game.num_actions + action, state.q.size)
+        entry = jnp.where(answered, state.pending * num_actions + action, state.q.size)
         goal = state.pending_reward + discount * (reward + environment_discount * ahead)
         pending, pending_reward = jnp.where(is_system, pair, -1), jnp.where(is_system, reward, 0)
     else:
-        mine = is_system.astype(discount.dtype)
-        goal = reward + (mine * discount + (1 - mine) * environment_discount) * ahead
-    q, visits = _update(state, entry, goal, hparams, "drop" if problem.is_maximin else _IN_BOUNDS)
+        goal = reward + jnp.where(is_system, discount, environment_discount) * ahead
+    q, visits = _update(state, entry, goal, hparams)
     forbidden = jnp.sum(~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
-    moved = replace(
+    return replace(
         state,
         q=q,
         visits=visits,
@@ -315,47 +463,52 @@ def _move(
         pending=pending,
         pending_reward=pending_reward,
     )
-    return moved, target_is_system
-
-
-_IN_BOUNDS = "promise_in_bounds"
 
 
 def _update(
-    state: State, entry: jax.Array, goal: jax.Array, hparams: Hparams, mode: str
+    state: State, entry: jax.Array, goal: jax.Array, hparams: Hparams
 ) -> tuple[jax.Array, jax.Array]:
     """The flat table and its visits after all chains have written."""
     q, visits = state.q, state.visits
     if hparams.step_size is None:
         # In a deterministic game all chains at one entry have the same target.
-        return q.at[entry].set(goal, mode=mode), visits.at[entry].add(1, mode=mode)
+        return q.at[entry].set(goal, mode="drop"), visits.at[entry].add(1, mode="drop")
     inside = jnp.minimum(entry, q.size - 1)
     before, old = take(visits, inside), take(q, inside)
-    visits = visits.at[entry].add(1, mode=mode)
+    visits = visits.at[entry].add(1, mode="drop")
     together = (take(visits, inside) - before).astype(q.dtype)
     size = jnp.asarray(hparams.step_size, q.dtype)
     if hparams.step_power is not None:
         size = size * (1 + before.astype(q.dtype)) ** -jnp.asarray(hparams.step_power, q.dtype)
     share = (1 - (1 - size) ** together) / together
-    return q.at[entry].add(share * (goal - old), mode=mode), visits
+    return q.at[entry].add(share * (goal - old), mode="drop"), visits
 
 
-def _choose(chains: _Chains, i: jax.Array, problem: Problem, sampling: _Sampling) -> jax.Array:
+def _choose(
+    state: State,
+    is_system: jax.Array,
+    i: jax.Array,
+    problem: Problem,
+    hparams: Hparams,
+    stream: splitmix.Stream,
+) -> jax.Array:
     """Each chain's action: greedy with the probability of its player, else by behavior."""
-    state, is_system = chains
-    words = splitmix.words(sampling.stream, 2 * i)
-    action = draw_alias(problem.behavior_table, state.position, words)
-    if sampling.epsilons == (None, None):
+    behavior = take(problem.behavior, state.position)
+    action = draw_weighted(behavior, splitmix.words(stream, 2 * i))
+    epsilons = [hparams.epsilon, hparams.environment_epsilon]
+    if epsilons == [None, None]:
         return action
-    best, known = _greedy(chains, problem)
-    drawn = splitmix.uniform(splitmix.words(sampling.stream, 2 * i + 1), state.q.dtype)
-    mine, theirs = (jnp.inf if e is None else e for e in sampling.epsilons)
+    best, known = _greedy(state, is_system, problem)
+    drawn = splitmix.uniform(splitmix.words(stream, 2 * i + 1), state.q.dtype)
+    decay = jnp.asarray(hparams.epsilon_decay) ** state.step
+    mine, theirs = (
+        jnp.inf if e is None else jnp.maximum(e * decay, hparams.epsilon_min) for e in epsilons
+    )
     return jnp.where(known & (drawn >= jnp.where(is_system, mine, theirs)), best, action)
 
 
-def _greedy(chains: _Chains, problem: Problem) -> tuple[jax.Array, jax.Array]:
+def _greedy(state: State, is_system: jax.Array, problem: Problem) -> tuple[jax.Array, jax.Array]:
     """Each chain's greedy action, and whether the table determines one."""
-    state, is_system = chains
     num_actions = problem.game.num_actions
     rows, known = state.q.reshape(-1, num_actions), jnp.ones(is_system.shape, bool)
     if problem.is_maximin:
@@ -367,19 +520,11 @@ def _greedy(chains: _Chains, problem: Problem) -> tuple[jax.Array, jax.Array]:
     return action_argmax(jnp.where(is_system[:, None], row, -row), jnp.bool_(True))[1], known
 
 
-def _value_at(q: jax.Array, state: jax.Array, is_system: jax.Array, problem: Problem) -> jax.Array:
-    """Values of the chains' states by a flat table; multiplying by signs is faster than selecting."""
-    num_actions = problem.game.num_actions
-    if problem.is_maximin:
-        block = take(q.reshape(-1, num_actions, num_actions), state)
-        return _finite(_reduce(jnp.maximum, _action_values(block)))
-    sign = 2 * is_system.astype(q.dtype) - 1
-    if num_actions > _UNROLLED:
-        return sign * jnp.max(sign[:, None] * take(q.reshape(-1, num_actions), state), axis=-1)
-    best = sign * take(q, state * num_actions)
-    for a in range(1, num_actions):
-        best = jnp.maximum(best, sign * take(q, state * num_actions + a))
-    return sign * best
+def _state_values(rows: jax.Array, is_system: jax.Array) -> jax.Array:
+    """Values of states with rows ``[..., A]`` or ``[..., A, A]``; signs are faster than two reductions."""
+    sign = 2 * is_system.astype(rows.dtype) - 1
+    value = sign * _reduce(jnp.maximum, sign[..., None] * _action_values(rows))
+    return jnp.where(jnp.isinf(value), 0, value)
 
 
 def _action_values(q: jax.Array) -> jax.Array:
@@ -397,10 +542,6 @@ def _reduce(function: Any, x: jax.Array) -> jax.Array:
     return result
 
 
-def _finite(x: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isinf(x), 0, x)
-
-
 def _sample(game: Game, key: jax.Array, state: jax.Array, action: jax.Array) -> jax.Array:
     """Successors of all chains; a deterministic game needs no keys."""
     if game.num_successors == 1:
@@ -411,31 +552,11 @@ def _sample(game: Game, key: jax.Array, state: jax.Array, action: jax.Array) -> 
 
 def _restart(key: jax.Array, state: State, problem: Problem, hparams: Hparams) -> State:
     """Chains restart with probability ``restart``, and drop their pending action."""
-
-    def redraw(
-        position: jax.Array, pending: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array | None]:
-        words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
-        anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
-        pending = None if pending is None else jnp.where(anew, -1, pending)
-        return jnp.where(anew, draw(problem.start_table, words[1]), position), pending
-
-    position, pending = lax.cond(
-        jnp.asarray(hparams.restart) > 0, redraw, lambda *x: x, state.position, state.pending
-    )
+    words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
+    anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
+    position = jnp.where(anew, draw(problem.start_table, words[1]), state.position)
+    pending = None if state.pending is None else jnp.where(anew, -1, state.pending)
     return replace(state, position=position, pending=pending)
-
-
-def _epsilons(step: jax.Array, hparams: Hparams) -> tuple[jax.Array | None, jax.Array | None]:
-    """Both players' epsilons at a step."""
-
-    def at(epsilon: jax.Array | float | None) -> jax.Array | None:
-        if epsilon is None:
-            return None
-        decayed = epsilon * jnp.asarray(hparams.epsilon_decay) ** step
-        return jnp.maximum(decayed, hparams.epsilon_min)
-
-    return at(hparams.epsilon), at(hparams.environment_epsilon)
 
 
 def _answers(problem: Problem) -> jax.Array:

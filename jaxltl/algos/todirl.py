@@ -35,26 +35,216 @@ Example: a reward of the state, and the policy that it gives in another world.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-import optax
+import numpy as np
 from flax import linen as nn
 from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.learner import Best, stop_early
-from jaxltl.algos.common.settings import RunState
-from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
+from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
-from jaxltl.core.models import Product, with_allowed
-from jaxltl.core.models.ops.successor_tables import PredecessorTable
+from jaxltl.core.models import Product, Trajectories, with_allowed
+from jaxltl.core.models.construct.batch import (
+    restrict_stacked_actions,
+    stack_models,
+    stack_observations,
+    training_counts,
+    unstack_product as lane,
+)
+from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
 from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.validation import Range
 from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint, soft_value
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+
+
+class RewardNetwork(nn.Module):
+    """A multilayer perceptron with ReLU on (observation, memory, action).
+
+    Maps ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, to
+    ``float[...]``. The first layer is a sum of three, so that no input is repeated for each
+    combination with the others.
+
+    Attributes:
+      hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
+    """
+
+    hidden: Sequence[int] = (80, 80)
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        widths = (*self.hidden, 1)
+        inputs = (observation, memory, action)
+        sizes = [x.shape[-1] for x in inputs]
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
+        bias = self.param("bias", nn.initializers.zeros_init(), (widths[0],))
+        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
+        x = terms[0] + (terms[1] + terms[2] + bias)
+        rows = x.shape[:-1]
+        x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
+        for width in widths[1:]:
+            x = nn.Dense(width)(nn.relu(x))
+        return x.reshape(rows)
+
+
+class Concatenated(nn.Module):
+    """A reward network from one of concatenated inputs, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``.
+
+    Attributes:
+      network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
+
+    >>> import jax
+    >>> read = jnp.zeros((5, 3)), jnp.zeros((5, 2)), jnp.zeros((5, 4))
+    >>> jax.eval_shape(Concatenated(nn.Dense(1)).init_with_output, jax.random.key(0), *read)[0].shape
+    (5,)
+    """
+
+    network: nn.Module
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        inputs = (observation, memory, action)
+        rows = jnp.broadcast_shapes(*(x.shape[:-1] for x in inputs))
+        wide = [jnp.broadcast_to(x, (*rows, x.shape[-1])) for x in inputs]
+        result = self.network(jnp.concatenate(wide, axis=-1))
+        return result[..., 0] if result.shape == (*rows, 1) else result
+
+
+@struct.dataclass
+class Problem:
+    """Products of worlds with the task, observations, and demonstrations.
+
+    Attributes:
+      model: products stacked along a first axis of W worlds.
+      observation: ``float[W, S, O]``, of each world state.
+      counts: ``float[W, S, Q, A]``, demonstrated state-action counts; with a horizon
+        ``float[W, T, S, Q, A]``.
+      held_out: counts of the held-out demonstrations for early stopping; may be zero.
+      weight: ``float[W]``, factors of the worlds' likelihoods.
+      predecessors: of the product states, with a first axis of W, for a faster gradient; or None.
+      network: called as ``network(observation [S, 1, 1, O], memory [1, Q, 1, Q],
+        action [1, 1, A, A]) -> float[S, Q, A]``, memory and action one-hot; static.
+    """
+
+    model: Product
+    observation: jax.Array
+    counts: jax.Array
+    held_out: jax.Array
+    weight: jax.Array
+    predecessors: PredecessorTable | None = None
+    network: nn.Module = struct.field(pytree_node=False, default=RewardNetwork())
+
+    @property
+    def horizon(self) -> int | None:
+        """The number T of time steps of the counts, or None."""
+        return self.counts.shape[1] if self.counts.ndim == 5 else None
+
+
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced.
+
+    Attributes:
+      discount: in [0, 1); with a horizon also 1.
+      l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: of all optimizers but ``lbfgs``; default 3e-3.
+      patience: steps without a better held-out likelihood (with `mu`, plus the weighted satisfaction
+        probability) after which learning stops; default 50.
+      mu: weight of the satisfaction probability (2.6) from the initial states, or None; default None.
+      tolerance: certified error of the soft values; None: the precision of the dtype; default None.
+      optimizer: ``"lbfgs"``, or the name of one of optax, such as ``"adamw"``; static; default
+        ``"adam"``.
+      method: of :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
+        default ``"value_iteration"``.
+      horizon: number of steps, for a time-dependent policy, or None; static; default None.
+    """
+
+    discount: Number = traced(Range(0, 1))
+    l2: Number = traced(Range(0, open_above=True), default=1e-3)
+    learning_rate: Number = traced(Range(0, open_above=True), default=3e-3)
+    patience: Number = traced(Range(1), default=50)
+    mu: Number | None = traced(Range(0, open_above=True), default=None)
+    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
+    optimizer: str = static(("lbfgs", *optimizers.NAMES), default="adam")
+    method: str = static(("newton", "value_iteration"), default="value_iteration")
+    horizon: int | None = static(COUNT, default=None)
+
+
+def make_problem(
+    worlds: Product | Sequence[Product],
+    observation: PyTree,
+    demonstrations: Trajectories | Sequence[Trajectories],
+    *,
+    held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
+    network: nn.Module | None = None,
+    weight: PyTree = None,
+    horizon: int | None = None,
+    allowed: PyTree = None,
+) -> Problem:
+    """A checked :class:`Problem` with arrays stacked over W worlds, on the host.
+
+    Args:
+      worlds: a product, several, or products stacked along a first axis of W worlds.
+      observation: ``float[S, O]``, or one for each world.
+      demonstrations: in the world (not in the product), or one for each world.
+      held_out: share of each world's trajectories, the last ones, or other trajectories, for early
+        stopping; None or 0: no early stopping.
+      network: the reward; default :class:`RewardNetwork`.
+      weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
+      horizon: count pairs by time, for ``Hparams.horizon``.
+      allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies; default all.
+        Demonstrated steps outside of it do not count.
+
+    Raises:
+      ValueError: arguments of different or wrong shapes, demonstrations that do not fit their world or
+        exceed the horizon, or no counted pair.
+    """
+    model = stack_models(worlds)
+    if allowed is not None:
+        model = restrict_stacked_actions(model, allowed)
+    num_worlds, dtype = model.letter.shape[0], model.dtype
+    observation = stack_observations(model, observation)
+    counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
+    weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
+    if weight.shape != (num_worlds,):
+        raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")
+    network = RewardNetwork() if network is None else network
+    inputs = _network_inputs(model, observation[0])
+    require_output(
+        "the network's reward has",
+        network,
+        inputs,
+        (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:])),
+        "one number for each state, memory and action. A module on one vector is wrapped as "
+        "Concatenated(module).",
+    )
+    return Problem(
+        model=model,
+        observation=observation,
+        counts=counts,
+        held_out=other,
+        weight=weight,
+        predecessors=predecessor_table([lane(model, w) for w in range(num_worlds)]),
+        network=network,
+    )
+
+
+def _network_inputs(
+    model: Product, observation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The network's inputs: observation, memory and action on their own axes."""
+    num_memory, num_actions = model.num_memory, model.mdp.available.shape[-1]
+    memory = jnp.eye(num_memory, dtype=observation.dtype)[None, :, None]
+    action = jnp.eye(num_actions, dtype=observation.dtype)[None, None]
+    return observation[:, None, None], memory, action
 
 
 @struct.dataclass
@@ -112,7 +302,7 @@ def solve(
 
     def world(model: Product, observation: jax.Array, initial: jax.Array) -> Solution:
         rewards = reward(problem.network, parameters, model, observation)
-        return soft_plan(rewards, model, hparams, initial)
+        return _soft_plan(rewards, model, hparams, initial)
 
     return trees.each_world(world, problem.model, problem.observation, _initial(problem, initial))
 
@@ -121,9 +311,6 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
     if initial is not None:
         return initial
     return jnp.zeros((*problem.model.letter.shape, problem.model.num_memory), problem.model.dtype)
-
-
-# --- learning -------------------------------------------------------------------------------------
 
 
 @struct.dataclass
@@ -171,113 +358,82 @@ def objective(
     if hparams.horizon is None and problem.horizon is not None:
         counts, held_out = counts.sum(axis=1), held_out.sum(axis=1)
 
-    def likelihood(data: _World) -> _Likelihood:
-        found = reward(problem.network, parameters, data.model, data.observation)
-        rewards = jnp.asarray(found, data.model.dtype)
-        by_time = hparams.horizon is not None
-        return (_time_dependent if by_time else _stationary)(rewards, data, hparams)
-
     found = trees.each_world(
-        likelihood,
-        _World(
-            model=problem.model,
-            observation=problem.observation,
-            counts=counts,
-            held_out=held_out,
-            initial=_initial(problem, initial),
-            predecessors=problem.predecessors,
-        ),
+        partial(_likelihoods, problem, hparams, parameters),
+        problem.model,
+        problem.observation,
+        (counts, held_out),
+        _initial(problem, initial),
+        problem.predecessors,
     )
+    demonstrated, other, satisfaction, value, error, status = found
     weight = problem.weight
-    pairs, other_pairs = (weight @ jnp.sum(x, axis=(1, 2, 3)) for x in _flat(counts, held_out))
-    neg = -weight @ found.demonstrated
+    pairs, other_pairs = (weight @ x.reshape(len(weight), -1).sum(1) for x in (counts, held_out))
+    neg = -weight @ demonstrated
     loss = neg + hparams.l2 / 2 * sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
-    score = lax.stop_gradient(-(weight @ found.held_out) / other_pairs)
+    score = lax.stop_gradient(-(weight @ other) / other_pairs)
     parts = Objective(
         neg_log_likelihood=neg,
         per_pair=neg / pairs,
         held_out=score,
         score=score,
-        satisfaction=jnp.mean(found.satisfaction),
-        value=found.value,
-        error=jnp.max(found.error),
-        status=jnp.max(found.status),
+        satisfaction=jnp.mean(satisfaction),
+        value=value,
+        error=jnp.max(error),
+        status=jnp.max(status),
     )
     if hparams.mu is None:
         return loss, parts
     # Its derivative is part of the likelihood's, since one linear system serves both.
-    gain = lax.stop_gradient(hparams.mu * (weight @ found.satisfaction))
+    gain = lax.stop_gradient(hparams.mu * (weight @ satisfaction))
     return loss - gain, replace(parts, score=score - gain / pairs)
 
 
-@struct.dataclass
-class _World:
-    """Data of one world, or of all with a first axis."""
+def _likelihoods(
+    problem: Problem,
+    hparams: Hparams,
+    parameters: PyTree,
+    model: Product,
+    observation: jax.Array,
+    counts: tuple[jax.Array, jax.Array],
+    initial: jax.Array,
+    predecessors: PredecessorTable | None,
+) -> tuple[jax.Array, ...]:
+    """Log-likelihoods of demonstrated and held-out pairs in a world, and the solver's results.
 
-    model: Product
-    observation: jax.Array
-    counts: jax.Array
-    held_out: jax.Array
-    initial: jax.Array
-    predecessors: PredecessorTable | None
-
-
-@struct.dataclass
-class _Likelihood:
-    """Log-likelihoods of demonstrated and held-out pairs in a world, and the solver's results."""
-
-    demonstrated: jax.Array
-    held_out: jax.Array
-    satisfaction: jax.Array
-    value: jax.Array
-    error: jax.Array
-    status: jax.Array
-
-
-def _stationary(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
-    """Likelihoods of the stationary soft policy; the demonstrated one is differentiable."""
-    model, counts = data.model, data.counts
-    constant = lax.stop_gradient(rewards)
-    solution = lax.stop_gradient(soft_plan(constant, model, hparams, data.initial))
-    log_policy = _log_policy(model, constant, hparams.discount, solution.value)
-    policy = jnp.where(model.available, jnp.exp(log_policy), 0)
-    satisfaction, cotangent = jnp.full((), jnp.nan, model.dtype), counts
-    if hparams.mu is not None:
-        satisfaction, gain = jax.value_and_grad(
-            lambda policy: jnp.sum(model.initial * satisfaction_probability(model, policy).value)
-        )(policy)
-        cotangent = counts + hparams.mu * policy * gain
-    slope = lax.stop_gradient(
-        soft_policy_adjoint(
-            model, policy, hparams.discount, cotangent, predecessors=data.predecessors
+    That of the demonstrated ones is differentiable.
+    """
+    rewards = jnp.asarray(reward(problem.network, parameters, model, observation), model.dtype)
+    satisfaction, value = jnp.full((), jnp.nan, model.dtype), initial
+    if hparams.horizon is not None:
+        solution = _backward_induction(rewards, model, hparams)
+        after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
+        log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
+        demonstrated = jnp.sum(counts[0] * log_policy)
+    else:
+        constant = lax.stop_gradient(rewards)
+        solution = lax.stop_gradient(_soft_plan(constant, model, hparams, initial))
+        value = solution.value
+        log_policy = _log_policy(model, constant, hparams.discount, value)
+        policy = jnp.where(model.available, jnp.exp(log_policy), 0)
+        cotangent = counts[0]
+        if hparams.mu is not None:
+            satisfaction, gain = jax.value_and_grad(
+                lambda policy: jnp.sum(
+                    model.initial * satisfaction_probability(model, policy).value
+                )
+            )(policy)
+            cotangent = cotangent + hparams.mu * policy * gain
+        slope = soft_policy_adjoint(
+            model, policy, hparams.discount, cotangent, predecessors=predecessors
         )
-    )
-    # The adjoint is the derivative of the likelihood; differentiating the solver's equations gives
-    # the same by scatters, which are slow on CPUs.
-    return _Likelihood(
-        demonstrated=jnp.sum(counts * log_policy) + jnp.sum(slope * (rewards - constant)),
-        held_out=jnp.sum(data.held_out * log_policy),
-        satisfaction=lax.stop_gradient(satisfaction),
-        value=solution.value,
-        error=jnp.max(solution.upper - solution.lower) / 2,
-        status=solution.status,
-    )
-
-
-def _time_dependent(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
-    """Likelihoods of the time-dependent soft policy, differentiable by backward induction."""
-    model = data.model
-    solution = backward_induction(rewards, model, hparams)
-    after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
-    log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
-    return _Likelihood(
-        demonstrated=jnp.sum(data.counts * log_policy),
-        held_out=jnp.sum(data.held_out * log_policy),
-        satisfaction=jnp.full((), jnp.nan, model.dtype),
-        value=data.initial,
-        error=lax.stop_gradient(jnp.max(solution.upper - solution.lower) / 2),
-        status=solution.status,
-    )
+        # The adjoint is the derivative of the likelihood; differentiating the solver's equations
+        # gives the same by scatters, which are slow on CPUs.
+        demonstrated = jnp.sum(counts[0] * log_policy)
+        demonstrated += jnp.sum(lax.stop_gradient(slope) * (rewards - constant))
+    error = jnp.max(solution.upper - solution.lower) / 2
+    rest = (jnp.sum(counts[1] * log_policy), satisfaction, value, error, solution.status)
+    return demonstrated, *lax.stop_gradient(rest)
 
 
 def _log_policy(
@@ -288,14 +444,10 @@ def _log_policy(
     return jnp.where(model.available, jax.nn.log_softmax(logits, axis=-1), 0)
 
 
-def _flat(*counts: jax.Array) -> list[jax.Array]:
-    return [x.reshape(x.shape[0], -1, *x.shape[-2:]) for x in counts]
-
-
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
-    inputs = network_inputs(problem.model, problem.observation[0])
+    inputs = _network_inputs(problem.model, problem.observation[0])
     drawn = _draw(problem.network, learner.init_key(key), inputs)
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(
@@ -303,7 +455,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         step=jnp.int32(0),
         parameters=parameters,
         value=_initial(problem, None),
-        optimizer=trees.strong(optimizers.optimizer_of(hparams).init(parameters)),
+        optimizer=optimizers.start(hparams, parameters),
         best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
@@ -317,22 +469,17 @@ def _draw(network: nn.Module, key: Key, inputs: tuple[jax.Array, ...]) -> PyTree
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
 
-    def loss_of(parameters: PyTree) -> jax.Array:
-        return objective(parameters, problem, hparams, state.value)[0]
+    def loss_of(parameters: PyTree) -> tuple[jax.Array, Objective]:
+        return objective(parameters, problem, hparams, state.value)
 
-    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
-        state.parameters, problem, hparams, state.value
-    )
-    parameters, optimizer = optimizers.descended(
-        hparams, gradient, state, value=loss, grad=gradient, value_fn=loss_of
-    )
+    loss, parts, norm, parameters, optimizer = optimizers.descend(loss_of, state, hparams)
     metrics = Metrics(
         loss=loss,
         neg_log_likelihood=parts.neg_log_likelihood,
         per_pair=parts.per_pair,
         held_out=parts.held_out,
         satisfaction=parts.satisfaction,
-        gradient_norm=optax.tree.norm(gradient),
+        gradient_norm=norm,
         error=parts.error,
         status=parts.status,
     )
@@ -359,9 +506,6 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     return solve(state.best.parameters, problem, hparams).policy
 
 
-# --- planning ----------------------------------------------------------------------------------
-
-
 def reward(
     network: nn.Module, parameters: PyTree, model: Product, observation: jax.Array
 ) -> jax.Array:
@@ -377,7 +521,7 @@ def reward(
     >>> reward(Late(), {}, product(world, "F g"), jnp.eye(2)).shape
     (2, 2, 1)
     """
-    return jnp.asarray(network.apply(parameters, *network_inputs(model, observation)))
+    return jnp.asarray(network.apply(parameters, *_network_inputs(model, observation)))
 
 
 def plan(
@@ -407,15 +551,15 @@ def plan(
       ValueError: unknown method, or a mask that does not fit.
     """
     model = model if allowed is None else with_allowed(model, allowed)
-    return soft_plan(reward(network, parameters, model, observation), model, hparams)
+    return _soft_plan(reward(network, parameters, model, observation), model, hparams)
 
 
-def soft_plan(
+def _soft_plan(
     rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
     """The soft value and policy of `rewards` in a `model`, by `hparams`, started at `initial`."""
     if hparams.horizon is not None:
-        return backward_induction(rewards, model, hparams)
+        return _backward_induction(rewards, model, hparams)
     return soft_value(
         model,
         rewards,
@@ -426,7 +570,7 @@ def soft_plan(
     )
 
 
-def backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) -> Solution:
+def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) -> Solution:
     """Soft values of a finite horizon, ``V_T = 0``, by backward induction; exact up to rounding."""
     rewards = jnp.asarray(rewards, model.dtype)
     discount = jnp.asarray(hparams.discount, model.dtype)

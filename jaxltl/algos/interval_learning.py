@@ -51,16 +51,194 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, pac, splitmix
-from jaxltl.algos.common.play import draw, successor_slot, take
-from jaxltl.algos.interval_learning.problem import Hparams, Metrics, Problem, State
+from jaxltl.algos.common.play import cumulative, draw, draw_weighted, successor_slot, take
+from jaxltl.algos.common.settings import COUNT, Number, RunState, require_own, static, traced
+from jaxltl.core import struct
 from jaxltl.core.array_types import Key, Numeric, PyTree
-from jaxltl.core.graphs.end_components import accepting_bottom_components, bottom_components
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
+from jaxltl.core.graphs.end_components import (
+    Accepting,
+    accepting_bottom_components,
+    accepting_end_components,
+    bottom_components,
+    end_components,
+)
+from jaxltl.core.models import to_padded, to_sparse
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.operators import forall_successor, sample_successor
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Status
+from jaxltl.core.validation import Range
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
 from jaxltl.core.values.interval.contest import greedy_distributions
+
+
+@struct.dataclass
+class Problem:
+    """A task in an MDP with unknown probabilities; made by :func:`make_problem`.
+
+    Attributes:
+      model: the product with the task's automaton; the learner reads the support of its
+        probabilities, and samples.
+      winning: ``bool[S, Q]``, the almost-sure winning region.
+      losing: ``bool[S, Q]``, the states from which the task cannot be satisfied.
+      allowed: ``bool[S, Q, A]``, the actions to be tried; in the winning region, actions all of
+        which may be repeated for ever and satisfy the task almost surely.
+      component: ``int32[S * Q]``, the maximal end component of each undecided state, or its own
+        number.
+      staying: ``bool[S, Q, A]``, the actions of undecided states that stay in it.
+      start_table: ``uint32[S]``, the initial distribution as cumulative weights.
+      num_claims: ``int[]``, number of unknown probabilities.
+    """
+
+    model: Product
+    winning: jax.Array
+    losing: jax.Array
+    allowed: jax.Array
+    component: jax.Array
+    staying: jax.Array
+    start_table: jax.Array
+    num_claims: jax.Array
+
+
+def make_problem(world: Model, task: Task) -> Problem:
+    """A checked :class:`Problem`: the product with the task, and its qualitative preprocessing.
+
+    Args:
+      world: an MDP or a sparse model; its labels, start and graph are known to the learner.
+      task: a formula, its text, or an automaton over the letters that occur. To make a probability
+        small, negate the formula.
+
+    Raises:
+      ValueError: the world is a game or no model, or the formula has unknown labels.
+
+    >>> from jaxltl import from_dense
+    >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]], initial=[1, 0],
+    ...                    label=[[0], [1]], propositions=["home"])
+    >>> make_problem(world, "F home").winning[0].tolist()
+    [True, True]
+    """
+    system = np.asarray(as_game(world).system)
+    if hasattr(world, "system") and not system.all():
+        raise ValueError(
+            "interval_learning plays alone; of a game with an environment learn by "
+            "jaxltl.algos.rmax, whose evidence(confidence=) bounds what counts say."
+        )
+    # The sparse form lists each successor of an action once, as it is observed.
+    padded = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
+    model = product(padded, task, label_on="exit")
+    accepting = accepting_end_components(model)
+    sure = almost_surely_reaching(model, accepting.region).region
+    winning, losing = np.asarray(sure), ~np.asarray(attractor(model, sure).region)
+    between = end_components(model, ~winning & ~losing)
+    outcomes = support(padded).sum(-1)
+    claims = np.where(outcomes > 2, outcomes, outcomes > 1).sum()
+    return Problem(
+        model=model,
+        winning=to_jax(winning),
+        losing=to_jax(losing),
+        allowed=_allowed(model, winning, accepting),
+        component=to_jax(np.asarray(between.component, np.int32).reshape(-1)),
+        staying=to_jax(between.inside),
+        start_table=to_jax(np.asarray(cumulative(np.asarray(padded.initial, float)))),
+        num_claims=to_jax(np.int32(max(int(claims), 1))),
+    )
+
+
+@jax.jit
+def _allowed(model: Product, winning: jax.Array, accepting: Accepting) -> jax.Array:
+    """In the winning region, actions inside accepting end components, or else those that stay."""
+    safe = forall_successor(model, winning) & model.available & winning[..., None]
+    safe = jnp.where(accepting.region[..., None], accepting.inside, safe)
+    return jnp.where(winning[..., None], safe, model.available)
+
+
+# --- settings, state and metrics ---------------------------------------------------------------
+
+
+INTERVALS = ("linear", "confidence")
+
+
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced.
+
+    Attributes:
+      intervals: ``"linear"``: linearly updating intervals, which narrow fast and forget a wrong
+        prior; ``"confidence"``: intervals that contain all true probabilities at all times with
+        probability `confidence`; static; default ``"linear"``.
+      confidence: in (0, 1); of ``"confidence"`` only; default 0.9.
+      least: positive; assumed lower bound of each transition probability; default 1e-4.
+      strength, most_strength: prior strengths in samples of linear intervals where data contradict
+        them and where they agree, 0 < strength <= most_strength; default 5.0 and 10.0.
+      exploration: in (0, 1], probability of any allowed action; default 0.1.
+      restart: probability of restarting before a move in the almost-sure winning region; in the
+        losing region 1; default 0.05.
+      discount: in (0, 1), prefers actions that win soonest among those of equal value; default 0.99.
+      sweeps: of value iteration in a step; at least the moves to the winning region; default 40.
+      tolerance: change of the last sweep at which values count as converged; default 1e-4.
+      num_runs, length: episodes in a step, and moves of each; static; default 4 and 64.
+    """
+
+    intervals: str = static(INTERVALS, default="linear")
+    confidence: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.9)
+    least: Number = traced(Range(0, 1, open_below=True), default=1e-4)
+    strength: Number = traced(Range(0, open_below=True, open_above=True), default=5.0)
+    most_strength: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
+    exploration: Number = traced(Range(0, 1, open_below=True), default=0.1)
+    restart: Number = traced(Range(0, 1), default=0.05)
+    discount: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.99)
+    sweeps: Number = traced(Range(1), default=40)
+    tolerance: Number = traced(Range(0, open_above=True), default=1e-4)
+    num_runs: int = static(COUNT, default=4)
+    length: int = static(COUNT, default=64)
+
+
+@struct.dataclass
+class State(RunState):
+    """Counts, intervals and values.
+
+    Attributes:
+      samples: ``int32[]``, observed transitions; near 2^31 further steps sample none.
+      counts: ``int32[S, A, K]``, observations of each transition.
+      lower, upper: ``float[S, A, K]``, intervals; 0 in padding.
+      pessimistic, optimistic: ``float[S, Q]``, optimal satisfaction probability with adversarial
+        and with cooperative nature, as far as value iteration has converged.
+      best: ``bool[S, Q, A]``, preferred actions.
+      residual: ``float[]``, largest change of the last sweep.
+    """
+
+    samples: jax.Array
+    counts: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    pessimistic: jax.Array
+    optimistic: jax.Array
+    best: jax.Array
+    residual: jax.Array
+
+
+@struct.metrics
+class Metrics:
+    """Figures after a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      samples: observed transitions.
+      lower, upper: pessimistic and optimistic value, mean over the initial distribution.
+      residual: of :class:`State`.
+      status: COMPLETED if the residual is at most the tolerance; MAX_STEPS if not, or if all
+        samples that can be counted were observed.
+    """
+
+    samples: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    residual: jax.Array
+    status: jax.Array
 
 
 @jax.jit
@@ -72,7 +250,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     least = jnp.asarray(hparams.least, world.dtype)
     lower = jnp.where(single, 1, least) * used
     upper = jnp.where(single, 1, 1 - least) * used
-    lower, upper = consistent(lower, upper)
+    lower, upper = _consistent(lower, upper)
     return State(
         key=key,
         step=jnp.int32(0),
@@ -91,14 +269,14 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     """Episodes, the update of the intervals, and value iteration from the last values."""
     size = hparams.num_runs * hparams.length
     more = state.samples <= loops.MAX_STEPS - size
-    new = sampled_counts(state, problem, hparams) * more
+    new = _sampled_counts(state, problem, hparams) * more
     state = replace(
         state, step=state.step + 1, samples=state.samples + size * more, counts=state.counts + new
     )
     if hparams.intervals == "linear":
-        lower, upper = linear_intervals(state, new, hparams)
+        lower, upper = _linear_intervals(state, new, hparams)
     else:
-        lower, upper = confidence_intervals(state, problem.num_claims, hparams)
+        lower, upper = _confidence_intervals(state, problem.num_claims, hparams)
     random = jnp.sum(problem.model.mdp.successor_probability > 0, -1, keepdims=True) > 1
     updated = jnp.any(new > 0, axis=-1, keepdims=True) & random
     lower, upper = jnp.where(updated, lower, state.lower), jnp.where(updated, upper, state.upper)
@@ -168,11 +346,7 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
     Raises:
       ValueError: the confidence is out of range, or an argument is of another type.
     """
-    if not isinstance(problem, Problem) or not isinstance(state, State):
-        raise ValueError(
-            "guarantee takes a state, as init and train return it, and the problem "
-            "that make_problem returned."
-        )
+    require_own((state, State), (problem, Problem))
     world = problem.model.mdp
     return learn_guarantee(
         world,
@@ -273,7 +447,9 @@ def _soonest(
 # --- intervals ---------------------------------------------------------------------------------
 
 
-def linear_intervals(state: State, new: jax.Array, hparams: Hparams) -> tuple[jax.Array, jax.Array]:
+def _linear_intervals(
+    state: State, new: jax.Array, hparams: Hparams
+) -> tuple[jax.Array, jax.Array]:
     """Linearly updating intervals (Suilen et al. 2022, definition 4; Walter and Augustin 2009).
 
     ``(n P + k) / (n + N)`` for both ends P and N `new` observations, k of them of the transition.
@@ -291,10 +467,10 @@ def linear_intervals(state: State, new: jax.Array, hparams: Hparams) -> tuple[ja
         return (n * prior + new) / (n + number)
 
     lower = end(state.lower, share >= state.lower)
-    return consistent(lower, end(state.upper, share <= state.upper))
+    return _consistent(lower, end(state.upper, share <= state.upper))
 
 
-def confidence_intervals(
+def _confidence_intervals(
     state: State, num_claims: jax.Array, hparams: Hparams
 ) -> tuple[jax.Array, jax.Array]:
     """Anytime-valid confidence intervals of all probabilities at once, in closed form.
@@ -310,14 +486,14 @@ def confidence_intervals(
     failure = (1 - jnp.asarray(hparams.confidence, dtype)) / num_claims.astype(dtype)
     n = jnp.maximum(jnp.sum(state.counts, -1, keepdims=True).astype(dtype), 1)
     share, c = state.counts / n, (jnp.log(2 * jnp.sqrt(n)) - jnp.log(failure)) / n
-    lower, upper = kl_lower_end(share, c), 1 - kl_lower_end(1 - share, c)
+    lower, upper = _kl_lower_end(share, c), 1 - _kl_lower_end(1 - share, c)
     floor = jnp.minimum(jnp.asarray(hparams.least, dtype), upper)
     lower = jnp.where(used, jnp.maximum(jnp.maximum(lower, floor), state.lower), 0)
     upper = jnp.where(used, jnp.minimum(upper, state.upper), 0)
-    return consistent(lower, upper)
+    return _consistent(lower, upper)
 
 
-def kl_lower_end(a: jax.Array, c: jax.Array) -> jax.Array:
+def _kl_lower_end(a: jax.Array, c: jax.Array) -> jax.Array:
     """A lower bound of all b with ``kl(a, b) <= c``."""
     a = jnp.clip(a, 0, 1)  # rounding may leave [0, 1]
     other = 1 - a
@@ -325,7 +501,7 @@ def kl_lower_end(a: jax.Array, c: jax.Array) -> jax.Array:
     return jnp.maximum(a - jnp.minimum(below, c + jnp.sqrt(c * c + 2 * c * other)), 0)
 
 
-def consistent(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _consistent(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The ends, widened or scaled so that they contain a distribution in spite of rounding."""
     lower = lower / jnp.maximum(jnp.sum(lower, -1, keepdims=True), 1)
     upper = jnp.maximum(upper, lower)
@@ -337,7 +513,7 @@ def consistent(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array
 # --- episodes ----------------------------------------------------------------------------------
 
 
-def sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+def _sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """Transition counts of a step's episodes, ``int32[S, A, K]``."""
     world, dtype, num_runs = problem.model.mdp, problem.model.dtype, hparams.num_runs
     explore, restart = (jnp.asarray(x, dtype) for x in (hparams.exploration, hparams.restart))
@@ -354,9 +530,7 @@ def sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Arra
         q = jnp.where(restarts, start, q)
         explores = (splitmix.uniform(words[2], dtype) < explore)[:, None]
         moves = jnp.where(explores, take(problem.allowed, (s, q)), take(state.best, (s, q)))
-        total = jnp.cumsum(moves.astype(dtype), axis=-1)
-        drawn = splitmix.uniform(words[3], dtype)[:, None] * total[:, -1:]
-        a = jnp.argmax(total > drawn, axis=-1).astype(jnp.int32)
+        a = draw_weighted(moves.astype(dtype), words[3])
         keys = jax.random.split(key, num_runs)
         t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
         return (t, take(next_memory, (s, q))), (s, a, successor_slot(as_game(world), s, a, t))
