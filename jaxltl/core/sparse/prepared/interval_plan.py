@@ -38,6 +38,9 @@ class RoomQueries(NamedTuple):
     room: Booleans  # bool[G], the answers
 
 
+_NO_QUERIES = RoomQueries(*np.zeros((3, 0), np.int64), np.zeros(0, bool))
+
+
 @dataclass(frozen=True)
 class IntervalPlan:
     """Residual problem after qualitative preprocessing."""
@@ -49,9 +52,10 @@ class IntervalPlan:
     within: Booleans  # bool[T], entries to which nature keeps in known states
     rows: Integers  # int[R'], available rows of open states
     used: Booleans  # bool[T], entries of these that nature may use
-    has_free_cycles: bool  # whether the side that must leave may also stay for ever at no cost
+    # whether the side that must leave may also stay for ever at no cost
+    has_free_cycles: bool = False
     # assumptions on the intervals, besides which ends and rewards are positive
-    queries: RoomQueries
+    queries: RoomQueries = _NO_QUERIES
 
 
 def plan_reachability(
@@ -60,7 +64,7 @@ def plan_reachability(
     """The plan of a reachability probability."""
     blocked = np.zeros(target.size, bool) if stay is None else ~stay & ~target
     absorbing, origin = model.with_absorbing(target | blocked)
-    mdp, log = absorbing.mdp, list[_Query]()
+    mdp, log = absorbing.mdp, list[RoomQueries]()
     known = zero_one_states(_recording(absorbing, log), target, query)
     zero, one = known
     if query.cooperative:
@@ -79,17 +83,15 @@ def plan_reachability(
             shortest_path_rows(mdp, one, every) if helps else attracting_rows(absorbing, one, every)
         )
         row = np.where(open_, out, row)
-    residual = _Residual(
-        model=absorbing,
-        origin=origin,
+    plan = IntervalPlan(
         known=np.where(open_, np.nan, one),
         row=row,
         within=within,
-        rows=open_[mdp.state],
+        rows=np.flatnonzero(open_[mdp.state]),
         used=np.ones(mdp.num_transitions, bool),
-        free=np.ones(mdp.num_rows, bool),
     )
-    return residual.plan(model, target | blocked, log)
+    every = np.ones(mdp.num_rows, bool)
+    return _of_original(plan, (model, absorbing), origin, target | blocked, every, log)
 
 
 def plan_total_reward(
@@ -97,7 +99,7 @@ def plan_total_reward(
 ) -> IntervalPlan:
     """The plan of an expected total reward; rewards ``float64[R]``."""
     absorbing, origin = model.with_absorbing(target)
-    mdp, log, large = absorbing.mdp, list[_Query](), query.nature_maximizes
+    mdp, log, large = absorbing.mdp, list[RoomQueries](), query.nature_maximizes
     recording = _recording(absorbing, log)
     free = target[mdp.state] | (reward[origin] == 0)
     paying = np.zeros(target.size, bool)
@@ -128,17 +130,47 @@ def plan_total_reward(
             out = shortest_path_rows(_restricted_nature(absorbing, used, kept), target, kept)
         row = np.where(nothing, row, out)
     known = np.where(nothing, 0, np.where(finite, np.nan, np.inf))
-    residual = _Residual(
-        model=absorbing,
-        origin=origin,
+    plan = IntervalPlan(
         known=known,
         row=row,
         within=within,
-        rows=kept & np.isnan(known)[mdp.state],
+        rows=np.flatnonzero(kept & np.isnan(known)[mdp.state]),
         used=used,
-        free=free,
     )
-    return residual.plan(model, target, log)
+    return _of_original(plan, (model, absorbing), origin, target, free, log)
+
+
+def _of_original(
+    plan: IntervalPlan,
+    models: tuple[UncertainMDP, UncertainMDP],
+    origin: Integers,
+    absorbed: Booleans,
+    free: Booleans,
+    log: list[RoomQueries],
+) -> IntervalPlan:
+    """The plan in the rows and entries of the original model, from those of the absorbing one."""
+    model, absorbing = models
+    mdp, small = model.mdp, absorbing.mdp
+    open_, rows = np.isnan(plan.known), np.zeros(small.num_rows, bool)
+    rows[plan.rows] = True
+    used = plan.used & (free & rows)[small.row]
+    inner = joint_end_components(absorbing, open_, used)[1] if open_.any() else used & False
+    cycles = inner & (small.successor != small.state[small.row])
+    # Entries of states that are not absorbing are the same, in the same order.
+    moves, moved = (~absorbed[x.state[x.row]] for x in (mdp, small))
+    entries = np.zeros(small.num_transitions, np.int64)
+    entries[moved] = np.flatnonzero(moves)
+    within, used = (np.ones(mdp.num_transitions, bool) for _ in range(2))
+    within[moves], used[moves] = plan.within[moved], plan.used[moved]
+    return IntervalPlan(
+        known=plan.known,
+        row=origin[plan.row],
+        within=within,
+        rows=origin[plan.rows],
+        used=used,
+        has_free_cycles=bool(cycles.any()),
+        queries=_unique_queries(model, log, entries),
+    )
 
 
 def _restricted_nature(model: UncertainMDP, entries: Booleans, rows: Booleans) -> HostMDP:
@@ -153,7 +185,7 @@ def _free_states(
     finite: Booleans,
     rows: Booleans,
     nature_maximizes: bool,
-    log: list[_Query],
+    log: list[RoomQueries],
 ) -> Booleans:
     """States from which a policy reaches the target almost surely by some rows."""
     mdp = model.mdp
@@ -171,19 +203,11 @@ def _free_states(
 # --- recorded queries ---------------------------------------------------------------------------
 
 
-class _Query(NamedTuple):
-    """Queries about one set of entries: ``int[E]`` entries and groups, ``bool[G]`` answers."""
-
-    entry: Integers
-    group: Integers
-    room: Booleans
-
-
 @dataclass(frozen=True, kw_only=True)
 class _RecordingMDP(UncertainMDP):
     """An uncertain MDP that records queries which positive ends alone do not answer."""
 
-    log: list[_Query]  # the queries
+    log: list[RoomQueries]  # the queries
     origin: Integers  # int[T], entries of the model that the queries refer to
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
@@ -207,18 +231,19 @@ class _RecordingMDP(UncertainMDP):
         room = row_sums(np.where(entries, self.upper, 0), start, -self._ones) >= 0
         entry = np.flatnonzero(entries & asked[self.mdp.row])
         group = (np.cumsum(asked) - 1)[self.mdp.row[entry]]
-        self.log.append(_Query(self.origin[entry], group, room[asked]))
+        rows = np.flatnonzero(asked)
+        self.log.append(RoomQueries(self.origin[entry], group, rows, room[asked]))
 
 
-def _recording(model: UncertainMDP, log: list[_Query]) -> _RecordingMDP:
+def _recording(model: UncertainMDP, log: list[RoomQueries]) -> _RecordingMDP:
     every = np.arange(model.mdp.num_transitions)
     return _RecordingMDP(model.mdp, model.lower, model.upper, log=log, origin=every)
 
 
-def _unique_queries(model: UncertainMDP, log: list[_Query], entries: Integers) -> RoomQueries:
-    none = np.zeros(0, np.int64)
+def _unique_queries(model: UncertainMDP, log: list[RoomQueries], entries: Integers) -> RoomQueries:
+    """The distinct queries, by the entries and rows of the model."""
     if not log:
-        return RoomQueries(none, none, none, np.zeros(0, bool))
+        return _NO_QUERIES
     before = np.cumsum([0, *(q.room.size for q in log[:-1])])
     entry = entries[np.concatenate([q.entry for q in log])]
     group = np.concatenate([q.group + n for q, n in zip(log, before, strict=True)])
@@ -236,43 +261,3 @@ def _unique_queries(model: UncertainMDP, log: list[_Query], entries: Integers) -
         model.mdp.row[entry[start[kept]]],
         room[kept],
     )
-
-
-# --- residual problem ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Residual:
-    """The plan of a model with absorbing states, in the rows and entries of that model."""
-
-    model: UncertainMDP
-    origin: Integers
-    known: Floats  # as in the plan; `rows`, bool[R], likewise (known, row, within, used)
-    row: Integers
-    within: Booleans
-    rows: Booleans
-    used: Booleans
-    free: Booleans  # bool[R], rows without reward
-
-    def plan(self, model: UncertainMDP, absorbing: Booleans, log: list[_Query]) -> IntervalPlan:
-        """The plan in the rows and entries of the original model."""
-        mdp, small = model.mdp, self.model.mdp
-        open_ = np.isnan(self.known)
-        used = self.used & (self.free & self.rows)[small.row]
-        inner = joint_end_components(self.model, open_, used)[1] if open_.any() else used & False
-        cycles = inner & (small.successor != small.state[small.row])
-        # Entries of states that are not absorbing are the same, in the same order.
-        moves, moved = (~absorbing[x.state[x.row]] for x in (mdp, small))
-        entries = np.zeros(small.num_transitions, np.int64)
-        entries[moved] = np.flatnonzero(moves)
-        within, used = (np.ones(mdp.num_transitions, bool) for _ in range(2))
-        within[moves], used[moves] = self.within[moved], self.used[moved]
-        return IntervalPlan(
-            known=self.known,
-            row=self.origin[self.row],
-            within=within,
-            rows=self.origin[self.rows],
-            used=used,
-            has_free_cycles=bool(cycles.any()),
-            queries=_unique_queries(model, log, entries),
-        )

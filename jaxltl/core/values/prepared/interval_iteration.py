@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, images, sweep
+from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, images, sweep
 
 SLACK = 1e6  # smallest numbers that a guess is above nothing
 _NEAR = 0.9  # distance of the first guess of a bound from the other, as a share of the tolerance
@@ -35,7 +34,8 @@ class Problem(NamedTuple):
     """The cyclic blocks of a system."""
 
     core: Blocks
-    given: dict[str, PyTree]  # options of block_sweeps.sweep
+    maximize: bool
+    fixed: tuple[jax.Array, jax.Array]  # float[N] of all places: 0 and the value where it is known
     unit: float  # relative rounding error of a sum
     least: float  # loss of a sum to underflow
     tolerance: jax.Array  # width of the enclosure
@@ -46,9 +46,49 @@ class Problem(NamedTuple):
         return slice(self.core.first, self.core.last)
 
     @property
+    def keep(self) -> jax.Array:
+        return self.fixed[0][self.span]
+
+    @property
+    def put(self) -> jax.Array:
+        return self.fixed[1][self.span]
+
+    @property
     def ceiling(self) -> float:
         """Upper bound of all values."""
         return jnp.inf if self.relative else 1.0
+
+    @property
+    def sign(self) -> float:
+        return 1.0 if self.maximize else -1.0
+
+    def sweep(self, x: jax.Array, factor: float, shift: float | jax.Array) -> jax.Array:
+        rounding = (factor, shift)
+        found = sweep(self.core, x, maximize=self.maximize, fixed=self.fixed, rounding=rounding)
+        return found[0]
+
+    def image(self, outer: jax.Array, x: jax.Array) -> jax.Array:
+        """``c + P x`` of all rows, ``[C, A, B]``."""
+        count, _, _, block = self.core.target.shape
+        found = images(self.core, outer.at[self.span].set(x))
+        return found * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
+
+    def best(self, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        rank = jnp.argmax(self.sign * image, axis=1).astype(jnp.int32)
+        return rank, _of(rank, image)
+
+    def system(self, rank: jax.Array) -> Chosen:
+        core = self.core
+        count, _, _, block = core.target.shape
+        target, weight = (
+            jnp.take_along_axis(x, rank[:, None, None], 1)[:, 0] for x in (core.target, core.weight)
+        )
+        inside = (target >= core.first) & (target < core.last)
+        return Chosen(
+            jnp.where(inside, target - core.first, count * block),
+            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block),
+            cyclic=True,
+        )
 
 
 class State(NamedTuple):
@@ -100,23 +140,19 @@ def enclose_cycles(
 
 def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -> jax.Array:
     """Candidate upper bound a little above the lower one."""
-    span, given = problem.span, problem.given
-    x = low[span]
-    more = problem.relative
-    x = x * (1 + wide) + SLACK * problem.least if more else jnp.minimum(x + wide, 1)
-    if "fixed" in given:
-        keep, put = given["fixed"]
-        x = x * keep[span] + put[span]
-    return high.at[span].set(x)
+    x = low[problem.span]
+    if problem.relative:
+        x = x * (1 + wide) + SLACK * problem.least
+    else:
+        x = jnp.minimum(x + wide, 1)
+    return high.at[problem.span].set(x * problem.keep + problem.put)
 
 
 def _risen(problem: Problem, s: State) -> State:
     """One sweep of the lower bound and of the candidate upper bound."""
-    span, unit = problem.span, problem.unit
-    down: Sweep = partial(sweep, rounding=(1 - unit, -problem.least), **problem.given)
-    up: Sweep = partial(sweep, rounding=(1 + unit, problem.least), **problem.given)
-    low = down(problem.core, s.low)[0]
-    high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
+    span, unit, least = problem.span, problem.unit, problem.least
+    low = problem.sweep(s.low, 1 - unit, -least)
+    high = lax.cond(s.guessed, lambda x: problem.sweep(x, 1 + unit, least), lambda x: x, s.high)
     new, old = low[span], s.low[span]
     change = jnp.abs(new - old)
     if problem.relative:
@@ -147,48 +183,6 @@ class _Policy(NamedTuple):
     rounds: jax.Array
 
 
-class _Choices(NamedTuple):
-    """Rows of the blocks, and places with a fixed value."""
-
-    problem: Problem
-    keep: jax.Array  # zero where `put` is known
-    put: jax.Array
-
-    @property
-    def sign(self) -> float:
-        return 1.0 if self.problem.given["maximize"] else -1.0
-
-    def image(self, outer: jax.Array, x: jax.Array) -> jax.Array:
-        """``c + P x`` of all rows, ``[C, A, B]``."""
-        count, _, _, block = self.problem.core.target.shape
-        found = images(self.problem.core, outer.at[self.problem.span].set(x))
-        return found * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
-
-    def best(self, image: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rank = jnp.argmax(self.sign * image, axis=1).astype(jnp.int32)
-        return rank, _of(rank, image)
-
-    def system(self, rank: jax.Array) -> Chosen:
-        core = self.problem.core
-        count, _, _, block = core.target.shape
-        target = jnp.take_along_axis(core.target, rank[:, None, None], 1)[:, 0]
-        weight = jnp.take_along_axis(core.weight, rank[:, None, None], 1)[:, 0]
-        inside = (target >= core.first) & (target < core.last)
-        return Chosen(
-            jnp.where(inside, target - core.first, count * block),
-            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block),
-            cyclic=True,
-        )
-
-
-def _choices(problem: Problem, dtype: jnp.dtype) -> _Choices:
-    if "fixed" in problem.given:
-        span = problem.span
-        return _Choices(problem, *(x[span] for x in problem.given["fixed"]))
-    size = problem.core.last - problem.core.first
-    return _Choices(problem, jnp.ones(size, dtype), jnp.zeros(size, dtype))
-
-
 def _of(rank: jax.Array, image: jax.Array) -> jax.Array:
     """The images of the chosen rows alone."""
     return jnp.take_along_axis(image, rank[:, None], 1).ravel()
@@ -196,21 +190,19 @@ def _of(rank: jax.Array, image: jax.Array) -> jax.Array:
 
 def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     """Bounds by policy iteration; the unchanged state if it fails."""
-    core, x = problem.core, state.low[problem.span]
-    rows = _choices(problem, x.dtype)
-    sign = rows.sign
+    core, x, sign = problem.core, state.low[problem.span], problem.sign
     # Values of earlier blocks lie between their bounds, so each side is proven with its own bound.
     middle = state.low.at[: core.first].set((state.low[: core.first] + high[: core.first]) / 2)
 
     def improve(p: _Policy) -> _Policy:
         timing = (p.rounds == 1) | p.done
-        residual = _of(p.rank, rows.image(middle, p.value)) + sign * p.extra - p.value
-        found = rows.system(p.rank).solve(jnp.where(timing, 1, residual))
+        residual = _of(p.rank, problem.image(middle, p.value)) + sign * p.extra - p.value
+        found = problem.system(p.rank).solve(jnp.where(timing, 1, residual))
         time = jnp.where(timing, found, p.time)
         value = jnp.where(timing, p.value, p.value + found)
-        extra = jnp.where(p.rounds == 1, _extra(problem, value, time, rows.keep), p.extra)
-        now = rows.image(middle, value)
-        rank, optimum = rows.best(now)
+        extra = jnp.where(p.rounds == 1, _extra(problem, value, time), p.extra)
+        now = problem.image(middle, value)
+        rank, optimum = problem.best(now)
         own = _of(p.rank, now)
         better = (sign * (optimum - own) > _KEPT * extra).reshape(p.rank.shape) & ~timing
         exact = jnp.max(jnp.abs(own + sign * extra - value)) <= extra / 16
@@ -222,7 +214,7 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
 
     none = jnp.asarray(False)
     return _proven(
-        rows,
+        problem,
         state,
         high,
         lax.while_loop(
@@ -230,7 +222,7 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
             improve,
             _Policy(
                 x,
-                rows.best(rows.image(middle, x))[0],
+                problem.best(problem.image(middle, x))[0],
                 jnp.ones_like(x),
                 jnp.zeros((), x.dtype),
                 none,
@@ -241,19 +233,18 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     )
 
 
-def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
+def _proven(problem: Problem, state: State, high: jax.Array, p: _Policy) -> State:
     """Bounds certified by the last policy; the unchanged state if it proves none."""
-    problem, sign, time = rows.problem, rows.sign, p.time
-    core, span = problem.core, problem.span
+    core, span, sign, time = problem.core, problem.span, problem.sign, p.time
     far, near = p.value, p.value - sign * 1.5 * p.extra * time
     outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
-    beyond = sign * far - sign * rows.best(rows.image(outer_far, far))[1]
-    attained = sign * _of(p.rank, rows.image(outer_near, near)) - sign * near
+    beyond = sign * far - sign * problem.best(problem.image(outer_far, far))[1]
+    attained = sign * _of(p.rank, problem.image(outer_near, near)) - sign * near
     # Known values, and places without a node, which have the value 0.
-    fixed = (rows.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
-    far, near = (jnp.where(fixed, rows.put, y) for y in (far, near))
+    fixed = (problem.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
+    far, near = (jnp.where(fixed, problem.put, y) for y in (far, near))
     slack = problem.unit * jnp.abs(far) * 2 + problem.least
-    onward = time - rows.system(p.rank).image(jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
+    onward = time - problem.system(p.rank).image(jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
     proven = jnp.all(
         fixed | ((beyond >= slack) & (attained >= slack) & (time >= 0) & (onward >= 0.5))
     )
@@ -275,20 +266,29 @@ def _swept(
     problem: Problem, outer: jax.Array, value: jax.Array, *, shift: jax.Array, rank: jax.Array
 ) -> jax.Array:
     """Greedy rows after some sweeps, which propagate improvements."""
-    x = outer.at[problem.span].set(value)
-    going: Sweep = partial(sweep, problem.core, rounding=(1.0, shift), **problem.given)
-    result: jax.Array = lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[
-        1
-    ]
-    return result
+
+    def again(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        x, rank = sweep(
+            problem.core,
+            carry[0],
+            maximize=problem.maximize,
+            rounding=(1.0, shift),
+            fixed=problem.fixed,
+            choose=True,
+        )
+        assert rank is not None
+        return x, rank
+
+    start = outer.at[problem.span].set(value), rank
+    return lax.fori_loop(0, _SWEEPS, again, start)[1]
 
 
-def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:
+def _extra(problem: Problem, value: jax.Array, time: jax.Array) -> jax.Array:
     """Extra cost of a step: small relative to the tolerance, and more than rounding."""
     time = jnp.maximum(time, 1)
     share = 1 / jnp.max(time)
     if problem.relative:
-        some = (value > SLACK * problem.least) & (keep > 0)
+        some = (value > SLACK * problem.least) & (problem.keep > 0)
         share = jnp.min(jnp.where(some, value / time, jnp.inf))
         share = jnp.where(jnp.isfinite(share), share, 1)
     most = jnp.maximum(jnp.max(jnp.abs(value)), 1e-30)

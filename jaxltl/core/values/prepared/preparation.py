@@ -200,24 +200,15 @@ def prepare(
 
 
 def _prepared(host: HostMDP, plan: Plan, cost: np.ndarray | None, objective: str) -> Prepared:
-    """The arrays of a plan, with the weights of the model in its blocks."""
+    """The arrays of a plan; solves fill in the weights of its blocks."""
     dtype = jnp.zeros(()).dtype
     refuse_underflow(host.row_start, host.entry_start, host.probability, dtype)
-    vector = np.concatenate(
-        [host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]]
-    )
-    if plan.loops is not None:
-        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry], plan.loops.groups)
-        scale = np.ones(host.num_rows)
-        scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
-        vector[: host.num_transitions] *= scale[host.row]
-        vector[host.num_transitions : -2] *= scale
+    nothing = host.num_transitions + host.num_rows + 1
     blocks, nodes, first = [], [], 0
     for part in plan.schedule.segments:
-        full = (part.source != vector.size - 1).any((1, 2)).ravel()
+        full = (part.source != nothing).any((1, 2)).ravel()
         nodes.append(first + np.flatnonzero(full))
-        weight = vector[part.source].astype(dtype)
-        blocks.append(Blocks(part.target, part.source, weight, part.name, first))
+        blocks.append(Blocks(part.target, part.source, None, part.name, first))
         first = blocks[-1].last
     loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
     cycles = None if plan.cycles is None else tuple(x.astype(np.int32) for x in plan.cycles)

@@ -141,59 +141,45 @@ def _solve(
     max_steps: jax.Array | int,
 ) -> Solution:
     tolerance = jnp.asarray(tolerance, prepared.probability.dtype)
-    share, taken = _shares(prepared, policy)
-    finite, valid = _checked_numbers(prepared, probability, reward, share)
-    if probability is not None or reward is not None or share is not None:
-        prepared = _refilled(prepared, probability, reward, share)
-    decided = None
-    if share is not None:
-        decided = _decided(prepared, reward, share)
+    finite, valid = _checked_numbers(prepared, probability, reward)
+    given = _given_policy(prepared, policy) if prepared.objective == "policy" else None
+    decided = None if given is None else _decided(prepared, reward, given)
+    if given is not None:
+        finite, valid = finite & given.finite, valid & given.valid
+    prepared = _filled(prepared, probability, reward, None if given is None else given.weight)
     found = _enclosed(prepared, decided, tolerance, max_steps)
     value = _attached(prepared, found, decided)
-    return _answer(prepared, found, decided, value, taken, _Checks(tolerance, finite, valid))
+    solution = _answer(prepared, found._replace(value=value), decided, tolerance, (finite, valid))
+    return solution if given is None else replace(solution, policy=given.policy)
 
 
-class _Checks(NamedTuple):
-    tolerance: jax.Array
-    finite: jax.Array
-    valid: jax.Array
+class _GivenPolicy(NamedTuple):
+    """A policy with the normalised weights of its rows."""
 
-
-class _Shares(NamedTuple):
+    policy: jax.Array
     weight: jax.Array
     used: jax.Array
-    valid: jax.Array
     finite: jax.Array
+    valid: jax.Array
 
 
-def _shares(prepared: Prepared, policy: _Maybe) -> tuple[_Shares | None, _Maybe]:
-    """Weights of the rows under the policy, normalised, and the policy of the solution."""
-    if prepared.objective != "policy":
-        return None, None
-    dtype = prepared.probability.dtype
-    if policy is None:
-        policy = jnp.ones(prepared.num_rows, dtype)
-    policy = jnp.asarray(policy)
+def _given_policy(prepared: Prepared, policy: _Maybe) -> _GivenPolicy:
+    """The policy; by default the only one of a chain."""
+    dtype, state = prepared.probability.dtype, prepared.row_state
+    policy = jnp.ones(prepared.num_rows, dtype) if policy is None else policy
+    weight = policy
     if is_deterministic(policy):
-        rows = jnp.arange(prepared.num_rows, dtype=jnp.int32)
-        used = policy[prepared.row_state] == rows
-        weight = used.astype(dtype)
-    else:
-        weight = policy.astype(dtype)
-        used = weight > 0
-    total = jax.ops.segment_sum(
-        weight, prepared.row_state, prepared.num_states, indices_are_sorted=True
-    )
-    slack = row_tolerance(dtype)
-    valid = jnp.all(jnp.abs(total - 1) <= slack) & jnp.all(weight >= 0)
+        weight = policy[state] == jnp.arange(prepared.num_rows, dtype=jnp.int32)
+    weight = weight.astype(dtype)
+    total = jax.ops.segment_sum(weight, state, prepared.num_states, indices_are_sorted=True)
+    valid = jnp.all(jnp.abs(total - 1) <= row_tolerance(dtype)) & jnp.all(weight >= 0)
     valid &= ~jnp.any(is_subnormal(weight))
-    finite = jnp.all(jnp.isfinite(weight))
-    total = jnp.where(total > 0, total, 1)
-    return _Shares(weight / total[prepared.row_state], used, valid, finite), policy
+    share = weight / jnp.where(total > 0, total, 1)[state]
+    return _GivenPolicy(policy, share, weight > 0, jnp.all(jnp.isfinite(weight)), valid)
 
 
 def _checked_numbers(
-    prepared: Prepared, probability: _Maybe, reward: _Maybe, share: _Shares | None
+    prepared: Prepared, probability: _Maybe, reward: _Maybe
 ) -> tuple[jax.Array, jax.Array]:
     """Tests that numbers are finite, and that they are valid."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
@@ -211,30 +197,25 @@ def _checked_numbers(
         valid &= jnp.all(reward >= 0) & jnp.all(before | (reward == 0))
         if prepared.objective == "min":
             valid &= jnp.all((reward > 0) == before)
-    if share is not None:
-        finite, valid = finite & share.finite, valid & share.valid
     return finite, valid
 
 
-def _refilled(
-    prepared: Prepared, probability: _Maybe, reward: _Maybe, share: _Shares | None = None
+def _filled(
+    prepared: Prepared, probability: _Maybe, reward: _Maybe, scale: _Maybe = None
 ) -> Prepared:
-    """The prepared question with other weights in its blocks."""
+    """The prepared question with weights in its blocks; rows are scaled by those of a policy."""
     dtype = prepared.probability.dtype
-    p = prepared.probability if probability is None else jnp.asarray(probability, dtype)
+    p = jnp.asarray(prepared.probability if probability is None else probability, dtype)
     r = prepared.reward if reward is None else jnp.asarray(reward, dtype)
-    scale = None if share is None else share.weight
+    r = jnp.zeros(prepared.num_rows, dtype) if r is None else r
+    if scale is not None:
+        p, r = p * scale[prepared.entry_row], r * scale
     if prepared.loops is not None:
         entry, group, row, row_group = prepared.loops
-        rest = p[entry] if scale is None else p[entry] * scale[prepared.entry_row[entry]]
-        total = jax.ops.segment_sum(rest, group, prepared.groups, indices_are_sorted=True)
-        inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)[row_group]
-        if scale is None:
-            scale = jnp.ones(prepared.num_rows, dtype)
-        scale = scale.at[row].multiply(inverse, unique_indices=True)
-    if r is None:
-        r = jnp.zeros(prepared.num_rows, dtype)
-    if scale is not None:
+        total = jax.ops.segment_sum(p[entry], group, prepared.groups, indices_are_sorted=True)
+        inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
+        ones = jnp.ones(prepared.num_rows, dtype)
+        scale = ones.at[row].set(inverse[row_group], unique_indices=True)
         p, r = p * scale[prepared.entry_row], r * scale
     vector = jnp.concatenate([p, r, jnp.asarray([1, 0], dtype)])
     one, two, three = (
@@ -252,12 +233,12 @@ class _Decided(NamedTuple):
     infinite: jax.Array
 
 
-def _decided(prepared: Prepared, reward: _Maybe, share: _Shares) -> _Decided:
+def _decided(prepared: Prepared, reward: _Maybe, given: _GivenPolicy) -> _Decided:
     """Places where the value of a policy is 0, 1 or infinite."""
     size = prepared.size
     earned = prepared.reward if reward is None else reward
-    paid = jnp.zeros(prepared.num_rows, bool) if earned is None else share.used & (earned > 0)
-    used = jnp.concatenate([share.used[prepared.entry_row], paid, jnp.asarray([True, False])])
+    paid = jnp.zeros(prepared.num_rows, bool) if earned is None else given.used & (earned > 0)
+    used = jnp.concatenate([given.used[prepared.entry_row], paid, jnp.asarray([True, False])])
     support = tuple(used[x.source] for x in prepared.segments)
     goal = size if prepared.question == "probability" else size + 1
     seed = jnp.zeros(size + 3, bool).at[goal].set(True)
@@ -300,13 +281,14 @@ def _enclosed(
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
     unit, least = _rounding(prepared)
-    given: dict[str, PyTree] = {"maximize": prepared.objective != "min"}
+    fixed = jnp.ones(size, dtype), jnp.zeros(size, dtype)
     if decided is not None:
-        given["fixed"] = tuple(x[:size].astype(dtype) for x in (decided.keep, decided.put))
+        fixed = decided.keep[:size].astype(dtype), decided.put[:size].astype(dtype)
     start = jnp.zeros(size + 3, dtype).at[size].set(1)
     if prepared.cyclic:
-        return _solve_cyclic(prepared, start, given, tolerance, max_steps)
-    x, rank = sweep(prepared.segments[0], start, choose=decided is None, **given)
+        return _enclosed_cycles(prepared, fixed, start, tolerance, max_steps)
+    maximize, choose = prepared.objective != "min", decided is None
+    x, rank = sweep(prepared.segments[0], start, maximize=maximize, fixed=fixed, choose=choose)
     x = x[:size]
     share = 1.3 * prepared.levels * unit
     known = share <= 0.1
@@ -316,32 +298,31 @@ def _enclosed(
     return _Found(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
 
 
-def _solve_cyclic(
+def _enclosed_cycles(
     prepared: Prepared,
+    fixed: tuple[jax.Array, jax.Array],
     start: jax.Array,
-    given: dict[str, PyTree],
     tolerance: jax.Array,
     max_steps: jax.Array | int,
 ) -> _Found:
     """Bounds from both sides where the system has cycles."""
     unit, least = _rounding(prepared)
     before, core, after = prepared.segments
-    size = prepared.size
-    down: Sweep = partial(sweep, rounding=(1 - unit, -least), **given)
-    up: Sweep = partial(sweep, rounding=(1 + unit, least), **given)
-    arrays = {k: x for k, x in given.items() if k != "maximize"}
+    maximize, size = prepared.objective != "min", prepared.size
+    one_sweep: Sweep = partial(sweep, maximize=maximize, fixed=fixed)
+    down, up = (partial(one_sweep, rounding=x) for x in ((1 - unit, -least), (1 + unit, least)))
 
-    def enclosed(core: Blocks, arrays: PyTree, *numbers: jax.Array) -> State:
-        options = {"maximize": given["maximize"], **arrays}
+    def enclosed(core: Blocks, fixed: tuple[jax.Array, jax.Array], *numbers: jax.Array) -> State:
         tolerance, low, high, most = numbers
-        problem = Problem(core, options, unit, least, tolerance, prepared.question == "reward")
+        relative = prepared.question == "reward"
+        problem = Problem(core, maximize, fixed, unit, least, tolerance, relative)
         return enclose_cycles(problem, low, high, most)
 
     # How much work it is depends on the lane.
     s = sequential_vmap(
         enclosed,
         core,
-        arrays,
+        fixed,
         tolerance,
         down(before, start)[0],
         up(before, start)[0],
@@ -349,12 +330,12 @@ def _solve_cyclic(
     )
     low, high = down(after, s.low)[0], up(after, s.high)[0]
     rank = None
-    if "fixed" not in given:
+    if prepared.objective != "policy":
         # Greedy in a bound that a pass does not worsen: its policy attains it.
-        safe = low if given["maximize"] else jnp.where(s.proven, high, low)
+        safe = low if maximize else jnp.where(s.proven, high, low)
         parts: list[PyTree] = []
         for part in prepared.segments:
-            safe, ranks = sweep(part, safe, choose=True, **given)
+            safe, ranks = one_sweep(part, safe, choose=True)
             parts.append(ranks)
         rank = jnp.concatenate(parts)
     low, high = low[:size], high[:size]
@@ -362,25 +343,32 @@ def _solve_cyclic(
     return _Found(middle, low, high, rank, s.moved, s.steps, s.proven)
 
 
-def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> jax.Array:
-    """Values of the places with implicit derivatives."""
+def _attached(
+    prepared: Prepared, found: _Found | None, decided: _Decided | None = None
+) -> jax.Array:
+    """Values of the places with implicit derivatives; of a chain also their approximation."""
     size, dtype = prepared.size, prepared.probability.dtype
     if not size:
-        return found.value
-    system = _chosen_rows(prepared, found.rank)
-    put = jnp.zeros(size, dtype)
+        return jnp.zeros(0, dtype)
+    system = _chosen_rows(prepared, None if found is None else found.rank)
+    one, put = jnp.asarray([1, 0, 0], dtype), jnp.zeros(size, dtype)
     if decided is not None:
         count, _, block = system.target.shape
-        keep = decided.keep[:size].astype(dtype)
+        keep, put = (x[:size].astype(dtype) for x in (decided.keep, decided.put))
         system = replace(system, weight=system.weight * keep.reshape(count, 1, block))
-        put = decided.put[:size].astype(dtype)
-    fixed = lax.stop_gradient(system)
-    one = jnp.asarray([1, 0, 0], dtype)
 
     def operator(x: jax.Array) -> jax.Array:
         return system.image(jnp.concatenate([x, one])) + put
 
-    return implicit(operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
+    fixed = lax.stop_gradient(system)
+    solve, transpose = fixed.solve, fixed.transpose_solve
+    if found is not None:
+        value = found.value
+    else:
+        if prepared.cyclic and is_direct(prepared):
+            solve, transpose = _eliminated(fixed, prepared.nodes)
+        value = solve(lax.stop_gradient(operator(put)))
+    return implicit(operator, value, solve=solve, transpose_solve=transpose)
 
 
 def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
@@ -389,25 +377,22 @@ def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
     weight = jnp.concatenate([x.weight for x in prepared.segments])
     if rank is None:
         return Chosen(target[:, 0], weight[:, 0], prepared.cyclic)
-    at = rank[:, None, None]
-    return Chosen(
-        jnp.take_along_axis(target, at, 1)[:, 0],
-        jnp.take_along_axis(weight, at, 1)[:, 0],
-        prepared.cyclic,
+    target, weight = (
+        jnp.take_along_axis(x, rank[:, None, None], 1)[:, 0] for x in (target, weight)
     )
+    return Chosen(target, weight, prepared.cyclic)
 
 
 def _answer(
     prepared: Prepared,
     found: _Found,
     decided: _Decided | None,
-    value: jax.Array,
-    taken: _Maybe,
-    checks: _Checks,
+    tolerance: jax.Array,
+    checks: tuple[jax.Array, jax.Array],
 ) -> Solution:
     """The solution; checked at the nodes, which may be far fewer than the states."""
-    tolerance, finite, valid = checks
-    dtype, size = prepared.probability.dtype, prepared.size
+    finite, valid = checks
+    dtype, size, value = prepared.probability.dtype, prepared.size, found.value
     relative = prepared.question == "reward"
     most = jnp.inf if relative else 1.0
     value = value + lax.stop_gradient(jnp.clip(value, 0, most) - value)
@@ -431,7 +416,7 @@ def _answer(
         value=everywhere(value, jnp.nan),
         lower=everywhere(lower, -jnp.inf),
         upper=everywhere(upper, jnp.inf),
-        policy=_policy(prepared, found) if taken is None else taken,
+        policy=_policy(prepared, found),
         residual=jnp.where(good, found.residual, jnp.nan),
         num_steps=found.steps,
         status=status,
@@ -501,26 +486,8 @@ def evaluate_prepared(
 def _evaluate(
     prepared: Prepared, probability: _Maybe, reward: _Maybe
 ) -> tuple[jax.Array, jax.Array]:
-    size, dtype = prepared.size, prepared.probability.dtype
-    finite, valid = _checked_numbers(prepared, probability, reward, None)
-    if probability is not None or reward is not None:
-        prepared = _refilled(prepared, probability, reward)
-    value = jnp.zeros(0, dtype)
-    if size:
-        system = _chosen_rows(prepared, None)
-        fixed = lax.stop_gradient(system)
-        eliminated = prepared.cyclic and is_direct(prepared)
-        solve, transpose = (
-            _eliminated(fixed, prepared.nodes)
-            if eliminated
-            else (fixed.solve, fixed.transpose_solve)
-        )
-
-        def operator(x: jax.Array) -> jax.Array:
-            return system.image(jnp.concatenate([x, jnp.asarray([1, 0, 0], dtype)]))
-
-        constant = lax.stop_gradient(operator(jnp.zeros(size, dtype)))
-        value = implicit(operator, solve(constant), solve=solve, transpose_solve=transpose)
+    finite, valid = _checked_numbers(prepared, probability, reward)
+    value = _attached(_filled(prepared, probability, reward), None)
     finite &= jnp.all(jnp.isfinite(lax.stop_gradient(value)))
     status = status_code(True, finite, certified=False, valid=valid | ~finite)
     return _at_states(prepared, value), status
