@@ -232,7 +232,7 @@ def robust_policy(
     search = FrontSearch(joint, objectives, tolerance / 8)
     wanted = np.ones(len(labels))
     while True:
-        lower = np.stack(search.lower)
+        lower = search.lower
         apart = frontier.separation(lower, wanted, search.scale)
         normals, bounds = search.half_spaces
         upper = min(float((bounds / normals.sum(1)).min()), 1.0)

@@ -168,20 +168,16 @@ def _solved(
     gain = np.where(moves, earned[own], quotient.known)
     loss = np.where(moves, spent[own], 0)
     end = np.arange(mdp.num_states) == mdp.num_states - 1
-    none = np.zeros(mdp.num_states)
     first = shortest_path_rows(mdp, end, np.ones(mdp.num_rows, bool)).astype(np.int64)
-    if not loss.any():
-        problem = ShortestPathProblem(mdp, ~end, none, gain, proper_policy=first)
-        found = policy_iteration(problem, maximize=True, tolerance=tolerance, relative=False)
-        return found.upper, found.row
-    if not (gain[moves] > 0).any():
-        most = quotient.known.max()
-        lost = np.where(moves, loss, most - quotient.known)
-        lost[-1] = 0
-        problem = ShortestPathProblem(mdp, ~end, none, lost, proper_policy=first)
-        found = policy_iteration(problem, maximize=False, tolerance=tolerance, relative=False)
-        return most - found.lower, found.row
-    return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
+    costs = loss.any()
+    if costs and (gain[moves] > 0).any():
+        return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
+    most = quotient.known.max() if costs else 0.0
+    amount = np.where(moves, loss, most - quotient.known) if costs else gain
+    amount[-1] = 0
+    problem = ShortestPathProblem(mdp, ~end, np.zeros(end.size), amount, proper_policy=first)
+    found = policy_iteration(problem, maximize=not costs, tolerance=tolerance, relative=False)
+    return (most - found.lower if costs else found.upper), found.row
 
 
 def _signed(

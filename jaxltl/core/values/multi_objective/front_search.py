@@ -7,17 +7,16 @@ policy leaves.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
 from jaxltl.core.sparse.multi_objective.weighted_sum import (
     FinalComponents,
-    WeightedProblem,
     final_components,
     weighted_optimum,
 )
@@ -32,48 +31,61 @@ from jaxltl.core.values.multi_objective.results import ConstrainedOptimum, Front
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
 
 
+class _Sum(NamedTuple):
+    """A weighted sum that was solved: the values of its policy, and a half-space."""
+
+    policy: np.ndarray
+    value: np.ndarray  # float64[n], with bounds
+    lower: np.ndarray
+    upper: np.ndarray
+    normal: np.ndarray
+    bound: float
+    exactness: float  # the tolerance
+
+
 class FrontSearch:
     """Known points and half-spaces, all objectives maximised: `signs` is -1 for minimised ones."""
 
     def __init__(self, model: Model, objectives: Sequence[Objective], tolerance: float) -> None:
-        self.model: SparseMDP = to_sparse(model)
         if not objectives:
             raise ValueError("there is no objective; give at least one.")
-        self.parts: list[Part]
-        self.sums: WeightedProblem
-        self.sums, self.parts, self.product = weighted_problem(self.model, objectives)
-        where = final_components(self.sums)
-        if where is None:
+        problem = weighted_problem(to_sparse(model), objectives)
+        self.problem, self.parts, self.product = problem
+        ends = final_components(self.problem)
+        if ends is None:
             names = " and ".join(str(p.number + 1) for p in self.parts if p.kind == "cost")
             raise ValueError(
                 f"the expected reward of objective {names or 1} is infinite under every policy: "
                 "what it counts goes on for ever, or its target is not reached almost surely."
             )
-        self.where: FinalComponents = where
+        self.ends: FinalComponents = ends
         self._require_finite()
         self.signs = np.array([p.sign for p in self.parts])
         self.tolerance = tolerance
-        self.values: list[np.ndarray] = []
-        self.lower: list[np.ndarray] = []
-        self.upper: list[np.ndarray] = []
-        self.normals: list[np.ndarray] = []
-        self.bounds: list[float] = []
-        self.exactness: list[float] = []  # the tolerance by which each sum was solved
-        self.policies: list[np.ndarray] = []
-        size = len(self.parts)
-        self.scale = np.ones(size)
-        for i in range(size):
-            self.ask(np.eye(size)[i])
+        self.solved: list[_Sum] = []
+        self.scale = np.ones(len(self.parts))
+        for normal in np.eye(len(self.parts)):
+            self.ask(normal)
         self._rescale()
 
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower bounds of the points, ``float64[N, n]``."""
+        return np.stack([x.lower for x in self.solved])
+
+    @property
+    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normals and bounds, ``float64[K, n]`` and ``float64[K]``."""
+        return np.stack([x.normal for x in self.solved]), np.array([x.bound for x in self.solved])
+
     def _require_finite(self) -> None:
-        mdp = self.sums.mdp
-        circles = end_components(mdp, rows=self.where.rows).inside
+        mdp = self.problem.mdp
+        cyclic = end_components(mdp, rows=self.ends.rows).inside
         everywhere = end_components(mdp).inside
         for part in self.parts:
             if part.kind != "gain":
                 continue
-            earns = (circles & (self.sums.gain[part.place] > 0)).any()
+            earns = (cyclic & (self.problem.gain[part.place] > 0)).any()
             if earns or (part.open is not None and (everywhere & part.open[mdp.state]).any()):
                 why = (
                     "reward is earned for ever in an end component"
@@ -86,80 +98,50 @@ class FrontSearch:
                 )
 
     def _rescale(self) -> None:
-        reach = np.abs(np.stack(self.lower)).max(0)
-        self.scale = np.array(
-            [
-                1.0 if p.kind == "sure" or not x > 0 else x
-                for p, x in zip(self.parts, reach, strict=True)
-            ]
-        )
+        reach = np.abs(self.lower).max(0)
+        is_reward = np.array([p.kind != "sure" for p in self.parts])
+        self.scale = np.where(is_reward & (reach > 0), reach, 1.0)
 
     def ask(self, normal: np.ndarray) -> None:
         """Solves a weighted sum, and adds its point and its half-space."""
-        weights: dict[str, np.ndarray] = {
-            "sure": np.zeros(len(self.sums.priority)),
-            "gain": np.zeros(len(self.sums.gain)),
-            "cost": np.zeros(len(self.sums.cost)),
-        }
+        rows = {"sure": self.problem.priority, "gain": self.problem.gain, "cost": self.problem.cost}
+        weights = {kind: np.zeros(len(x)) for kind, x in rows.items()}
+        shift = 0.0  # a probability to be minimised is one minus the maximised one
         for part, w in zip(self.parts, normal, strict=True):
             weights[part.kind][part.place] = w
-        found = weighted_optimum(
-            self.sums,
-            self.where,
-            weights["sure"],
-            weights["gain"],
-            weights["cost"],
-            self.tolerance / 4 * float((normal * self.scale).sum()),
-        )
-        # A probability to be made small is one minus the one that was made large.
-        shift = sum(
-            w for p, w in zip(self.parts, normal, strict=True) if p.kind == "sure" and p.sign < 0
-        )
-        value, lower, upper = self.evaluate(found.weight, found.home)
-        self.values.append(value)
-        self.lower.append(lower)
-        self.upper.append(upper)
-        self.policies.append(found.weight)
-        self.normals.append(np.array(normal))
-        self.exactness.append(self.tolerance)
-        self.bounds.append(found.bound - shift + 1e-15 * (abs(found.bound) + shift))
+            shift += w if part.kind == "sure" and part.sign < 0 else 0
+        tolerance = self.tolerance / 4 * float((normal * self.scale).sum())
+        found = weighted_optimum(self.problem, self.ends, **weights, tolerance=tolerance)
+        bound = found.bound - shift + 1e-15 * (abs(found.bound) + shift)
+        values = self._evaluate(found.weight, found.home)
+        self.solved.append(_Sum(found.weight, *values, normal, bound, self.tolerance))
 
-    def evaluate(
-        self, weight: np.ndarray, home: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values of a policy with bounds, all maximised."""
-        sums, sparse = self.sums, sparse_mdp_of_product(self.product)
+    def _evaluate(self, weight: np.ndarray, home: np.ndarray) -> np.ndarray:
+        """Values of a policy and their bounds, all maximised: ``float64[3, n]``."""
+        problem, sparse = self.problem, sparse_mdp_of_product(self.product)
         chain = induced_chain(sparse, sparse, weight)
-        inside = (weight > 0) & home[sums.mdp.state]
-        component = end_components(sums.mdp, rows=inside).component
+        inside = (weight > 0) & home[problem.mdp.state]
+        component = end_components(problem.mdp, rows=inside).component
+        leader = component[problem.mdp.state[inside]]
+        options = {"tolerance": self.tolerance / 8, "depth": chain.depth}
         found = []
         for part in self.parts:
             if part.kind == "sure":
-                level, leader = sums.priority[part.place], component[sums.mdp.state[inside]]
                 least = np.full(home.size, np.iinfo(np.int64).max)
-                np.minimum.at(least, leader, level[inside])
+                np.minimum.at(least, leader, problem.priority[part.place][inside])
                 good = home & (least[component] % 2 == 0)
-                x = optimal.reachability(
-                    chain.mdp, good, maximize=True, tolerance=self.tolerance / 8, depth=chain.depth
-                )
+                x = optimal.reachability(chain.mdp, good, maximize=True, **options)
             else:
-                rows = (sums.gain if part.kind == "gain" else sums.cost)[part.place]
-                earned = chain.mean(rows, sums.mdp.row_start)
-                x = optimal.total_reward(
-                    chain.mdp,
-                    earned,
-                    home,
-                    maximize=False,
-                    tolerance=self.tolerance / 8,
-                    depth=chain.depth,
-                )
+                rows = (problem.gain if part.kind == "gain" else problem.cost)[part.place]
+                earned = chain.mean(rows, problem.mdp.row_start)
+                x = optimal.total_reward(chain.mdp, earned, home, maximize=False, **options)
             found.append(self._expected(part, x))
-        return tuple(np.array(x) for x in zip(*found, strict=True))  # type: ignore[return-value]
+        return np.array(found).T
 
     def _expected(self, part: Part, found: Enclosure) -> tuple[float, float, float]:
         """Value, lower and upper bound from the initial distribution."""
-        first = np.flatnonzero(self.sums.start)
-        share = self.sums.start[first]
+        first = np.flatnonzero(self.problem.start)
+        share = self.problem.start[first]
         slack = 1e-15 * (first.size + 2)
         value, low, high = (
             float(share @ x[first]) for x in (found.value, found.lower, found.upper)
@@ -176,24 +158,18 @@ class FrontSearch:
         # The policy made the opposite event's probability large.
         return (value - 1, *((low - 1, high - 1) if exact else (low - 1 - 1e-16, high - 1 + 1e-16)))
 
-    @property
-    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Normals and bounds, ``float64[K, n]`` and ``float64[K]``."""
-        return np.stack(self.normals), np.array(self.bounds)
-
     def front(self) -> Front:
-        values, lower, upper = (
-            np.stack(x) * self.signs for x in (self.values, self.lower, self.upper)
-        )
-        lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
-        values, lower, upper = (x + 0.0 for x in (values, lower, upper))
+        """The points and half-spaces with the signs of the objectives."""
+        points = np.array([(x.value, x.lower, x.upper) for x in self.solved]) * self.signs + 0.0
+        value, one, other = points.swapaxes(0, 1)
+        normals, bounds = self.half_spaces
         return Front(
-            values,
-            lower,
-            upper,
-            np.stack(self.normals) * self.signs,
-            np.array(self.bounds),
-            tuple(self.policies),
+            value,
+            np.minimum(one, other),
+            np.maximum(one, other),
+            normals * self.signs,
+            bounds,
+            tuple(x.policy for x in self.solved),
             self.product,
         )
 
@@ -203,13 +179,12 @@ class FrontSearch:
         """Decides whether a vector is attained, with a mixture or a half-space as evidence."""
         looked = 0
         while True:
-            for k in range(looked, len(self.normals)):
-                if frontier.exceeds(self.normals[k], self.bounds[k], wanted):
+            for k, known in enumerate(self.solved[looked:], looked):
+                if frontier.exceeds(known.normal, known.bound, wanted):
                     return False, None, k
-            looked = len(self.normals)
-            lower = np.stack(self.lower)
+            lower, looked = self.lower, len(self.solved)
             for i in np.flatnonzero((lower >= wanted).all(1)):
-                return True, np.eye(len(lower))[int(i)], None
+                return True, np.eye(looked)[int(i)], None
             apart = frontier.separation(lower, wanted, self.scale)
             for share in (apart.share, frontier.plain(apart.share)):
                 if frontier.meets(lower, share, wanted):
@@ -228,16 +203,14 @@ class FrontSearch:
 
     def _known(self, normal: np.ndarray) -> bool:
         """True if a weighted sum was solved as accurately already, up to rounding."""
-        size = normal * self.scale
-        return any(
-            np.abs(size / size.sum() - x * self.scale / (x * self.scale).sum()).max() < 1e-12
-            for x, exactness in zip(self.normals, self.exactness, strict=True)
-            if exactness <= self.tolerance
-        )
+        normals = np.stack([normal, *(x.normal for x in self.solved)]) * self.scale
+        normals /= normals.sum(1, keepdims=True)
+        exact = np.array([x.exactness <= self.tolerance for x in self.solved])
+        return bool((exact & (np.abs(normals[1:] - normals[0]).max(1) < 1e-12)).any())
 
     def nearest(self, wanted: np.ndarray, index: int | None = None) -> NearestMixture:
         """The mixture nearest to thresholds, with the best value of one objective if given."""
-        lower, asked = np.stack(self.lower), np.isfinite(wanted)
+        lower, asked = self.lower, np.isfinite(wanted)
         apart = frontier.separation(lower[:, asked], wanted[asked], self.scale[asked])
         share = apart.share
         if index is not None:
@@ -250,13 +223,13 @@ class FrontSearch:
         """The optimal value of one objective under thresholds on the others."""
         sign, tolerance = self.signs[index], self.tolerance
         enough = wanted.copy()
-        enough[index] = min(x[index] for x in self.lower) - self.scale[index]
+        enough[index] = self.lower[:, index].min() - self.scale[index]
         holds, share, _ = self.decide(enough, max_points)
         if holds is False:
             nan = float("nan")
             return ConstrainedOptimum(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
         while True:
-            lower = np.stack(self.lower)
+            lower = self.lower
             known = frontier.largest(lower, self.half_spaces, index, wanted, self.scale, share)
             size = max(1.0 if self.parts[index].kind == "sure" else abs(known.upper), 1e-300)
             narrow = known.upper - known.lower <= tolerance * size
@@ -285,7 +258,7 @@ class FrontSearch:
             self.ask(1 / self.scale / len(self.parts))
         held: dict[bytes, frontier.Separation] = {}
         while True:
-            lower, before = np.stack(self.lower), self.scale
+            lower, before = self.lower, self.scale
             self._rescale()
             if not np.array_equal(before, self.scale):
                 held.clear()
@@ -302,7 +275,7 @@ class FrontSearch:
         self, corners: np.ndarray, held: dict[bytes, frontier.Separation]
     ) -> frontier.Separation:
         """The corner farthest beyond the mixtures; distances only shrink as points are added."""
-        lower, names, fresh = np.stack(self.lower), [x.tobytes() for x in corners], set()
+        lower, names, fresh = self.lower, [x.tobytes() for x in corners], set()
         far = np.array([held[x].distance if x in held else np.inf for x in names])
         while (i := int(far.argmax())) not in fresh:
             held[names[i]] = frontier.separation(lower, corners[i], self.scale)

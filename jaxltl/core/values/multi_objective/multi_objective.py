@@ -118,7 +118,7 @@ def pareto(
     search = FrontSearch(model, objectives, tolerance / 8)
     gap = search.close(tolerance, max_points)
     front = search.front()
-    lower, near = np.stack(search.lower), search.tolerance * search.scale
+    lower, near = search.lower, search.tolerance * search.scale
     kept = [
         i
         for i, x in enumerate(lower)
