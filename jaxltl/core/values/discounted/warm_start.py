@@ -1,8 +1,7 @@
 """Warm-started discounted values of many models of one game.
 
 For learners that solve a model repeatedly as it changes. Under ``vmap`` over models of one graph
-the lanes become the last axis of every array, so that a gather reads whole rows of lanes. The loop
-ends on the width of the bounds of the active lanes.
+the lanes become the last axis of every array, so that a gather reads whole rows of lanes.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.values.engine.iterate import fill_row
+from jaxltl.core.values.engine.iterate import side_by_side
 
 _MOST_SWEEPS = 100_000
-_FEWEST = 16  # lanes from which a separate loop is faster, and which fill its rows
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
@@ -41,10 +38,17 @@ class Models(NamedTuple):
     active: jax.Array
 
 
+class _Sweeps(NamedTuple):
+    """Loop state; `change` is ``T v - v``, computed once for all uses."""
+
+    value: jax.Array
+    change: jax.Array
+    error: jax.Array
+    number: jax.Array
+
+
 def span_iteration(
-    game: Game,
-    allowed: jax.Array,
-    models: Models,
+    game: Game, allowed: jax.Array, models: Models
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Value iteration of a discounted game from a first guess, with MacQueen bounds.
 
@@ -56,74 +60,30 @@ def span_iteration(
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
     discount, enough = (jnp.asarray(x, dtype) for x in (models.discount, models.enough))
     active = jnp.asarray(models.active)
-    result: tuple[jax.Array, jax.Array, jax.Array] = _iterate(
-        graph, models._replace(discount=discount, enough=enough, active=active)
-    )
-    return result
+    models = models._replace(discount=discount, enough=enough, active=active)
+    return side_by_side(_solved, graph, models)
 
 
-class _Sweeps(NamedTuple):
-    """Loop state; `change` is ``T v - v``, computed once for all uses."""
-
-    value: jax.Array
-    change: jax.Array
-    error: jax.Array
-    number: jax.Array
-
-
-def _plain(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
-    start = _Sweeps(
-        models.value,
-        _change(graph, models, models.value),
-        jnp.full_like(models.enough, jnp.inf),
-        jnp.int32(0),
-    )
-    lanes = models.active.shape
-    few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
-    found = _swept(graph, models, start, few)
-    if few:
-        found = _last_lanes(graph, models, found, few)
-    return found.value, found.error, jnp.stack(_quantities(graph, models, found.value), axis=1)
-
-
-def _unfinished(models: Models, now: _Sweeps) -> jax.Array:
-    return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
-
-
-def _swept(graph: _Graph, models: Models, start: _Sweeps, few: int = 0) -> _Sweeps:
-    """Sweeps until at most `few` lanes have not converged."""
+def _solved(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
     live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
 
+    def is_active(now: _Sweeps) -> jax.Array:
+        return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
+
     def sweep(now: _Sweeps) -> _Sweeps:
+        active = is_active(now)
         top = jnp.where(live, now.change, -jnp.inf).max(axis=0)
         bottom = jnp.where(live, now.change, jnp.inf).min(axis=0)
-        going = models.active & (now.error > models.enough)
         moved = now.value + now.change + ahead * (top + bottom) / 2
-        value = jnp.where(live & going, moved, now.value)
-        error = jnp.where(going, ahead * (top - bottom) / 2, now.error)
+        value = jnp.where(live & active, moved, now.value)
+        error = jnp.where(active, ahead * (top - bottom) / 2, now.error)
         return _Sweeps(value, _change(graph, models, value), error, now.number + 1)
 
-    def left(now: _Sweeps) -> jax.Array:
-        going = _unfinished(models, now)
-        return jnp.sum(going) > few if few else jnp.any(going)
-
-    return lax.while_loop(left, sweep, start)
-
-
-def _last_lanes(graph: _Graph, models: Models, found: _Sweeps, few: int) -> _Sweeps:
-    """Continues with the lanes that have not converged: most models need few sweeps, some many."""
-    going = _unfinished(models, found)
-    place = jnp.cumsum(going) - 1
-    who = jnp.nonzero(going, size=few, fill_value=0)[0]
-    narrow, rest = jax.tree.map(lambda x: x[..., who] if x.ndim else x, (models, found))
-    narrow = narrow._replace(active=jnp.arange(few) <= place[-1])
-    last = _swept(graph, narrow, rest)
-    place = jnp.maximum(place, 0)
-    result: _Sweeps = jax.tree.map(
-        lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found
-    )
-    return result
+    change = _change(graph, models, models.value)
+    start = _Sweeps(models.value, change, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
+    value, _, error, _ = lax.while_loop(lambda now: jnp.any(is_active(now)), sweep, start)
+    return value, error, jnp.stack(_quantities(graph, models, value), axis=1)
 
 
 def _beside(models: Models, x: jax.Array) -> jax.Array:
@@ -160,28 +120,3 @@ def _quantities(graph: _Graph, models: Models, value: jax.Array) -> list[jax.Arr
             mean = sum(terms[1:], start=terms[0])
         columns.append(models.gain[:, a] + models.discount * mean)
     return columns
-
-
-_iterate = jax.custom_batching.custom_vmap(_plain)
-
-
-@_iterate.def_vmap
-def _lanes_last(size: int, batched: PyTree, graph: _Graph, models: Models) -> PyTree:
-    shared, own = batched
-    if any(shared):
-        axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))
-        return jax.vmap(_plain, axes)(graph, models), (True, True, True)
-    lanes = models.value.ndim - own.value - 1
-    number = size * (models.value.shape[-1] if lanes else 1)
-
-    def last(x: jax.Array, is_batched: bool) -> jax.Array:
-        x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-        x = jnp.moveaxis(x, 0, -1)
-        return fill_row(x.reshape(*x.shape[:-2], -1) if lanes else x)
-
-    def first(x: jax.Array) -> jax.Array:
-        x = x[..., :number]
-        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size) if lanes else x, -1, 0)
-
-    found = _iterate(graph, jax.tree.map(last, models, own))
-    return jax.tree.map(first, found), (True, True, True)
