@@ -38,7 +38,8 @@ class RoomQueries(NamedTuple):
     room: Booleans  # bool[G], the answers
 
 
-_NO_QUERIES = RoomQueries(*np.zeros((3, 0), np.int64), np.zeros(0, bool))
+_NONE: Integers = np.zeros(0, np.int64)
+_NO_QUERIES = RoomQueries(_NONE, _NONE, _NONE, np.zeros(0, bool))
 
 
 @dataclass(frozen=True)

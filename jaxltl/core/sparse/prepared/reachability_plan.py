@@ -94,7 +94,7 @@ def _scheduled(
     """
     state, origin = small.mdp.state[rows], small.row[rows]
     width = np.diff(small.mdp.entry_start)[rows]
-    row = np.repeat(np.arange(rows.size), width)
+    row: Integers = np.repeat(np.arange(rows.size), width)
     successor = small.mdp.successor[concatenated_ranges(small.mdp.entry_start[rows], width)]
     source = concatenated_ranges(mdp.entry_start[origin], width)
     loop, loops = successor == state[row], None
@@ -113,11 +113,10 @@ def _scheduled(
     source = np.append(mdp.num_transitions + origin[paid], source[kept])
     entries = np.argsort(row, kind="stable")
     row, target, source = row[entries], target[entries], source[entries]
-    count = np.count_nonzero(code >= 0)
+    count = int(np.count_nonzero(code >= 0))
+    owner, name = code[state], origin.astype(np.int64)
     if mixed:
-        owner, name, row = np.arange(count), np.zeros(count, np.int64), code[state][row]
-    else:
-        owner, name = code[state], origin.astype(np.int64)
+        owner, name, row = np.arange(count), np.zeros(count, np.int64), owner[row]
     one = mdp.num_transitions + mdp.num_rows
     order = schedule(Nodes(count, owner, name, row, target, source), one, one + 1)
     place = order.size - 1 - code

@@ -102,13 +102,12 @@ def robust_reachability(
       [0.4, 1.0, 0.0]
     """
     asked = width_asked(tolerance)
-    sides = sides_of(model, policy, objective, nature)
-    model = sides.world
-    target = sides.states(state_mask(model.nominal, target, "target"))
+    world, sides = sides_of(model, policy, objective, nature)
+    target = sides.states(state_mask(world.nominal, target, "target"))
     if stay is not None:
-        stay = sides.states(state_mask(model.nominal, stay, "stay")) | sides.added
+        stay = sides.states(state_mask(world.nominal, stay, "stay")) | sides.added
     found = reachability(sides.host, target, sides.query(asked), stay=stay)
-    return robust_solution(sides, found, asked, relative=False)
+    return robust_solution(world, sides, found, asked, relative=False)
 
 
 @validated()
@@ -149,12 +148,11 @@ def robust_total_reward(
       ([2.0, 0.0], [0.5, 0.5, 1.0])
     """
     asked = width_asked(tolerance)
-    sides = sides_of(model, policy, objective, nature)
-    model = sides.world
-    target = sides.states(state_mask(model.nominal, target, "target"))
-    earned = sides.rows(interval_reward(model, reward))
+    world, sides = sides_of(model, policy, objective, nature)
+    target = sides.states(state_mask(world.nominal, target, "target"))
+    earned = np.where(sides.choosing, 0, interval_reward(world, reward)[sides.encoded.row])
     found = total_reward(sides.host, earned, target, sides.query(asked))
-    return robust_solution(sides, found, asked, relative=True)
+    return robust_solution(world, sides, found, asked, relative=True)
 
 
 @validated()
@@ -192,13 +190,14 @@ def robust_discounted_value(
       >>> found.value.round(6).tolist(), found.nature.tolist()
       ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
-    sides = sides_of(model, policy, objective, nature)
-    earned = sides.entries(entry_reward(sides.world, reward))
+    world, sides = sides_of(model, policy, objective, nature)
+    entry = sides.encoded.entry
+    earned = np.where(entry < 0, 0, entry_reward(world, reward)[entry])
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
     discounts = np.where(sides.choosing, 1.0, float(discount))
     found = discounted_value(DiscountedModel(sides.host, earned, discounts), sides.query(asked))
-    return robust_solution(sides, found, asked, relative=False)
+    return robust_solution(world, sides, found, asked, relative=False)
 
 
 def robust_expectation(
@@ -282,16 +281,17 @@ def interval_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
 
 
 def robust_solution(
-    sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
+    world: IntervalMDP, sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
 ) -> Solution:
     """The :class:`Solution` of certified values."""
-    row, chance, size = found.row, found.probability, sides.world.num_states
-    if sides.spread is not None:
-        row = sides.spread.policy(row, chance)
-        chance = sides.spread.nature(chance, np.asarray(sides.world.nominal.probability))
-    policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
-    found = replace(found, probability=chance)
-    return solution_at(found, np.arange(size), (size,), policy, tolerance, relative=relative)
+    size, encoded = world.num_states, sides.encoded
+    policy = sides.policy
+    if policy is None:
+        policy = encoded.policy(found.row, found.probability).astype(np.int32)
+    otherwise = np.asarray(world.nominal.probability)
+    found = replace(found, probability=encoded.nature(found.probability, otherwise))
+    states = np.arange(size)
+    return solution_at(found, states, (size,), np.asarray(policy), tolerance, relative=relative)
 
 
 def solution_at(
@@ -321,18 +321,14 @@ def solution_at(
 class Sides(NamedTuple):
     """An uncertain MDP with the directions of policy and nature."""
 
-    model: IntervalMDP | None  # the given model
-    host: UncertainMDP  # the solved one, in which a policy and nature choose
     maximize: bool  # whether the policy maximises
     helpful: bool  # whether nature maximises
-    spread: EncodedChoices | None  # of the given model in the solved one
-    policy: Array | None
+    encoded: EncodedChoices  # the model in which a policy and nature choose, and its origin
+    policy: Array | None = None  # a given one
 
     @property
-    def world(self) -> IntervalMDP:
-        """The given model."""
-        assert self.model is not None
-        return self.model
+    def host(self) -> UncertainMDP:
+        return self.encoded.model
 
     def query(self, tolerance: float) -> Query:
         return Query(self.maximize, self.helpful, tolerance)
@@ -340,42 +336,30 @@ class Sides(NamedTuple):
     @property
     def choosing(self) -> np.ndarray:
         """Rows ``bool[R']`` by which nature chooses among rows, without a step."""
-        if self.spread is None:
-            return np.zeros(self.host.mdp.num_rows, bool)
-        return self.spread.row < 0
+        return self.encoded.row < 0
 
     @property
     def added(self) -> np.ndarray:
         """Auxiliary states, ``bool[S']``."""
-        return np.arange(self.host.mdp.num_states) >= self.world.num_states
+        return self.encoded.source != np.arange(self.encoded.source.size)
 
     def states(self, quantity: np.ndarray) -> np.ndarray:
         """A set of states ``bool[S']``, without auxiliary ones."""
-        return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
-
-    def entries(self, quantity: np.ndarray) -> np.ndarray:
-        """A quantity of entries ``float64[T']``, 0 where nature chooses."""
-        if self.spread is None:
-            return quantity
-        return np.where(self.spread.entry < 0, 0, quantity[self.spread.entry])
-
-    def rows(self, quantity: np.ndarray) -> np.ndarray:
-        """A quantity of rows ``float64[R']``, 0 where nature chooses."""
-        if self.spread is None:
-            return quantity
-        return np.where(self.choosing, 0, quantity[self.spread.row])
+        return quantity[self.encoded.source] & ~self.added
 
 
-def sides_of(model: Model, policy: Array | None, objective: str, nature: str | None) -> Sides:
-    """Directions of policy and nature, games and given policies encoded."""
+def sides_of(
+    model: Model, policy: Array | None, objective: str, nature: str | None
+) -> tuple[IntervalMDP, Sides]:
+    """The interval model, and directions of policy and nature, games and given policies encoded."""
     world, system = world_of(model)
     if policy is None:
-        return host_sides(world.host, system, objective, nature)._replace(model=world)
+        return world, host_sides(world.host, system, objective, nature)
     helpful = nature_direction(nature, objective) == "max"
-    parted = _under(world, np.asarray(policy), True if system is None else system)
+    encoded = _under(world, np.asarray(policy), True if system is None else system)
     # The remaining choices are those of the environment, against the policy.
     against = helpful if system is None else objective == "min"
-    return Sides(world, parted.model, against, helpful, parted, policy)
+    return world, Sides(against, helpful, encoded, policy)
 
 
 def world_of(model: Model) -> tuple[IntervalMDP, np.ndarray | None]:
@@ -398,26 +382,27 @@ def host_sides(
     helpful = nature_direction(nature, objective) == "max"
     maximize = objective == "max"
     if system is None:
-        return Sides(None, host, maximize, helpful, None, None)
+        return Sides(maximize, helpful, _rows_of(host, np.arange(host.mdp.num_rows)))
     # The player with nature's objective becomes nature, and the other one is the policy.
     rows = np.ones(host.mdp.num_rows)
-    parted = choices_as_nature(host, system if maximize == helpful else ~system, 0 * rows, rows)
-    return Sides(None, parted.model, not helpful, helpful, parted, None)
+    encoded = choices_as_nature(host, system if maximize == helpful else ~system, 0 * rows, rows)
+    return Sides(not helpful, helpful, encoded)
+
+
+def _rows_of(host: UncertainMDP, row: Integers) -> EncodedChoices:
+    """The model, or a chain of one row for each state, without choices of nature."""
+    model, entry = host, np.arange(host.mdp.num_transitions)
+    if row.size < host.mdp.num_rows:
+        model, entry = host.under_policy(row)
+    return EncodedChoices(model, np.arange(host.mdp.num_states), row, entry, 0 * entry - 1)
 
 
 def _under(model: IntervalMDP, policy: np.ndarray, where: Array) -> EncodedChoices:
     """The model under a policy, in all states or in those of one player."""
     host = model.host
     if is_deterministic(policy) and np.all(where):
-        row_weights(model.nominal, policy)
-        chain, entry = host.under_policy(policy)
-        return EncodedChoices(
-            chain,
-            np.arange(model.num_states),
-            policy.astype(np.int64),
-            entry,
-            np.full(entry.size, -1),
-        )
+        row_weights(model.nominal, policy)  # checks it
+        return _rows_of(host, policy.astype(np.int64))
     weight = row_weights(model.nominal, policy, where)
     total = host.mdp.over_choices(np.add, weight)
     weight = weight / np.where(total > 0, total, 1)[host.mdp.state]

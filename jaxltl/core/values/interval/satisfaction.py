@@ -202,25 +202,23 @@ def _fixed(
     dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
     require_weights(host.mdp, weight, row_tolerance(dtype))
     weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
-    parted = choices_as_nature(host, np.ones(host.mdp.num_states, bool), weight, weight)
-    return Sides(None, parted.model, helpful, helpful, parted, policy)
+    encoded = choices_as_nature(host, np.ones(host.mdp.num_states, bool), weight, weight)
+    return Sides(helpful, helpful, encoded, policy)
 
 
 def _solved(
     sides: Sides, host: UncertainMDP, verdicts: _Verdicts, tolerance: float
 ) -> RobustValues:
     """Robust satisfaction probability from all states of the product."""
-    if sides.spread is None:
-        return _of_sides(host, verdicts, sides.query(tolerance))
-    found = _of_sides(sides.host, verdicts.of(sides.spread.source), sides.query(tolerance))
-    size = host.mdp.num_states
+    size, encoded = host.mdp.num_states, sides.encoded
+    found = _of_sides(sides.host, verdicts.of(encoded.source), sides.query(tolerance))
     return replace(
         found,
         value=found.value[:size],
         lower=found.lower[:size],
         upper=found.upper[:size],
-        row=sides.spread.policy(found.row, found.probability),
-        probability=sides.spread.nature(found.probability, host.mdp.probability),
+        row=encoded.policy(found.row, found.probability),
+        probability=encoded.nature(found.probability, host.mdp.probability),
     )
 
 

@@ -113,8 +113,9 @@ class FrontSearch:
         tolerance = self.tolerance / 4 * float((normal * self.scale).sum())
         found = weighted_optimum(self.problem, self.ends, **weights, tolerance=tolerance)
         bound = found.bound - shift + 1e-15 * (abs(found.bound) + shift)
-        values = self._evaluate(found.weight, found.home)
-        self.solved.append(_Sum(found.weight, *values, normal, bound, self.tolerance))
+        value, lower, upper = self._evaluate(found.weight, found.home)
+        known = _Sum(found.weight, value, lower, upper, normal, bound, self.tolerance)
+        self.solved.append(known)
 
     def _evaluate(self, weight: np.ndarray, home: np.ndarray) -> np.ndarray:
         """Values of a policy and their bounds, all maximised: ``float64[3, n]``."""
@@ -123,18 +124,22 @@ class FrontSearch:
         inside = (weight > 0) & home[problem.mdp.state]
         component = end_components(problem.mdp, rows=inside).component
         leader = component[problem.mdp.state[inside]]
-        options = {"tolerance": self.tolerance / 8, "depth": chain.depth}
+        tolerance, depth = self.tolerance / 8, chain.depth
         found = []
         for part in self.parts:
             if part.kind == "sure":
                 least = np.full(home.size, np.iinfo(np.int64).max)
                 np.minimum.at(least, leader, problem.priority[part.place][inside])
                 good = home & (least[component] % 2 == 0)
-                x = optimal.reachability(chain.mdp, good, maximize=True, **options)
+                x = optimal.reachability(
+                    chain.mdp, good, maximize=True, tolerance=tolerance, depth=depth
+                )
             else:
                 rows = (problem.gain if part.kind == "gain" else problem.cost)[part.place]
                 earned = chain.mean(rows, problem.mdp.row_start)
-                x = optimal.total_reward(chain.mdp, earned, home, maximize=False, **options)
+                x = optimal.total_reward(
+                    chain.mdp, earned, home, maximize=False, tolerance=tolerance, depth=depth
+                )
             found.append(self._expected(part, x))
         return np.array(found).T
 

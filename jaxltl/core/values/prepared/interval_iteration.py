@@ -280,7 +280,8 @@ def _swept(
         return x, rank
 
     start = outer.at[problem.span].set(value), rank
-    return lax.fori_loop(0, _SWEEPS, again, start)[1]
+    result: jax.Array = lax.fori_loop(0, _SWEEPS, again, start)[1]
+    return result
 
 
 def _extra(problem: Problem, value: jax.Array, time: jax.Array) -> jax.Array:

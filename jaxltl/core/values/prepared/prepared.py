@@ -35,6 +35,9 @@ from jaxltl.core.values.prepared.prepared_interval import (
 __all__ = ["Prepared", "evaluate_prepared", "is_direct", "prepare", "solve_prepared"]
 
 _Maybe: TypeAlias = jax.Array | None
+_Solvers: TypeAlias = tuple[
+    Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]
+]  # of a system and of its transpose
 ELIMINATED = 256  # nodes up to which cycles are solved by elimination
 
 
@@ -361,13 +364,11 @@ def _attached(
         return system.image(jnp.concatenate([x, one])) + put
 
     fixed = lax.stop_gradient(system)
-    solve, transpose = fixed.solve, fixed.transpose_solve
-    if found is not None:
-        value = found.value
-    else:
-        if prepared.cyclic and is_direct(prepared):
-            solve, transpose = _eliminated(fixed, prepared.nodes)
-        value = solve(lax.stop_gradient(operator(put)))
+    solvers: _Solvers = fixed.solve, fixed.transpose_solve
+    if found is None and prepared.cyclic and is_direct(prepared):
+        solvers = _eliminated(fixed, prepared.nodes)
+    solve, transpose = solvers
+    value = solve(lax.stop_gradient(operator(put))) if found is None else found.value
     return implicit(operator, value, solve=solve, transpose_solve=transpose)
 
 
@@ -493,9 +494,7 @@ def _evaluate(
     return _at_states(prepared, value), status
 
 
-def _eliminated(
-    system: Chosen, nodes: jax.Array
-) -> tuple[Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]]:
+def _eliminated(system: Chosen, nodes: jax.Array) -> _Solvers:
     """Solvers of a system and of its transpose by a dense inverse on its nodes."""
     count, _, block = system.target.shape
     size, most = count * block, nodes.shape[0]

@@ -48,26 +48,26 @@ def exact_reachability(
 
 
 def exact_steps(
-    mdp: HostMDP, target: Booleans, stay: Booleans, num_steps: int, objective: str
+    mdp: HostMDP,
+    target: Booleans,
+    objective: str,
+    *,
+    stay: Booleans | None = None,
+    num_steps: int = 1,
 ) -> Bounds | None:
-    """Step-bounded reachability bounds; None if the model or the number of steps is large."""
+    """Step-bounded reachability bounds, without `stay` of being at a target after these steps.
+
+    None if the model or the number of steps is large.
+    """
     if num_steps * mdp.successor.size > MAX_TERMS:
         return None
     value = [Fraction(int(t)) for t in target]
     for _ in range(num_steps):
-        image = _backup(mdp, value, objective)
-        value = [
-            Fraction(1) if t else x if s else Fraction(0)
-            for t, s, x in zip(target, stay, image, strict=True)
-        ]
+        value = _backup(mdp, value, objective)
+        if stay is not None:
+            kept = zip(target, stay, value, strict=True)
+            value = [Fraction(1) if t else x if s else Fraction(0) for t, s, x in kept]
     return _bounds(value)
-
-
-def exact_next(mdp: HostMDP, target: Booleans, objective: str) -> Bounds | None:
-    """Bounds of the probability that the next state is in a set; None if the model is large."""
-    if mdp.successor.size > MAX_TERMS:
-        return None
-    return _bounds(_backup(mdp, [Fraction(int(t)) for t in target], objective))
 
 
 def _backup(mdp: HostMDP, value: list[Fraction], objective: str) -> list[Fraction]:

@@ -17,7 +17,6 @@ from jaxltl.core.values.properties.answers import (
 )
 from jaxltl.core.values.properties.exact_reachability import (
     Bounds,
-    exact_next,
     exact_reachability,
     exact_steps,
 )
@@ -68,15 +67,14 @@ class _Found(NamedTuple):
     """The solution at the requested states."""
 
     solution: Solution
-    method: str
     strategy: PropertyStrategy | None
 
 
-class Directions(TypedDict):
+class Directions(TypedDict, total=False):
     """Directions of the policy and of nature, as arguments of the solvers."""
 
     objective: str
-    nature: str | None
+    nature: str
 
 
 class _Aim(NamedTuple):
@@ -93,7 +91,7 @@ class _Aim(NamedTuple):
     def directions(self) -> Directions:
         """Keyword arguments of the solvers."""
         if self.nature is None:
-            return {"objective": self.policy, "nature": None}
+            return {"objective": self.policy}
         nature = "cooperative" if self.nature == self.policy else "adversarial"
         return {"objective": self.policy, "nature": nature}
 
@@ -174,7 +172,7 @@ def solve_property(
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
     tolerance = width_asked(tolerance)
-    solve = _solver(model, prop, _aim(model, prop), states)
+    solve = partial(_solved, _Query(model, states, prop.text), prop, _aim(model, prop))
     found = solve(width(tolerance))
     if prop.relation is None:
         answer = _answer(prop, states, found, None, width(tolerance))
@@ -217,7 +215,7 @@ def as_answer(
     prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
 ) -> Answer:
     """The answer of a solution at the requested states, without a strategy."""
-    found = _Found(solution, method, None)
+    found = _Found(replace(solution, method=method), None)
     holds = None if prop.relation is None else _verdicts(prop, found)
     return _answer(prop, states, found, holds, tolerance)
 
@@ -237,7 +235,8 @@ def _answer(
         status = _status(prop, found, tolerance)
     else:
         status = Status.PRECISION if None in holds else Status.CONVERGED
-    return Answer(states, value, lower, upper, holds, status, found.method, found.strategy)
+    method = found.solution.method
+    return Answer(states, value, lower, upper, holds, status, method, found.strategy)
 
 
 def _status(prop: Property, found: _Found, tolerance: float) -> Status:
@@ -330,58 +329,34 @@ def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
 # --- which solver -----------------------------------------------------------------------------
 
 
-def _solver(
-    model: SparseMDP | IntervalMDP, prop: Property, aim: _Aim, states: np.ndarray
-) -> Callable[[float], _Found]:
-    """The solver of a property, as a function of the tolerance."""
-    path, graph = prop.path, _graph(model)
+def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Found:
+    """The solution of a property at some states."""
+    model, path = query.model, prop.path
     if prop.operator == "P":
         assert not isinstance(path, Earned)
-        return _Probability(model, states, prop.text).of(path, aim)
-    if prop.operator == "LRA":
-        assert isinstance(path, Formula)
-        known = _without_intervals(model, prop, "averages in the long run")
-        share = states_satisfying(graph, path, prop.text).astype(np.float64)
-        return lambda tolerance: _plain(
-            states, average_reward(known, share, objective=aim.policy, tolerance=tolerance)
-        )._replace(method=_AVERAGE)
-    reward: Reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
+        return query.probability(path, aim, tolerance)
+    if prop.operator == "LRA" or path == Earned("average"):
+        known = _without_intervals(model, prop.text, "averages in the long run")
+        reward: Reward = prop.reward
+        if prop.operator == "LRA":
+            assert isinstance(path, Formula)
+            reward = query.where(path).astype(np.float64)
+        elif prop.operator == "T":
+            reward = np.ones(model.num_rows)
+        average = average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+        return query.found(replace(average, method=_AVERAGE))
+    reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
+    target = None
     if isinstance(path, Formula):
-        target = states_satisfying(graph, path.operands[0], prop.text)
-        return lambda tolerance: _plain(
-            states, total_reward(model, reward, target, tolerance=tolerance, **aim.directions)
-        )
-    assert isinstance(path, Earned)
-    if path.steps is not None:
-        return _steps_solver(model, path.kind == "cumulative", reward, path.steps, aim, states)
-    what = "rewards for ever (C)" if path.kind == "total" else "averages in the long run"
-    known = _without_intervals(model, prop, what)
-    if path.kind == "total":
-        return lambda tolerance: _plain(
-            states, total_reward(known, reward, objective=aim.policy, tolerance=tolerance)
-        )
-    return lambda tolerance: _plain(
-        states, average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
-    )._replace(method=_AVERAGE)
-
-
-def _steps_solver(
-    model: SparseMDP | IntervalMDP,
-    cumulative: bool,
-    reward: Reward,
-    steps: int,
-    aim: _Aim,
-    states: np.ndarray,
-) -> Callable[[float], _Found]:
-    if isinstance(model, IntervalMDP):
-        robust = robust_cumulative_reward if cumulative else robust_instantaneous_reward
-        return lambda tolerance: _plain(
-            states, robust(model, reward, steps, **aim.directions), by="steps"
-        )
-    solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
-    return lambda tolerance: _plain(
-        states, solve(model, reward, steps, objective=aim.policy), by="steps"
-    )
+        target = query.where(path.operands[0])
+    elif path.steps is not None:
+        solvers = bounded.instantaneous_reward, robust_instantaneous_reward
+        if path.kind == "cumulative":
+            solvers = bounded.cumulative_reward, robust_cumulative_reward
+        return query.by_steps(solvers, reward, path.steps, aim=aim)
+    else:
+        model = _without_intervals(model, prop.text, "rewards for ever (C)")
+    return query.found(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
 
 
 def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
@@ -403,186 +378,139 @@ def _without_intervals(
     )
 
 
-def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
-    method = solution.method or {
-        "steps": "step by step",
-        "reward": "level by level of the reward",
-    }.get(by, "")
-    nature = None if solution.nature is None else np.asarray(solution.nature)
-    return _Found(
-        at_states(solution, states),
-        method,
-        PropertyStrategy(np.asarray(solution.policy), by, nature=nature),
-    )
-
-
-class _Probability(NamedTuple):
-    """Probabilities of path formulas of one model, at some states."""
+class _Query(NamedTuple):
+    """A model and the states at which a property is asked for."""
 
     model: SparseMDP | IntervalMDP
     states: np.ndarray
     text: str
 
-    def of(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
-        """The solver of a path formula; simple ones need no automaton."""
+    def where(self, condition: Formula) -> np.ndarray:
+        return states_satisfying(_graph(self.model), condition, self.text)
+
+    def found(self, solution: Solution, by: str = "") -> _Found:
+        """A solution at all states, at those that are asked for."""
+        method = {"steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
+        nature = None if solution.nature is None else np.asarray(solution.nature)
+        strategy = PropertyStrategy(np.asarray(solution.policy), by, nature=nature)
+        solution = replace(solution, method=solution.method or method)
+        return _Found(at_states(solution, self.states), strategy)
+
+    def by_steps(
+        self,
+        solvers: tuple[Callable[..., Solution], Callable[..., Solution]],
+        *arguments: object,
+        aim: _Aim,
+        **options: object,
+    ) -> _Found:
+        """A step-bounded quantity, by the solver for known probabilities or that for intervals."""
+        solve = solvers[isinstance(self.model, IntervalMDP)]
+        found = solve(self.model, *arguments, **options, **aim.directions)
+        return self.found(found, by="steps")
+
+    def exact(self, found: _Found, tolerance: float, solve: Callable[..., Bounds | None]) -> _Found:
+        """The solution with bounds by rational arithmetic, if these are asked for and possible."""
+        if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
+            return found
+        bounds = solve(self.model.host)
+        if bounds is None:
+            return found
+        lower, upper = (x[self.states] for x in bounds)
+        solution = replace(
+            found.solution, value=lower, lower=lower, upper=upper, method="rational arithmetic"
+        )
+        return found._replace(solution=solution)
+
+    def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
+        """The probability of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
-            return self.within(path, aim)
-        if path.operator == "!" and not is_boolean(path):
-            return self.opposite(path.operands[0], aim)
+            return self.within(path, aim, tolerance)
         if is_boolean(path):
-            return lambda tolerance: self.at_once(path)
+            return self.at_once(path)
+        if path.operator == "!":
+            return self.opposite(path.operands[0], aim, tolerance)
         if not all(is_boolean(f) for f in path.operands):
-            return self.automaton(path, aim)
+            return self.automaton(path, aim, tolerance)
         left, right = path.operands[0], path.operands[-1]
         match path.operator:
             case "X":
-                target: Array = self.where(right)
-                return lambda tolerance: self.next(target, aim, tolerance)
+                target = self.where(right)
+                solve: Callable[..., Solution] = bounded.next_probability
+                if isinstance(self.model, IntervalMDP):
+                    solve = robust_next_probability
+                found = self.found(solve(self.model, target, **aim.directions))
+                exact = partial(exact_steps, target=target, objective=aim.policy)
+                return self.exact(found, tolerance, exact)
             case "F":
-                return self.until(TRUE, right, aim)
+                return self.until(TRUE, right, aim, tolerance)
             case "U":
-                return self.until(left, right, aim)
+                return self.until(left, right, aim, tolerance)
             case "G":
-                return self.opposite(Formula("F", (~right,)), aim)
+                return self.opposite(Formula("F", (~right,)), aim, tolerance)
             case "W":
-                return self.opposite(Formula("U", (~right, ~left & ~right)), aim)
+                return self.opposite(Formula("U", (~right, ~left & ~right)), aim, tolerance)
             case "R":
-                return self.opposite(Formula("U", (~left, ~right)), aim)
+                return self.opposite(Formula("U", (~left, ~right)), aim, tolerance)
         raise AssertionError(path.operator)
-
-    def where(self, condition: Formula) -> np.ndarray:
-        return states_satisfying(_graph(self.model), condition, self.text)
 
     def at_once(self, path: Formula) -> _Found:
         holds: Array = self.where(path).astype(np.float64)[self.states]
         zero: Array = np.int32(0)
         nobody: Array = np.zeros(0, np.int32)
         return _Found(
-            Solution(
-                value=holds,
-                policy=nobody,
-                lower=holds,
-                upper=holds,
-                residual=zero,
-                num_steps=zero,
-                status=zero,
-            ),
-            "the label",
-            None,
+            Solution(holds, nobody, holds, holds, zero, zero, zero, method="the label"), None
         )
 
-    def opposite(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
-        solve = self.of(path, aim.opposite)
+    def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
+        found = self.probability(path, aim.opposite, tolerance)
+        return found._replace(solution=complement_event(found.solution))
 
-        def found(tolerance: float) -> _Found:
-            result = solve(tolerance)
-            return result._replace(solution=complement_event(result.solution))
-
-        return found
-
-    def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
+    def until(self, left: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Found:
         target: Array = self.where(right)
         stay: Array = None if left == TRUE else self.where(left)
-
-        def solve(tolerance: float) -> _Found:
-            found = _plain(
-                self.states,
-                reachability_probability(
-                    self.model, target, stay=stay, tolerance=tolerance, **aim.directions
-                ),
-            )
-            if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
-                return found
-            policy = None
-            if not self.model.is_chain:
-                assert found.strategy is not None
-                policy = found.strategy.row
-            host = self.model.host
-            return self.exact(found, exact_reachability(host, target, stay, policy, aim.policy))
-
-        return solve
-
-    def exact(self, found: _Found, bounds: Bounds | None) -> _Found:
-        """The solution with bounds by rational arithmetic, where there are any."""
-        if bounds is None:
-            return found
-        lower, upper = (x[self.states] for x in bounds)
-        return found._replace(
-            solution=replace(found.solution, value=lower, lower=lower, upper=upper),
-            method="rational arithmetic",
+        solution = reachability_probability(
+            self.model, target, stay=stay, tolerance=tolerance, **aim.directions
         )
-
-    def next(self, target: np.ndarray, aim: _Aim, tolerance: float) -> _Found:
-        if isinstance(self.model, IntervalMDP):
-            return _plain(
-                self.states, robust_next_probability(self.model, target, **aim.directions)
-            )
-        found = _plain(
-            self.states, bounded.next_probability(self.model, target, objective=aim.policy)
+        policy = None if self.model.is_chain else np.asarray(solution.policy)
+        exact = partial(
+            exact_reachability, target=target, stay=stay, policy=policy, objective=aim.policy
         )
-        if tolerance > _EXACT:
-            return found
-        return self.exact(found, exact_next(self.model.host, target, aim.policy))
+        return self.exact(self.found(solution), tolerance, exact)
 
-    def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
-        def found(tolerance: float) -> _Found:
-            result = optimal_satisfaction(
-                self.model, path, states=self.states, tolerance=tolerance, **aim.directions
-            )
-            method = result.solution.method
-            size = f"product of {result.product.host.num_states} states"
-            return _Found(
-                result.solution,
-                f"{size}, {method}" if method else size,
-                PropertyStrategy(result.row, memory=result, nature=result.solution.nature),
-            )
+    def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Found:
+        result = optimal_satisfaction(
+            self.model, path, states=self.states, tolerance=tolerance, **aim.directions
+        )
+        size = f"product of {result.product.host.num_states} states"
+        method = ", ".join(filter(None, (size, result.solution.method)))
+        strategy = PropertyStrategy(result.row, memory=result, nature=result.solution.nature)
+        return _Found(replace(result.solution, method=method), strategy)
 
-        return found
-
-    def within(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
+    def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Found:
         if path.operator == "R":
             negated = TRUE if path.left.operator == "false" else ~path.left
-            return self.opposite(replace(path, operator="U", left=negated, right=~path.right), aim)
+            until = replace(path, operator="U", left=negated, right=~path.right)
+            return self.opposite(until, aim, tolerance)
+        target, stay = self.where(path.right), self.where(path.left)
         if path.reward is not None:
-            return self.within_reward(path, aim)
+            assert path.limit is not None
+            # Rewards are counted in units of more than 1e-9, so this is just below the limit.
+            limit = float(path.limit - Fraction(1, 10**9) * path.strict)
+            model = _without_intervals(self.model, self.text, "bounds on rewards")
+            solution = bounded.reward_bounded_reachability(
+                model, target, path.reward or None, limit, stay=stay, objective=aim.policy
+            )
+            return self.found(solution, by="reward")
         if path.lower or path.upper is None:
             if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
                 raise ValueError(
                     f"{self.text}: a lower bound on steps is solved for up to "
                     f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller."
                 )
-            return self.of(unfolded(path), aim)
-        target, stay = self.where(path.right), self.where(path.left)
-        steps, model = path.upper, self.model
-        if isinstance(model, IntervalMDP):
-            return lambda tolerance: _plain(
-                self.states,
-                robust_bounded_reachability(model, target, steps, stay=stay, **aim.directions),
-                by="steps",
-            )
-
-        def solve(tolerance: float) -> _Found:
-            found = bounded.bounded_reachability(
-                model, target, steps, stay=stay, objective=aim.policy
-            )
-            plain = _plain(self.states, found, by="steps")
-            if tolerance > _EXACT:
-                return plain
-            return self.exact(plain, exact_steps(model.host, target, stay, steps, aim.policy))
-
-        return solve
-
-    def within_reward(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
-        assert path.limit is not None
-        target, stay = self.where(path.right), self.where(path.left)
-        # Rewards are counted in units of more than 1e-9, so this is just below the limit.
-        limit = path.limit - Fraction(1, 10**9) * path.strict
-        reward = path.reward or None
-        model = _without_intervals(self.model, self.text, "bounds on rewards")
-        return lambda tolerance: _plain(
-            self.states,
-            bounded.reward_bounded_reachability(
-                model, target, reward, float(limit), stay=stay, objective=aim.policy
-            ),
-            by="reward",
+            return self.probability(unfolded(path), aim, tolerance)
+        solvers = bounded.bounded_reachability, robust_bounded_reachability
+        found = self.by_steps(solvers, target, path.upper, aim=aim, stay=stay)
+        exact = partial(
+            exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
         )
+        return self.exact(found, tolerance, exact)

@@ -11,7 +11,6 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties import solve_property as module
 from jaxltl.core.values.properties.exact_reachability import (
-    exact_next,
     exact_reachability,
     exact_steps,
 )
@@ -403,8 +402,8 @@ def test_exact_bounds_of_random_mdps_agree_with_the_solvers(seed):
         once = jl.values.next_probability(model, target, objective=objective)
         for solution, bounds in (
             (until, exact_reachability(model.host, target, stay, until.policy, objective)),
-            (steps, exact_steps(model.host, target, stay, 4, objective)),
-            (once, exact_next(model.host, target, objective)),
+            (steps, exact_steps(model.host, target, objective, stay=stay, num_steps=4)),
+            (once, exact_steps(model.host, target, objective)),
         ):
             assert bounds is not None
             assert (solution.lower <= bounds[1]).all() and (bounds[0] <= solution.upper).all()
