@@ -247,7 +247,8 @@ def _evaluate(successor: Integers, weight: Fractions, old: _Biases) -> _Biases:
 def _images(graph: _Graph, v: _Biases) -> Fractions:
     """``r - g + v(t)`` for each move to t, with the gain g of t."""
     t = graph.successor
-    return graph.weight - v.gain[t] + v.bias[t]
+    result: Fractions = graph.weight - v.gain[t] + v.bias[t]
+    return result
 
 
 def _improve(graph: _Graph, v: _Biases, policy: Integers, chooser: Booleans) -> Integers:

@@ -341,11 +341,13 @@ class Sides(NamedTuple):
     @property
     def added(self) -> np.ndarray:
         """Auxiliary states, ``bool[S']``."""
-        return self.encoded.source != np.arange(self.encoded.source.size)
+        result: np.ndarray = self.encoded.source != np.arange(self.encoded.source.size)
+        return result
 
     def states(self, quantity: np.ndarray) -> np.ndarray:
         """A set of states ``bool[S']``, without auxiliary ones."""
-        return quantity[self.encoded.source] & ~self.added
+        result: np.ndarray = quantity[self.encoded.source] & ~self.added
+        return result
 
 
 def sides_of(
@@ -391,7 +393,8 @@ def host_sides(
 
 def _rows_of(host: UncertainMDP, row: Integers) -> EncodedChoices:
     """The model, or a chain of one row for each state, without choices of nature."""
-    model, entry = host, np.arange(host.mdp.num_transitions)
+    model: UncertainMDP = host
+    entry: Integers = np.arange(host.mdp.num_transitions)
     if row.size < host.mdp.num_rows:
         model, entry = host.under_policy(row)
     return EncodedChoices(model, np.arange(host.mdp.num_states), row, entry, 0 * entry - 1)

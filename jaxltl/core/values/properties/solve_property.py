@@ -42,12 +42,6 @@ from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.interval.robust import width_asked
-from jaxltl.core.values.interval.step_bounded import (
-    robust_bounded_reachability,
-    robust_cumulative_reward,
-    robust_instantaneous_reward,
-    robust_next_probability,
-)
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -349,11 +343,10 @@ def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Foun
     target = None
     if isinstance(path, Formula):
         target = query.where(path.operands[0])
-    elif path.steps is not None:
-        solvers = bounded.instantaneous_reward, robust_instantaneous_reward
-        if path.kind == "cumulative":
-            solvers = bounded.cumulative_reward, robust_cumulative_reward
-        return query.by_steps(solvers, reward, path.steps, aim=aim)
+    elif isinstance(path, Earned) and path.steps is not None:
+        cumulative = path.kind == "cumulative"
+        solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
+        return query.found(solve(model, reward, path.steps, **aim.directions), by="steps")
     else:
         model = _without_intervals(model, prop.text, "rewards for ever (C)")
     return query.found(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
@@ -396,18 +389,6 @@ class _Query(NamedTuple):
         solution = replace(solution, method=solution.method or method)
         return _Found(at_states(solution, self.states), strategy)
 
-    def by_steps(
-        self,
-        solvers: tuple[Callable[..., Solution], Callable[..., Solution]],
-        *arguments: object,
-        aim: _Aim,
-        **options: object,
-    ) -> _Found:
-        """A step-bounded quantity, by the solver for known probabilities or that for intervals."""
-        solve = solvers[isinstance(self.model, IntervalMDP)]
-        found = solve(self.model, *arguments, **options, **aim.directions)
-        return self.found(found, by="steps")
-
     def exact(self, found: _Found, tolerance: float, solve: Callable[..., Bounds | None]) -> _Found:
         """The solution with bounds by rational arithmetic, if these are asked for and possible."""
         if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
@@ -435,12 +416,9 @@ class _Query(NamedTuple):
         match path.operator:
             case "X":
                 target = self.where(right)
-                solve: Callable[..., Solution] = bounded.next_probability
-                if isinstance(self.model, IntervalMDP):
-                    solve = robust_next_probability
-                found = self.found(solve(self.model, target, **aim.directions))
+                solution = bounded.next_probability(self.model, target, **aim.directions)
                 exact = partial(exact_steps, target=target, objective=aim.policy)
-                return self.exact(found, tolerance, exact)
+                return self.exact(self.found(solution), tolerance, exact)
             case "F":
                 return self.until(TRUE, right, aim, tolerance)
             case "U":
@@ -508,9 +486,10 @@ class _Query(NamedTuple):
                     f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller."
                 )
             return self.probability(unfolded(path), aim, tolerance)
-        solvers = bounded.bounded_reachability, robust_bounded_reachability
-        found = self.by_steps(solvers, target, path.upper, aim=aim, stay=stay)
+        solution = bounded.bounded_reachability(
+            self.model, target, path.upper, stay=stay, **aim.directions
+        )
         exact = partial(
             exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
         )
-        return self.exact(found, tolerance, exact)
+        return self.exact(self.found(solution, by="steps"), tolerance, exact)
