@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,12 +15,12 @@ import optax
 
 from jaxltl.algos import cce, trust_region as tr
 from jaxltl.algos.cce import exponential_family as families
-from jaxltl.app.job import plain
-from jaxltl.core.environments.environment import Environment, Timestep
+from jaxltl.app.wording import Record
+from jaxltl.core.environments import Agent, Environment, Episode, run_episode
 from jaxltl.envs import lqr, navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
-from jaxltl.envs.networks import apply, make_network
-from jaxltl.reproduce.experiment import Figures, render_table, svg_files
+from jaxltl.envs.networks import apply, make_network, network_agent
+from jaxltl.reproduce.experiment import experiment, render_table
 from jaxltl.core.models.protocols import PyTree
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
@@ -48,22 +47,17 @@ class Plan:
     fresh: int = 1000  # trajectories that evaluate a returned policy
 
 
-def figures(
-    progress: Callable[[str], None] = lambda text: None,
-    *,
-    seeds: int | None = None,
-    plan: Plan | None = None,
-) -> Figures:
-    """Figures 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
-    begin = time.perf_counter()
+@experiment
+def measure(
+    progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
+) -> Record:
+    """Record 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
     plan = plan or Plan()
     optimum = lqr.optimum(lqr.lqr())
-    rows, drawn = [], []
+    regulators = []
     for network in plan.networks:
         progress(f"the regulator, network {network}")
-        row, curves = _regulator(network, seeds or LQR_SEEDS, plan, optimum)
-        rows.append(row)
-        drawn.append(curves)
+        regulators.append(_regulator(network, seeds or LQR_SEEDS, plan, optimum))
     # All searches of the robot are dispatched before the first result is read: JAX runs several in
     # parallel while it compiles the next.
     usual, pretrained = [], []
@@ -77,49 +71,52 @@ def figures(
         robot = _robot(task)
         # A distribution of feasible policies for each seed, by minimising the cost alone.
         hparams, keys = replace(robot.hparams, margin=1e3), _keys(seeds or SEEDS, 100 + task)
-        initial = _train(keys, robot.problem, hparams, plan.steps // 2)[0].family
-        pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, initial)) for m in methods]
-    evaluated = []
-    for runs in (usual, pretrained):
-        progress("the robot: trajectories of the returned policies")
-        evaluated.append([_evaluated(robot, run, plan) for robot, run in runs])
-    navigation, robot_curves, maps = zip(*evaluated[0], strict=True) if usual else ((), (), ())
-    from_feasible, feasible_curves, _ = (
-        zip(*evaluated[1], strict=True) if pretrained else ((), (), ())
+        family = _train(keys, robot.problem, hparams, plan.steps // 2)[0].family
+        pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, family)) for m in methods]
+    progress("the robot: trajectories of the returned policies")
+    usual_runs, pretrained_runs = (
+        [_evaluated(robot, run, plan) for robot, run in runs] for runs in (usual, pretrained)
     )
-    return plain(
-        {
-            "lqr_optimum": optimum.total,
-            "lqr": rows,
-            "navigation": navigation,
-            "navigation_feasible_start": from_feasible,
-            "seconds": round(time.perf_counter() - begin, 2),
-            "figure8": {
-                "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
-                "learned": drawn,
-            },
-            "figure10": robot_curves,
-            "figure11": feasible_curves,
-            "maps": maps,
-        }
-    )
+    return {
+        "lqr_optimum": optimum.total,
+        "lqr": [row for row, _ in regulators],
+        "navigation": [row for row, _, _ in usual_runs],
+        "navigation_feasible_start": [row for row, _, _ in pretrained_runs],
+        "figure8": {
+            "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
+            "learned": [curves for _, curves in regulators],
+        },
+        "figure10": [curve for _, curve, _ in usual_runs],
+        "figure11": [curve for _, curve, _ in pretrained_runs],
+        "maps": [paths for _, _, paths in usual_runs],
+    }
 
 
 # --- the regulator ------------------------------------------------------------------------------
 
-_train = jax.jit(
-    lambda keys, problem, hparams, num_steps: jax.vmap(
-        lambda key: cce.train(key, problem, hparams, num_steps=num_steps)
-    )(keys),
-    static_argnums=3,
-)
+
+@partial(jax.jit, static_argnums=3)
+def _train(
+    keys: jax.Array,
+    problem: cce.Problem,
+    hparams: cce.Hparams,
+    num_steps: int,
+    families_: PyTree = None,
+) -> PyTree:
+    """The search from every key, by default from the initial distribution of the problem."""
+
+    def one(key: jax.Array, family: PyTree) -> PyTree:
+        start = problem if family is None else replace(problem, family=family)
+        return cce.train(key, start, hparams, num_steps=num_steps)
+
+    return jax.vmap(one)(keys, families_)
 
 
 def _keys(seeds: int, part: int) -> jax.Array:
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(i), part))(jnp.arange(seeds))
 
 
-def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple[Figures, Figures]:
+def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple[Record, Record]:
     """A network's row, and its curves of figure 8."""
     world, network = lqr.lqr(), make_network(name)
     size = network.num_parameters
@@ -233,55 +230,23 @@ def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.A
 def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTree = None) -> Search:
     """A search by a method, from scratch or from pretrained distributions of policies."""
     keys = _keys(seeds, robot.task)
+    num_steps, trust_steps = plan.steps, plan.trust_steps
+    if pretrained is not None:
+        num_steps, trust_steps = plan.feasible_steps
     if method == "CCE":
-        return _cross_entropy(robot, keys, plan, pretrained)
-    return _trust_region(robot, method, keys, plan, pretrained)
-
-
-def _cross_entropy(robot: Robot, keys: jax.Array, plan: Plan, pretrained: PyTree) -> Search:
-    if pretrained is None:
-        state, metrics = _train(keys, robot.problem, robot.hparams, plan.steps)
-    else:
-        state, metrics = _train_from(
-            keys, pretrained, robot.problem, robot.hparams, plan.feasible_steps[0]
-        )
-    return Search(
-        "CCE",
-        keys,
-        metrics.num_evaluated * _NUM_TRAJECTORIES,
-        metrics.objective,
-        metrics.cost[..., 0],
-        state,
-        robot.hparams,
-    )
-
-
-@partial(jax.jit, static_argnums=4)
-def _train_from(
-    keys: jax.Array, family: PyTree, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
-) -> PyTree:
-    """The search from an initial distribution for each seed."""
-
-    def one(key: jax.Array, family: PyTree) -> PyTree:
-        return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
-
-    return jax.vmap(one)(keys, family)
-
-
-def _trust_region(
-    robot: Robot, method: str, keys: jax.Array, plan: Plan, pretrained: PyTree
-) -> Search:
+        state, metrics = _train(keys, robot.problem, robot.hparams, num_steps, pretrained)
+        made, cost = metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.cost[..., 0]
+        return Search(method, keys, made, metrics.objective, cost, state, robot.hparams)
     hparams = replace(
         _TRUST,
         method="cpo" if method == "CPO" else "trpo",
         # A penalty of zero instead of None does not recompile.
         penalty=None if method == "CPO" else PENALTY * (method == "penalised TRPO"),
     )
-    num_steps = plan.trust_steps if pretrained is None else plan.feasible_steps[1]
     state = jax.vmap(lambda key: tr.init(key, robot.stepwise, hparams))(keys)
     if pretrained is not None:
         state = _imitate(state, robot, hparams, pretrained)
-    state, metrics = _run(state, robot.stepwise, hparams, num_steps)
+    state, metrics = _run(state, robot.stepwise, hparams, trust_steps)
     return Search(method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
 
 
@@ -298,13 +263,8 @@ def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: PyTr
 
     def imitate(state: tr.State, family: PyTree) -> tr.State:
         policy = families.center(family)
-        seen, _, _ = _drive(
-            robot.environment,
-            partial(_by_network, network, policy),
-            state.key,
-            200,
-            robot.world.horizon,
-        )
+        agent = network_agent(network, robot.environment)(policy)
+        seen = _episodes(state.key, robot.environment, agent, 200, robot.world.horizon).observation
         seen = seen.reshape(-1, seen.shape[-1])
         goal = apply(network, policy, seen)
 
@@ -329,56 +289,21 @@ def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: PyTr
 # --- trajectories of returned policies -------------------------------------------------------------
 
 
-def _by_network(network: PyTree, policy: jax.Array, seen: jax.Array, key: jax.Array) -> jax.Array:
-    del key
-    return apply(network, policy, seen)
+@partial(jax.jit, static_argnums=(3, 4))
+def _episodes(
+    key: jax.Array, environment: Environment, agent: Agent, number: int, horizon: int
+) -> Episode:
+    keys = jax.random.split(key, number)
+    return jax.vmap(lambda k: run_episode(k, environment, agent, num_steps=horizon))(keys)
 
 
-def _drawn(state: tr.State, hparams: tr.Hparams, seen: jax.Array, key: jax.Array) -> jax.Array:
-    mean, deviation = tr.act(state, hparams, seen)
-    return mean + deviation * jax.random.normal(key, mean.shape, mean.dtype)
-
-
-def _drive(
-    environment: Environment,
-    act: Callable[..., jax.Array],
-    key: jax.Array,
-    number: int,
-    horizon: int,
-) -> tuple[jax.Array, PyTree, tuple[jax.Array, jax.Array]]:
-    """Observations ``[T, M, O]``, states ``[T, M]``, and J and Z ``[M]`` of M trajectories."""
-    starts, noise = jax.random.split(key)
-    places = jax.vmap(environment.reset)(jax.random.split(starts, number))
-
-    def move(places: PyTree, key: jax.Array) -> PyTree:
-        seen = jax.vmap(environment.observe)(places)
-        action = act(seen, key)
-        found: Timestep = jax.vmap(lambda p, a: environment.step(p, a, None))(places, action)
-        return found.world, (seen, places, found.reward, found.cost)
-
-    _, (seen, path, reward, cost) = jax.lax.scan(move, places, jax.random.split(noise, horizon))
-    return seen, path, (reward.sum(0), cost.sum(0))
-
-
-@partial(jax.jit, static_argnums=(2, 3))
-def _driven(
-    environment: Environment, policy: PyTree, number: int, horizon: int, key: jax.Array
-) -> PyTree:
-    if isinstance(policy, tuple):
-        act = partial(_drawn, *policy)
-    else:
-        act = partial(_by_network, nav.policy_network(nav.navigation()), policy)
-    _, path, scores = _drive(environment, act, key, number, horizon)
-    return path.state, scores
-
-
-def _policies(robot: Robot, run: Search, plan: Plan) -> list[PyTree]:
+def _agents(robot: Robot, run: Search, plan: Plan) -> Iterator[Agent]:
     """The returned policy of each seed; if none is feasible, the one of the least violation."""
-    policies: list[PyTree] = []
+    act = network_agent(nav.policy_network(robot.world), robot.environment)
     for i, key in enumerate(run.keys):
         state = jax.tree.map(lambda x, i=i: x[i], run.state)
         if run.method != "CCE":
-            policies.append((state, run.hparams))
+            yield tr.policy(state, robot.stepwise, run.hparams)
             continue
         result = cce.result(
             state,
@@ -388,27 +313,26 @@ def _policies(robot: Robot, run: Search, plan: Plan) -> list[PyTree]:
             num_evaluations=max(plan.fresh // _NUM_TRAJECTORIES, 2),
         )
         least = min((result.mean, result.best), key=lambda a: float(a.excess))
-        policies.append(least.parameters if result.solution is None else result.solution)
-    return policies
+        yield act(least.parameters if result.solution is None else result.solution)
 
 
-def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures, Figures]:
+def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Record, Record, Record]:
     """A row, the learning curves, and trajectories of the first seed's policy."""
     limit = nav.LIMITS[robot.task]
     trajectories, objectives, costs = (
         np.asarray(x) for x in (run.trajectories, run.objective, run.cost)
     )
-    policies = _policies(robot, run, plan)
     path: Any = None
     objective, cost, interval = [], [], []
-    for policy in policies:
-        state, (j, z) = _driven(
-            robot.environment, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6)
+    for agent in _agents(robot, run, plan):
+        found = _episodes(
+            jax.random.key(10**6), robot.environment, agent, plan.fresh, robot.world.horizon
         )
-        path = state if path is None else path
-        objective.append(float(j.mean()))
-        cost.append(float(z.mean()))
-        margin = 1.96 * float(z.std(ddof=1)) / np.sqrt(plan.fresh)
+        path = found.world.state if path is None else path
+        total = found.cost.sum(1)
+        objective.append(float(found.reward.sum(1).mean()))
+        cost.append(float(total.mean()))
+        margin = 1.96 * float(total.std(ddof=1)) / np.sqrt(plan.fresh)
         interval.append((cost[-1] - margin, cost[-1] + margin))
     reached = costs <= limit
     first = [
@@ -418,7 +342,7 @@ def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures,
         "task": robot.task,
         "method": run.method,
         "limit": limit,
-        "seeds": len(policies),
+        "seeds": len(cost),
         "seeds_feasible": sum(z <= limit for z in cost),
         "seeds_confident": sum(high <= limit for _, high in interval),
         "seeds_feasible_at_end": int(reached[:, -1].sum()),
@@ -446,8 +370,8 @@ def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures,
     paths = {
         "task": robot.task,
         "method": run.method,
-        "x": _rounded(path.x[:, :10].T, 3),
-        "y": _rounded(path.y[:, :10].T, 3),
+        "x": _rounded(path.x[:10, :-1], 3),
+        "y": _rounded(path.y[:10, :-1], 3),
     }
     return row, curve, paths
 
@@ -455,7 +379,7 @@ def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures,
 # --- the table ----------------------------------------------------------------------------------
 
 
-def table(result: Figures) -> str:
+def table(result: Record) -> str:
     """The report of section 4.5."""
     return render_table("cce.txt", **result)
 
@@ -463,8 +387,8 @@ def table(result: Figures) -> str:
 # --- pictures -----------------------------------------------------------------------------------
 
 
-def pictures(result: Figures) -> list[tuple[str, bytes]]:
-    """Figures 8, 10 and 11, and trajectories of the returned policies of the first seed."""
+def pictures(result: Record) -> Record:
+    """Record 8, 10 and 11, and trajectories of the returned policies of the first seed."""
     from jaxltl import plot
 
     best = result["figure8"]["optimum"]
@@ -472,14 +396,13 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
         "figure_8_regulator": plot.lines(
             {
                 x["network"]: {
-                    "first state": (
-                        np.asarray(x["state"])[..., 0],
-                        np.asarray(best["state"])[:, 0],
-                    ),
-                    "second state": (
-                        np.asarray(x["state"])[..., 1],
-                        np.asarray(best["state"])[:, 1],
-                    ),
+                    **{
+                        f"{name} state": (
+                            np.asarray(x["state"])[..., i],
+                            np.asarray(best["state"])[:, i],
+                        )
+                        for i, name in enumerate(("first", "second"))
+                    },
                     "control": (x["control"], best["control"]),
                     "cost beyond the optimum": ([x["gap"]], None),
                     "violation": ([x["violation"]], None),
@@ -496,7 +419,7 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
     ):
         if not curves:
             continue
-        rows: Figures = {}
+        rows: Record = {}
         limits = {}
         for x in curves:
             row = rows.setdefault(f"task {x['task']}", {"objective": {}, "cost": {}})
@@ -513,4 +436,4 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
         bounds=world.bounds,
         columns=len({x["method"] for x in result["maps"]}),
     )
-    return svg_files(drawn)
+    return drawn

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
 
+from jaxltl.app.job import plain
+from jaxltl.app.wording import Record
 from jaxltl.io.templates import render
 
 ResultT = TypeVar("ResultT")
-Figures = dict[str, Any]  # numbers, texts, and lists and dicts of them, as in JSON
+
+
+def experiment(measure: Callable[..., Record]) -> Callable[..., Any]:
+    """Decorator of ``measure(progress, ...)``: values of JSON, with the seconds of everything."""
+
+    @functools.wraps(measure)
+    def run(progress: Callable[[str], None] = lambda text: None, **options: Any) -> Any:
+        begin = time.perf_counter()
+        result = measure(progress, **options)
+        return plain({**result, "total_seconds": round(time.perf_counter() - begin, 2)})
+
+    return run
 
 
 def run_seconds(job: Callable[[], ResultT]) -> tuple[ResultT, float]:
@@ -25,10 +39,3 @@ def render_table(template: str, **values: object) -> str:
     """A report by a template, without blanks at the ends of lines."""
     lines = render("jaxltl.reproduce", template, **values).splitlines()
     return "\n".join(line.rstrip() for line in lines)
-
-
-def svg_files(drawn: Mapping[str, Any]) -> list[tuple[str, bytes]]:
-    """SVG files of drawn figures by name."""
-    from jaxltl import plot
-
-    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ import numpy as np
 from jaxltl.algos import mlirl as irl
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.chunks import Options, run_in_chunks
-from jaxltl.app.job import plain
+from jaxltl.app.wording import Record
 from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.mdp import MDP
@@ -24,7 +22,7 @@ from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
-from jaxltl.reproduce.experiment import Figures, render_table
+from jaxltl.reproduce.experiment import experiment, render_table
 
 MAP = """
 w  w  w  w  w  w  r  w  w  w
@@ -52,7 +50,7 @@ MUS = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 STARTS = ((0, 0, 0, 0, 0), (1, 1, 1, 1, 1), (5, 2, 2, 2, 2))
 DISCOUNT, L2, MU = 0.5, 1e-3, 0.01
 
-PUBLISHED: dict[str, Figures] = {
+PUBLISHED: dict[str, Record] = {
     "case1": {"mean": 0.304, "min": 6.9e-9, "theta": [8.5176, 4.2678, -0.0442, -0.8208, 3.7336]},
     "case2": {"mean": 0.954, "min": 0.430, "theta": [9.6090, 2.3128, 2.7393, -0.0121, 2.3221]},
     "case3": {"mean": 0.999, "min": 0.962, "theta": [10.2010, 1.8908, 3.9550, 8.1854, 1.8855]},
@@ -117,47 +115,42 @@ def learn_cases(
     return cases
 
 
-def _evaluated(
-    model: Product, policy: jax.Array, named: Mapping[str, int] = MappingProxyType({})
-) -> Figures:
-    """Mean and minimum over initial states of the satisfaction probability, and that of `named` ones."""
+def _evaluated(model: Product, policy: jax.Array) -> tuple[Record, np.ndarray]:
+    """Mean and minimum over initial states of the satisfaction probability, and that of each."""
     solution = check(satisfaction_probability(model, policy))
     starts = np.asarray(model.initial) > 0
     value = np.asarray(solution.value)[starts]
-    each = from_starts(model, solution.value)
-    worst = int(np.argwhere(starts)[np.argmin(value)][0])
-    return {
+    row = {
         "mean": value.mean(),
         "min": value.min(),
-        "worst": worst,
+        "worst": int(np.argwhere(starts)[np.argmin(value)][0]),
         "bound": float(np.max((solution.upper - solution.lower)[starts])),
-        **{name: each[state] for name, state in named.items()},
     }
+    return row, from_starts(model, solution.value)
 
 
-def _case(model: Product, learned: tuple[np.ndarray, jax.Array, float]) -> Figures:
+def _case(model: Product, learned: tuple[np.ndarray, jax.Array, float]) -> Record:
     theta, policy, likelihood = learned
     policy = policy if policy.ndim == 3 else lift_policy(model, policy)
-    return {**_evaluated(model, policy), "theta": theta, "neg_log_likelihood": likelihood}
+    return {**_evaluated(model, policy)[0], "theta": theta, "neg_log_likelihood": likelihood}
 
 
-def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> Figures:
+def _missing_safety(world: MDP, shown: Trajectories) -> Record:
     """A policy learned with a task that does not forbid red, evaluated under the true task."""
     incomplete = product(world, TASK_WITHOUT_SAFETY)
     features = irl.task_features(incomplete, shown, avoid=["r"])
-    [(_, policy, _)] = learn_cases(irl.make_problem(incomplete, features.values, shown), (mu,))
+    [(_, policy, _)] = learn_cases(irl.make_problem(incomplete, features.values, shown), (None,))
     reached = restrict(incomplete)
     true = product(reached.model, TASK)
-    lifted = lift_policy(true, policy[reached.base_state, reached.memory])
+    row, each = _evaluated(true, lift_policy(true, policy[reached.base_state, reached.memory]))
     base = np.asarray(reached.base_state)
-    result = _evaluated(true, lifted, {"row_7_column_5": int(np.argmax(base == 6 * 10 + 4))})
-    result["worst"] = int(base[result["worst"]])
-    return result
+    cell = int(np.argmax(base == 6 * 10 + 4))
+    return {**row, "worst": int(base[row["worst"]]), "row_7_column_5": each[cell]}
 
 
-def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
+@experiment
+def measure(progress: Callable[[str], None]) -> Record:
     """Section 2.5: three cases, the sweep of mu, and the task without its safety part."""
-    begin = time.perf_counter()
     world, shown = two_goals()
     model = product(world, TASK)
     progress("case 1: in the world, without the task")
@@ -170,19 +163,16 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
     progress(f"case 3: with the satisfaction term, for {len(MUS)} weights mu in parallel")
     sweep = [_case(model, case) for case in learn_cases(problem, MUS)]
     progress("without the safety part of the task")
-    missing = _missing_safety(world, shown, None)
-    result = {
+    return {
         "case1": _case(model, first),
         "case2": _case(model, second),
         "case3": sweep[MUS.index(MU)],
         "mu_sweep": [{"mu": mu, **case} for mu, case in zip(MUS, sweep, strict=True)],
-        "missing_safety": missing,
-        "seconds": round(time.perf_counter() - begin, 2),
+        "missing_safety": _missing_safety(world, shown),
     }
-    return plain(result)
 
 
-def table(result: Figures) -> str:
+def table(result: Record) -> str:
     """The report of section 2.5."""
     titles = ("case 1: in the world", "case 2: in the product", "case 3: with satisfaction")
     names = ("case1", "case2", "case3")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,14 +13,14 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import rmax
 from jaxltl.algos.common import loops, pac
-from jaxltl.app.job import plain
+from jaxltl.app.wording import Record
 from jaxltl.core.games.winning import almost_sure_buchi
 from jaxltl.core.models import expectation, restrict
 from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
-from jaxltl.reproduce.experiment import Figures, render_table, run_seconds, svg_files
+from jaxltl.reproduce.experiment import experiment, render_table, run_seconds
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
 RESTART = 1 / 50  # probability of a restart before a move
@@ -43,13 +42,13 @@ _HPARAMS = rmax.Hparams(
 )
 
 
-def figures(progress: Callable[[str], None] = lambda text: None, *, seeds: int = SEEDS) -> Figures:
+@experiment
+def measure(progress: Callable[[str], None], *, seeds: int = SEEDS) -> Record:
     """Section 6.7: the game, its optimal and initial values, and learned strategies."""
-    begin = time.perf_counter()
     progress("the game and its optimal values")
     model = patrol()
     problem = rmax.make_problem(model.game, model.accepting, model.reward)
-    known = _known_model(model)
+    known, strategies, quantity = _known_model(model)
     progress(f"learning with {seeds} seeds in one call, with and without restarts")
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     restarting = replace(_HPARAMS, restart=RESTART)
@@ -59,30 +58,30 @@ def figures(progress: Callable[[str], None] = lambda text: None, *, seeds: int =
     progress("learning with one seed at a time, to measure seconds")
     alone, until_last = _single_run_seconds(keys, problem, restarting, runs)
     system = np.asarray(model.game.system)
-    result = {
+    values = {name: _worst(model, strategy) for name, strategy in strategies.items()}
+    values |= {"optimal": known.pop("optimal"), "learned": evidence.worst_case.value}
+    return {
         **_sizes(model, problem),
-        **known["figures"],
+        **known,
+        **{f"{name}_strategy": _summary(model, values[name]) for name in strategies},
         "learned": learned,
         "learned_without_restarts": without,
         "seconds": alone,
         "last_update_seconds": until_last,
         "seconds_together": together,
-        "total_seconds": round(time.perf_counter() - begin, 2),
-        "figure17": _figure_17(model, known["quantity"]),
+        "figure17": _figure_17(model, quantity),
         "figure18": {
             "reachable": np.asarray(evidence.reachable)[system],
-            "learned": np.asarray(evidence.worst_case.value)[system],
-            **{k: np.asarray(v)[system] for k, v in known["values"].items()},
+            **{name: np.asarray(value)[system] for name, value in values.items()},
         },
-        "figure19": _figure_19(model, known["winning"], evidence),
+        "figure19": _figure_19(model, strategies["winning"], evidence),
     }
-    return plain(result)
 
 
 # --- the true model -------------------------------------------------------------------------
 
 
-def _sizes(model: Patrol, problem: rmax.Problem) -> Figures:
+def _sizes(model: Patrol, problem: rmax.Problem) -> Record:
     game = model.game
     moves = np.asarray(game.available.sum(axis=1))
     reachable = restrict(game).model
@@ -96,9 +95,9 @@ def _sizes(model: Patrol, problem: rmax.Problem) -> Figures:
     }
 
 
-def _known_model(model: Patrol) -> Figures:
-    """Optimal values and strategies of algorithm 4 in the true model."""
-    game, worst = model.game, partial(_worst, model)
+def _known_model(model: Patrol) -> tuple[Record, dict[str, jax.Array], jax.Array]:
+    """Optimal values and the loss of algorithm 4, two strategies, and the values of actions."""
+    game = model.game
     optimal = check(minimax_value(game, model.reward, DISCOUNT)).value
     quantity = model.reward + DISCOUNT * expectation(game, optimal)
     near = pac.near_optimal(quantity, game.available, pac.action_tolerance(EPSILON, DISCOUNT))
@@ -106,26 +105,19 @@ def _known_model(model: Patrol) -> Figures:
     hat = pac.hat_game(game, near, p)
     action = almost_sure_buchi(hat, jnp.pad(model.accepting, (0, 2 * game.num_states))).action
     of_hat = pac.recover_hat_strategy(hat, jax.nn.one_hot(action, hat.num_actions))
-    uniform = worst(game.available / game.available.sum(axis=1, keepdims=True))
-    winning = jax.nn.one_hot(almost_sure_buchi(game, model.accepting).action, game.num_actions)
-    by_graph = worst(winning)
+    uniform_hat = pac.hat_strategy(near, game.available, p)
     values, counts = np.unique(
         np.round(np.asarray(optimal)[np.asarray(game.system)], 6), return_counts=True
     )
-    return {
-        "figures": {
-            "values": {f"{v:.6f}": int(n) for v, n in zip(values, counts, strict=True)},
-            "initial_strategy": _summary(model, uniform),
-            "winning_strategy": _summary(model, by_graph),
-            "hat_strategy_gap": jnp.max(optimal - worst(of_hat)),
-            "uniform_hat_strategy_gap": jnp.max(
-                optimal - worst(pac.hat_strategy(near, game.available, p))
-            ),
-        },
-        "values": {"optimal": optimal, "initial": uniform, "winning": by_graph},
-        "winning": winning,
-        "quantity": quantity,
+    known = {
+        "values": {f"{v:.6f}": int(n) for v, n in zip(values, counts, strict=True)},
+        "hat_strategy_gap": jnp.max(optimal - _worst(model, of_hat)),
+        "uniform_hat_strategy_gap": jnp.max(optimal - _worst(model, uniform_hat)),
+        "optimal": optimal,
     }
+    winning = jax.nn.one_hot(almost_sure_buchi(game, model.accepting).action, game.num_actions)
+    uniform = game.available / game.available.sum(axis=1, keepdims=True)
+    return known, {"initial": uniform, "winning": winning}, quantity
 
 
 def _worst(model: Patrol, strategy: jax.Array) -> jax.Array:
@@ -133,7 +125,7 @@ def _worst(model: Patrol, strategy: jax.Array) -> jax.Array:
     return check(strategy_value(model.game, strategy, model.reward, DISCOUNT)).value
 
 
-def _summary(model: Patrol, value: jax.Array) -> Figures:
+def _summary(model: Patrol, value: jax.Array) -> Record:
     here = jnp.maximum(value[model.game.system], 0)  # rounding may leave a tiny negative zero
     return {"min": here.min(), "max": here.max(), "mean": here.mean()}
 
@@ -176,7 +168,7 @@ def _single_run_seconds(
 
 def _evaluated(
     found: loops.Learned, problem: rmax.Problem, hparams: rmax.Hparams
-) -> tuple[list[Figures], rmax.Evidence]:
+) -> tuple[list[Record], rmax.Evidence]:
     """A row for each seed, and the evidence of the first; all strategies of a run have one support."""
     rows, every = [], []
     for seed in range(len(found.num_steps)):
@@ -203,7 +195,7 @@ def _evaluated(
 # --- the table ----------------------------------------------------------------------------------
 
 
-def table(result: Figures) -> str:
+def table(result: Record) -> str:
     """The report of section 6.7."""
     return render_table(
         "pac.txt",
@@ -217,7 +209,7 @@ def table(result: Figures) -> str:
 # --- pictures -----------------------------------------------------------------------------------
 
 
-def _figure_17(model: Patrol, quantity: jax.Array) -> Figures:
+def _figure_17(model: Patrol, quantity: jax.Array) -> Record:
     """Optimal actions without the task for each light, on first, and cell, for any automaton state."""
     best = pac.near_optimal(quantity, model.game.available, 1e-9)
     here = np.asarray(model.game.system & (model.memory == 0))
@@ -227,7 +219,7 @@ def _figure_17(model: Patrol, quantity: jax.Array) -> Figures:
     return {"best": moves}
 
 
-def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Figures:
+def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Record:
     """Strategies for each light, on first, and automaton state; NaN in unreachable states."""
     system = np.asarray(model.game.system)
     place = tuple(np.asarray(x)[system] for x in (1 - model.light, model.memory, model.cell))
@@ -248,8 +240,8 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Fig
     }
 
 
-def pictures(result: Figures) -> list[tuple[str, bytes]]:
-    """Figures 17 to 19: the task, the values, and the strategies of the first seed."""
+def pictures(result: Record) -> Record:
+    """Record 17 to 19: the task, the values, and the strategies of the first seed."""
     from jaxltl import plot
 
     task = surveillance()
@@ -261,7 +253,7 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
     shown, maps = result["figure18"], result["figure19"]
     titles = [f"light {light}, q{q}" for light in _DANGER for q in (1, 2, 3, 4)]
     laid_out = {k: np.asarray(maps[k], float).reshape(8, 9, -1) for k in ("initial", "learned")}
-    drawn = {
+    return {
         "figure_17_automaton": plot.automaton(task),
         "figure_17_best_moves": plot.strategies(
             _MAP,
@@ -289,4 +281,3 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
             mark="epsilon-optimal",
         ),
     }
-    return svg_files(drawn)

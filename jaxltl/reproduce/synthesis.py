@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import jax
@@ -10,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import maximin_q
-from jaxltl.app.job import plain
+from jaxltl.app.wording import Record
 from jaxltl.core.games import GR1, Parity, apply_strategy, buchi, gr1, permissive_strategy, safety
 from jaxltl.core.games.winning import solve, task_game
 from jaxltl.core.models import Game, Restriction
 from jaxltl.core.types import NotConverged, check
 from jaxltl.core.values import minimax_value, optimal_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
-from jaxltl.reproduce.experiment import Figures, render_table, run_seconds, svg_files
+from jaxltl.reproduce.experiment import experiment, render_table, run_seconds
 
 SIZES = (3, 4, 5, 6, 8, 10)
 BOUNDS = (4, 6, 8, 10, 14, 20)
@@ -38,9 +37,9 @@ TABLE6 = {4: 8.0922, 6: 8.8658, 8: 9.2442, 10: 9.4647, 14: 9.7034, 20: 9.8616}
 MEMORYLESS = 5.7368
 
 
-def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
+@experiment
+def measure(progress: Callable[[str], None]) -> Record:
     """Section 5.5: tables 5 and 6, example 2, and the game of figure 12."""
-    begin = time.perf_counter()
     table5, curve = [], None
     for size in SIZES:
         progress(f"table 5: two robots on a {size} x {size} grid")
@@ -48,23 +47,19 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
         table5.append(row)
         curve = size_curve or curve
     progress(f"table 6: counters up to {BOUNDS[-1]}")
-    table6 = [_counters(bound) for bound in BOUNDS]
-    game = robots(3)
-    memoryless = _restricted(game, buchi(game, CORNERS, safe="!collision"))
+    memoryless, *table6 = [_counters(bound) for bound in (None, *BOUNDS)]
     progress("example 2: assumptions and guarantees")
     second = _example_2()
     progress("figure 12: a reward against the task")
-    result = {
+    return {
         "table5": table5,
         "table6": table6,
-        "memoryless_permissive_max": float(_value(memoryless.model).max()),
+        "memoryless_permissive_max": memoryless["max_value"],
         "example2": second["summary"],
         "figure12": _figure_12(),
         "figure13": curve,
         "figure14": second["values"],
-        "seconds": round(time.perf_counter() - begin, 2),
     }
-    return plain(result)
 
 
 def _restricted(game: Game, objective: Parity | GR1, bound: int | None = None) -> Restriction:
@@ -79,7 +74,7 @@ def _value(game: Game) -> np.ndarray:
     return np.asarray(check(solution).value)
 
 
-def _example_1(size: int) -> tuple[Figures, Figures]:
+def _example_1(size: int) -> tuple[Record, Record]:
     """A row of table 5, and the learning curve of size 4."""
 
     def synthesize() -> Restriction:
@@ -127,7 +122,7 @@ def _learn(
 
 def _learning_curve(
     size: int, strategy: Restriction, problem: maximin_q.Problem, learned: maximin_q.State
-) -> Figures:
+) -> Record:
     """Data of figure 13: the learned values, and their changes in steps of 10,000 moves."""
     hparams = maximin_q.Hparams(discount=DISCOUNT, num_chains=100, moves_per_step=100)
     _, metrics = maximin_q.train(jax.random.key(1), problem, hparams, num_steps=40, max_rows=40)
@@ -140,17 +135,13 @@ def _learning_curve(
     }
 
 
-def _counters(bound: int) -> Figures:
+def _counters(bound: int | None) -> Record:
     game = robots(3)
-    found = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound)
-    return {
-        "bound": bound,
-        "states": found.model.num_states,
-        "max_value": float(_value(found.model).max()),
-    }
+    found = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound).model
+    return {"bound": bound, "states": found.num_states, "max_value": float(_value(found).max())}
 
 
-def _example_2() -> Figures:
+def _example_2() -> Record:
     game = robots(4)
     task = gr1(
         game,
@@ -175,7 +166,7 @@ def _example_2() -> Figures:
     }
 
 
-def _figure_12() -> Figures:
+def _figure_12() -> Record:
     """The value without a task, and with the task satisfied within m visits."""
     game, reward = reward_against_task()
     best = check(optimal_value(game.mdp, reward, DISCOUNT))
@@ -195,7 +186,7 @@ def _figure_12() -> Figures:
     return {"supremum": float(best.value.max()), "attained": bool(won), "delays": delays}
 
 
-def table(result: Figures) -> str:
+def table(result: Record) -> str:
     """The report of section 5.5."""
     rows = {
         "table5": [(row, TABLE5[row["n"]]) for row in result["table5"]],
@@ -204,23 +195,22 @@ def table(result: Figures) -> str:
     return render_table("synthesis.txt", memoryless=MEMORYLESS, **{**result, **rows})
 
 
-def pictures(result: Figures) -> list[tuple[str, bytes]]:
-    """Figures 13 and 14: values of the system's states, and the convergence of learning."""
+def pictures(result: Record) -> Record:
+    """Record 13 and 14: values of the system's states, and the convergence of learning."""
     from jaxltl import plot
 
     first, second = result["figure13"], result["figure14"]
     change = np.log10(np.maximum(first["residual"], 1e-16))
-    drawn = {
+    return {
         "figure_13_values": plot.game_values(_on_all_states(first), 4, label="learned value"),
         "figure_13_residual": plot.curves(
             {"log10 of the largest change of a value": change}, steps=first["moves"]
         ),
         "figure_14_values": plot.game_values(_on_all_states(second), 4, label="value"),
     }
-    return svg_files(drawn)
 
 
-def _on_all_states(part: Figures) -> np.ndarray:
+def _on_all_states(part: Record) -> np.ndarray:
     values = np.full(2 * part["n"] ** 4, np.nan)
     values[np.asarray(part["state"])] = part["value"]
     return values

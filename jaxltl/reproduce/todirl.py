@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import behavioral_cloning as cloning, todirl
-from jaxltl.app.job import plain
+from jaxltl.app.wording import Record
 from jaxltl.core.automata import Automaton, synchronize, to_automaton
 from jaxltl.core.models.construct.batch import lift_memory_policy, stack_products
 from jaxltl.core.models.product import Product
@@ -21,7 +20,7 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.undiscounted.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
 from jaxltl.io.colored_world import read_world, write_world
-from jaxltl.reproduce.experiment import Figures, render_table, svg_files
+from jaxltl.reproduce.experiment import experiment, render_table
 from jaxltl.core.models.protocols import PyTree
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
@@ -43,14 +42,11 @@ class Plan:
     test_worlds: int = 20  # number of unseen worlds
 
 
-def figures(
-    progress: Callable[[str], None] = lambda text: None,
-    *,
-    seeds: int | None = None,
-    plan: Plan | None = None,
-) -> Figures:
-    """Figures 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
-    begin = time.perf_counter()
+@experiment
+def measure(
+    progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
+) -> Record:
+    """Record 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
     plan, num_seeds = plan or Plan(), seeds or 10
     setting = _setting(num_seeds, plan)
     rows, drawn = [], []
@@ -61,15 +57,12 @@ def figures(
             rows.append(row)
             drawn += [curve] if curve else []
     progress("the expert, and a random policy")
-    return plain(
-        {
-            "by_demonstrations": rows,
-            "reference": _references(setting),
-            "seconds": round(time.perf_counter() - begin, 2),
-            "seeds": num_seeds,
-            "figure6": drawn,
-        }
-    )
+    return {
+        "by_demonstrations": rows,
+        "reference": _references(setting),
+        "seeds": num_seeds,
+        "figure6": drawn,
+    }
 
 
 # --- worlds and demonstrations ------------------------------------------------------------------
@@ -139,7 +132,7 @@ def _run(learner: Any, states: PyTree, problems: PyTree, hparams: PyTree, num_st
 
 def _learned(
     setting: Setting, method: str, number: int, plan: Plan
-) -> tuple[Figures, Figures | None]:
+) -> tuple[Record, Record | None]:
     """A row, and its learning curve for one number of demonstrations."""
     memory = setting.task
     if method in _MEMORY:
@@ -240,7 +233,7 @@ def _bounds(found: Any) -> Bounds:
     return Bounds(*(np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)))
 
 
-def _row(found: Performance, states: PyTree) -> Figures:
+def _row(found: Performance, states: PyTree) -> Record:
     each = found.test.mean.mean(1)
     return {
         "train_mean": found.train.mean.mean(),
@@ -260,8 +253,8 @@ def _deviation(x: np.ndarray) -> float:
     return float(x.std(ddof=1)) if len(x) > 1 else 0.0
 
 
-def _curve(points: list[Performance]) -> Figures:
-    curve: Figures = {}
+def _curve(points: list[Performance]) -> Record:
+    curve: Record = {}
     for part in ("train", "test"):
         each = [getattr(j, part).mean.reshape(len(j.train.mean), -1).mean(1) for j in points]
         curve[f"{part}_mean"] = [x.mean() for x in each]
@@ -269,7 +262,7 @@ def _curve(points: list[Performance]) -> Figures:
     return curve
 
 
-def _trajectories(setting: Setting, states: PyTree) -> list[Figures]:
+def _trajectories(setting: Setting, states: PyTree) -> list[Record]:
     """Trajectories of the first seed's policy in its training world and in two test worlds."""
     parameters, drawn = jax.tree.map(lambda x: x[:1], states.best.parameters), []
     worlds = {
@@ -287,7 +280,7 @@ def _trajectories(setting: Setting, states: PyTree) -> list[Figures]:
     return drawn
 
 
-def _references(setting: Setting) -> list[Figures]:
+def _references(setting: Setting) -> list[Record]:
     """L_phi of the expert and of the uniform policy."""
     rows = []
     for name in ("expert", "random"):
@@ -312,12 +305,12 @@ def _references(setting: Setting) -> list[Figures]:
 # --- table and pictures -------------------------------------------------------------------------
 
 
-def table(result: Figures) -> str:
+def table(result: Record) -> str:
     """The report of section 3.5."""
     return render_table("todirl.txt", orders=_orders(result["by_demonstrations"]), **result)
 
 
-def _orders(rows: list[Figures]) -> list[str]:
+def _orders(rows: list[Record]) -> list[str]:
     """Differences of the methods that know the task, paired by seed."""
     lines = []
     by = {(x["demonstrations"], x["method"]): x for x in rows}
@@ -335,38 +328,41 @@ def _orders(rows: list[Figures]) -> list[str]:
     return lines
 
 
-def pictures(result: Figures) -> list[tuple[str, bytes]]:
-    """Figures 6 and 7, and trajectories of learned policies."""
+def pictures(result: Record) -> Record:
+    """Record 6 and 7, and trajectories of learned policies."""
     from jaxltl import plot
 
     columns = {"train": "training world", "test": "test worlds"}
-    learning: Figures = {title: {} for title in columns.values()}
-    for x in result["figure6"]:
-        for part, title in columns.items():
-            learning[title][x["method"]] = tuple(
-                np.asarray(y, float)
-                for y in (
-                    np.asarray(x["steps"]) / x["steps"][-1],
-                    x[f"{part}_mean"],
-                    x[f"{part}_std"],
-                )
-            )
-    by_number: Figures = {title: {} for title in columns.values()}
     rows = result["by_demonstrations"]
-    for method in dict.fromkeys(x["method"] for x in rows):
-        mine = [x for x in rows if x["method"] == method]
-        for part, title in columns.items():
-            by_number[title][method] = (
+    by_method = {x["method"]: [y for y in rows if y["method"] == x["method"]] for x in rows}
+    by_number = {
+        title: {
+            method: (
                 np.log10([x["demonstrations"] for x in mine]),
                 [x[f"{part}_mean"] for x in mine],
                 [x[f"{part}_std"] for x in mine],
             )
+            for method, mine in by_method.items()
+        }
+        for part, title in columns.items()
+    }
     drawn = {
         "figure_7_demonstrations": plot.bands(
             {"satisfaction probability": by_number}, label="demonstrations, decimal logarithm"
         )
     }
     if result["figure6"]:
+        learning = {
+            title: {
+                x["method"]: (
+                    np.asarray(x["steps"], float) / x["steps"][-1],
+                    np.asarray(x[f"{part}_mean"], float),
+                    np.asarray(x[f"{part}_std"], float),
+                )
+                for x in result["figure6"]
+            }
+            for part, title in columns.items()
+        }
         drawn["figure_6_learning"] = plot.bands(
             {"satisfaction probability": learning}, label="share of all steps"
         )
@@ -377,4 +373,4 @@ def pictures(result: Figures) -> list[tuple[str, bytes]]:
             trajectories=make_trajectories(world.mdp, place["runs"]),
             title=f"{place['title']}: trajectories of the learned policy",
         )
-    return svg_files(drawn)
+    return drawn
