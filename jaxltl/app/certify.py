@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import click
 import numpy as np
 
 from jaxltl.core import validation
@@ -77,14 +78,6 @@ class Source:
     # assumption on possible transitions; default "complete", or "given" with a model; see
     # :func:`~jaxltl.core.models.construct.counts.model_from_counts`
     graph: Graph | None = None
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Files to write besides the result, or None."""
-
-    policy: Path | None = None
-    curve: Path | None = None
 
 
 def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
@@ -163,15 +156,17 @@ def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
 
 def certify(evidence: Evidence, query: Query) -> DataGuarantee:
     """Guarantee of a log and a query, see :func:`jaxltl.learn_guarantee`."""
-    return learn_guarantee(
-        evidence.model,
-        evidence.counts,
-        query.formula,
-        query.confidence,
-        graph=evidence.graph,
-        method=query.method,
-        objective=query.objective,
-    )
+    return learn_guarantee(evidence.model, evidence.counts, **_options(evidence, query))
+
+
+def _options(evidence: Evidence, query: Query) -> Record:
+    return {
+        "task": query.formula,
+        "confidence": query.confidence,
+        "graph": evidence.graph,
+        "method": query.method,
+        "objective": query.objective,
+    }
 
 
 def text(evidence: Evidence, result: Record) -> str:
@@ -224,16 +219,8 @@ def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
     """The guarantee by number of samples, for one random order of the log."""
     total = int(evidence.counts.sum())
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
-    bound = guarantee_curve(
-        evidence.model,
-        evidence.counts,
-        query.formula,
-        query.confidence,
-        sizes.tolist(),
-        graph=evidence.graph,
-        method=query.method,
-        objective=query.objective,
-    )
+    options = _options(evidence, query)
+    bound = guarantee_curve(evidence.model, evidence.counts, sizes=sizes.tolist(), **options)
     return sizes.tolist(), bound.tolist()
 
 
@@ -310,43 +297,35 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
 
 
 def certify_and_write(
-    log: Path,
-    query: Query,
-    source: Source,
-    outputs: Outputs,
-    as_json: bool,
-    say: Callable[[str], None],
-) -> bool:
-    """Runs the command, output files opened first; True if some bound did not converge."""
+    log: Path, query: Query, source: Source, policy: Path | None, picture: Path | None
+) -> Record:
+    """Runs the command, output files opened first, and returns the result."""
     from jaxltl.core.files import atomic_write
     from jaxltl.core.models.construct.lifting import project_policy
     from jaxltl.core.policies.policy_file import save_policy
 
     check_confidence(query.confidence)
-    target, picture = outputs.policy, outputs.curve
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
-    nothing = contextlib.nullcontext()
-    with (
-        nothing if target is None else atomic_write(target) as file,
-        nothing if picture is None else atomic_write(picture) as drawing,
-    ):
+    with contextlib.ExitStack() as held:
+        file, drawing = (
+            None if path is None else held.enter_context(atomic_write(path))
+            for path in (policy, picture)
+        )
         evidence = read_evidence(log, source)
         begin = time.perf_counter()
         found = certify(evidence, query)
         result = entry(evidence, query, found, time.perf_counter() - begin)
-        say(text(evidence, result))
+        click.echo(text(evidence, result))
         if file is not None:
-            about = {**result, "seconds": None}
-            policy = project_policy(evidence.model, found.satisfaction, states=evidence.states)
-            save_policy(file, policy, {"result": json.dumps(about, allow_nan=False)})
-        if drawing is not None:
+            about = json.dumps({**result, "seconds": None}, allow_nan=False)
+            learned = project_policy(evidence.model, found.satisfaction, states=evidence.states)
+            save_policy(file, learned, {"result": about})
+        if picture is not None and drawing is not None:
             from jaxltl import plot
 
             sizes, bound = curve(evidence, query)
             result["curve"] = {"samples": sizes, "bound": bound}
             figure = plot.guarantees(sizes, {"guaranteed": bound}, reference=found.optimistic)
-            drawing.write(plot.to_bytes(figure, picture.suffix[1:]))  # type: ignore[union-attr]
-        if as_json:
-            say(json.dumps(result, allow_nan=False))
-    return result["status"] != Status.CONVERGED.name
+            drawing.write(plot.to_bytes(figure, picture.suffix[1:]))
+    return result

@@ -146,8 +146,7 @@ def load(
 
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            most = MAX_STATES if max_states is None else max_states
-            model = build_model(program, max_states=most, progress=_Progress())
+            model = build_model(program, max_states=max_states or MAX_STATES, progress=_Progress())
         for warning in caught:
             print(f"warning: {warning.message}", file=sys.stderr, flush=True)
     if isinstance(model, Game):
@@ -184,47 +183,49 @@ def solve(
     max_states: int | None = None,
     relative: bool = False,
 ) -> Iterator[Result]:
-    """Yields the result of each property in order; errors of one do not end the others.
-
-    Of a program, some states are explored for each property.
-    """
+    """Yields the result of each property; of a program, some states are explored for each."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
+    def answer(prop: Property) -> Found:
+        if not isinstance(model, Program):
+            return solve_property(model, prop, tolerance=tolerance, relative=relative)
+        from jaxltl.core.programs.build import MAX_STATES
+        from jaxltl.core.programs.partial import solve_program
+
+        return solve_program(
+            model,
+            prop,
+            method="partial",
+            tolerance=tolerance,
+            max_states=max_states or MAX_STATES,
+            report=_Progress(),
+        )
+
+    return answers(queries, answer)
+
+
+def answers(
+    queries: Sequence[Query],
+    answer: Callable[[Property], Found],
+    is_fatal: Callable[[Exception], bool] = lambda error: False,
+) -> Iterator[Result]:
+    """Yields the result of each property in order; errors of one do not end the others."""
     for one in queries:
         begin = time.perf_counter()
         found: Found | None = None
         error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
-                if isinstance(model, Program):
-                    found = _explored(model, one.parsed, tolerance, max_states)
-                else:
-                    found = solve_property(
-                        model, one.parsed, tolerance=tolerance, relative=relative
-                    )
-            except ValueError as mistake:
-                error = str(mistake)
-            except NotConverged as failure:
-                error, fault = str(failure), NOT_CONVERGED
-            except Exception as failure:  # a bug must not lose the other answers
-                traceback.print_exc()
-                error, fault = f"{type(failure).__name__}: {failure}", NOT_CONVERGED
+                found = answer(one.parsed)
+            except Exception as failure:
+                if is_fatal(failure):
+                    raise
+                error = str(failure)
+                fault = INVALID if isinstance(failure, ValueError) else NOT_CONVERGED
+                if not isinstance(failure, ValueError | NotConverged):
+                    traceback.print_exc()  # a bug must not lose the other answers
+                    error = f"{type(failure).__name__}: {error}"
         yield Result(one, found, time.perf_counter() - begin, error, fault)
-
-
-def _explored(program: Program, prop: Property, tolerance: float, max_states: int | None) -> Answer:
-    """The answer of a partial exploration, with bounds on the way for long ones."""
-    from jaxltl.core.programs.build import MAX_STATES
-    from jaxltl.core.programs.partial import solve_program
-
-    return solve_program(
-        program,
-        prop,
-        method="partial",
-        tolerance=tolerance,
-        max_states=MAX_STATES if max_states is None else max_states,
-        report=_Progress(),
-    )
 
 
 # --- output -----------------------------------------------------------------------------------

@@ -16,14 +16,13 @@ import jaxltl
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import ProcessGroup, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import INVALID, NOT_CONVERGED, Query, Result, load
+from jaxltl.app.solve import Query, Result, answers, load
 from jaxltl.core.logic import Formula, Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.models import IntervalMDP, ShardedMDP, SparseMDP, on_host, shard, to_mesh
 from jaxltl.core.types import NotConverged
 from jaxltl.core.values.properties.solve_on_mesh import (
     Bounds,
-    Question,
     first_bounds,
     question_on_mesh,
 )
@@ -117,20 +116,12 @@ class MeshSolver:
 
     def solve(self, queries: Sequence[Query]) -> Iterator[Result]:
         """Yields the result of each property in order; errors of one do not end the others."""
-        for query in queries:
-            begin = time.perf_counter()
-            found: Answer | None = None
-            error, fault = query.error, INVALID
-            if query.parsed is not None:
-                try:
-                    found = self._answer(query.parsed)
-                except ValueError as mistake:
-                    if self.group.processes > 1 and is_loss(mistake):
-                        raise
-                    error = str(mistake)
-                except NotConverged as failure:
-                    error, fault = str(failure), NOT_CONVERGED
-            yield Result(query, found, time.perf_counter() - begin, error, fault)
+        return answers(queries, self._answer, self._is_fatal)
+
+    def _is_fatal(self, error: Exception) -> bool:
+        """True if other processes may not have the same error."""
+        known = isinstance(error, ValueError | NotConverged) and not is_loss(error)
+        return self.group.processes > 1 and not known
 
     def _answer(self, prop: Property) -> Answer:
         model, group = self.model, self.group
@@ -141,7 +132,7 @@ class MeshSolver:
             path = self.directory / f"solve-{_digest_text(mark)[:12]}.npz"
         bounds, part, made = first_bounds(model, question), 0, 0
         if path is not None and group.sees(str(path), path.exists()):
-            bounds, part, made = _restored(path, mark, model, question, bounds)
+            bounds, part, made = _restored(path, mark, model, bounds)
         chunk = steps_between(model)
         while True:
             found = question.advance(bounds, question.tolerance(self.tolerance, FINER[part]), chunk)
@@ -179,17 +170,15 @@ def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> Record:
 
 
 def _restored(
-    path: Path, given: Mapping[str, str], model: ShardedMDP, question: Question, bounds: Bounds
+    path: Path, given: Mapping[str, str], model: ShardedMDP, bounds: Bounds
 ) -> tuple[Bounds, int, int]:
     """Bounds from a checkpoint, which may be of another number of devices."""
-    like = _state(model, bounds, 0, 0)
-    small = {name: x for name, x in like.items() if name != "bounds"}
     empty = jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), bounds)
-    devices = int(files.load(path, {**small, "bounds": empty}, given)["devices"])
+    found = files.load(path, _state(model, empty, 0, 0), given)
+    devices = int(found["devices"])
     if devices == model.num_devices:
-        found = files.load(path, like, given)
+        found = files.load(path, _state(model, bounds, 0, 0), given)
     else:
-        found = files.load(path, {**small, "bounds": empty}, given)
         count, size = model.num_given, -(-model.num_given // devices)
         begins = np.arange(devices + 1) * count // devices
         each = np.concatenate(
