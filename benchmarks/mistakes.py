@@ -58,7 +58,7 @@ def write(place: Path) -> Path:
 
 def losses(place: Path) -> Iterator[tuple[str, int, float]]:
     """Number of steps and negative log-likelihood of the kept policy, with and without the cut."""
-    setup = job.prepare(job.read_task(write(place)), 0)
+    setup = job.prepare(job.FILE.read(write(place)), 0)
     every = dataclasses.replace(setup.guarantee, used=None)
     for title, guarantee in (("until the mistake", setup.guarantee), ("all", every)):
         one = dataclasses.replace(setup, guarantee=guarantee)

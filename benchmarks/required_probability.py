@@ -163,7 +163,7 @@ def _run(path: Path) -> tuple[float, dict]:
     """CPU seconds of learning with nothing compiled, and the result."""
     jax.clear_caches()
     before = time.process_time()
-    setup = job.prepare(job.read_task(path), 0)
+    setup = job.prepare(job.FILE.read(path), 0)
     result = job.summary(job.learn(setup, Training(0, 1)))
     return time.process_time() - before, result
 

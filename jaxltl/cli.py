@@ -136,7 +136,7 @@ def check(task_file: Path) -> None:
     if "game" in read_toml(task_file, "the file")[0]:
         from jaxltl.app.files import game
 
-        file = game.read_game(task_file)
+        file = game.GameFile.read(task_file)
         world = game.load_game(file)
         play, _ = game.load_objective(file, world)
         click.echo(f"ok: {world.game.num_states} states, {play.num_states} in the product")
@@ -178,10 +178,10 @@ def synthesize(
     begin = time.perf_counter()
     _begin(f"solving {game_file}")
     from jaxltl.app import synthesize as synthesis
-    from jaxltl.app.files.game import read_game
+    from jaxltl.app.files.game import GameFile
     from jaxltl.app.reports import synthesize as report
 
-    file = read_game(game_file)
+    file = GameFile.read(game_file)
     out = run_job.directory(out, file.name)
     with contextlib.ExitStack() as held:
         held.enter_context(run_job.locked(out))
@@ -193,7 +193,7 @@ def synthesize(
         place = report.place_of(found, environment)
         progress("writing")
         written = report.write(found, out, place, time.perf_counter() - begin)
-    click.echo(report.table(written, found))
+    click.echo(report.report_of(found).table(written))
     click.echo(f"\nwrote {out}/result.json and the files beside it")
     if as_json:
         _print_json(written)
@@ -502,10 +502,11 @@ def certify(
     graph = app.graph_of_options(
         options.pop("graph"), options.pop("least_probability"), query.confidence
     )
-    outputs = app.Outputs(policy, curve)
-    if app.certify_and_write(
-        log, query, app.Source(graph=graph, **options), outputs, as_json, click.echo
-    ):
+    source = app.Source(graph=graph, **options)
+    result = app.certify_and_write(log, query, source, policy, curve)
+    if as_json:
+        _print_json(result)
+    if result["status"] != "CONVERGED":
         raise SystemExit(1)
 
 
@@ -544,24 +545,22 @@ _EXPERIMENTS = {
 @compiling(fast=False)
 @plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
-    """Print published and measured figures side by side."""
+    """Print published and measured numbers side by side."""
     _begin(f"reproducing {what}")
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     options = {} if seeds is None else {"seeds": seeds}
-    if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
+    if seeds is not None and "seeds" not in inspect.signature(experiment.measure).parameters:
         raise ValueError(f"reproduce {what} has no seeds; leave --seeds out.")
     with float64():
-        result = experiment.figures(progress=_say, **options)
-        pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
+        result = experiment.measure(_say, **options)
+        pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else {}
     click.echo(experiment.table(result))
     if pictures:
-        from jaxltl.core.files import atomic_write
+        out = run_job.make_directory(out or Path("out") / "reproduce")
+        from jaxltl import plot
 
-        out = out or Path("out") / "reproduce"
-        out.mkdir(parents=True, exist_ok=True)
-        for name, picture in pictures:
-            with atomic_write(out / name) as file:
-                file.write(picture)
-        click.echo(f"\nwrote {', '.join(name for name, _ in pictures)} to {out}")
+        files = {f"{name}.svg": plot.to_bytes(figure) for name, figure in pictures.items()}
+        run_job.write_files(out, files.items())
+        click.echo(f"\nwrote {', '.join(files)} to {out}")
     if as_json:
         _print_json(result)

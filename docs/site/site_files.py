@@ -52,7 +52,7 @@ PAGES = {
     ),
     "game-file": FilePage(
         "Game files",
-        game.GameFileSchema,
+        game.GameFile,
         "``jaxltl synthesize`` reads a game and an objective of the system, and returns its winning "
         "region and a strategy; see :doc:`permissive strategies </docs/guides/permissive-strategies>`.",
         "patrol.toml",

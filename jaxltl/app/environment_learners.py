@@ -16,7 +16,7 @@ from jaxltl.algos import cce, ppo, trust_region
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
-from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentTask
+from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentFile
 from jaxltl.app.job import settings
 from jaxltl.core.environments import Agent, Box, Environment, Finite, Timestep, Verdict
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
@@ -34,13 +34,13 @@ class Method:
     problem: PyTree  # with `hparams`, arguments of its functions
     hparams: PyTree
     agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
-    figures: tuple[str, ...]  # names of the metrics that are drawn
+    drawn: tuple[str, ...]  # names of the metrics that are drawn
     kept: tuple[str, ...]  # names of the state's fields that determine a policy
     transitions: int  # bound of the environment's steps in a step of the learner
     description: str  # of the policy
 
 
-def make_method(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
     """The learner of a task file."""
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
     found = make(task, environment, num_steps)
@@ -59,7 +59,7 @@ def make_method(task: EnvironmentTask, environment: Environment, num_steps: int)
 _LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
 
 
-def _settings(task: EnvironmentTask) -> Record:
+def _settings(task: EnvironmentFile) -> Record:
     """The method's keys, with pairs of numbers as schedules and lists as tuples."""
     steps = task.learner.steps
     found = task.settings.given()
@@ -78,7 +78,7 @@ def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, b
     )
 
 
-def _ppo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
     spec = _settings(task)
     parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
     network = dataclasses.replace(default_network(environment.actions), **parts)
@@ -96,7 +96,7 @@ def _ppo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     )
 
 
-def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
     table, actions = task.settings, environment.actions
     assert isinstance(table, CceTable)
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
@@ -127,7 +127,7 @@ def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     )
 
 
-def _cpo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
     table = task.settings
     assert isinstance(table, CpoTable) and table.limit is not None
     if not isinstance(environment.actions, Box):

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jaxltl.app.files.task_environment import EnvironmentTask
+from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments.environment import Environment, make_environment, require_environment
 from jaxltl.core.environments.episodes import with_time_limit
@@ -37,7 +37,7 @@ PACKAGES = {
 
 
 def load_environment(
-    task: EnvironmentTask, world: Environment | Dynamics | None = None
+    task: EnvironmentFile, world: Environment | Dynamics | None = None
 ) -> Environment:
     """The environment of a task file, with its labels and its horizon."""
     world, table = load_world(task) if world is None else world, task.world
@@ -46,7 +46,7 @@ def load_environment(
         return world if table.horizon is None else with_time_limit(world, table.horizon)
 
 
-def load_world(task: EnvironmentTask) -> Environment | Dynamics:
+def load_world(task: EnvironmentFile) -> Environment | Dynamics:
     """The environment or the dynamics of a task file, with its labels."""
     table, folder = task.world, task.path.parent
     if table.dynamics is not None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import inspect
 import json
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -17,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl
-from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks, trace_lanes
-from jaxltl.app.protocols import Algorithm, LearningTask, Training
+from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks
+from jaxltl.app.files.task import FormulaFile
+from jaxltl.app.protocols import Algorithm, Training
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
@@ -45,12 +44,8 @@ def run_seeds(
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs a learner from N seeds in parallel; returns chunks and metrics ``[T, N]`` by name."""
     mesh = training.mesh if training.num_seeds > 1 else None
-    first = (algorithm.init, training.seed, training.num_seeds, problem, hparams)
     if mesh is None:
-        wait = compile_in_background(_first_states, *first)
-        trace_lanes(algorithm.step, jax.eval_shape(_first_states, *first), problem, hparams)
-        wait()
-        states = _first_states(*first)
+        states = _first_states(algorithm.init, training.seed, training.num_seeds, problem, hparams)
     else:
         make = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
         states = make(np.arange(training.num_seeds), np.int32(training.seed), problem, hparams)
@@ -106,25 +101,12 @@ def one_seed(learned: PyTree, i: int) -> PyTree:
     return dataclasses.replace(learned, **one, history=history)
 
 
-def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     """Least loss and greatest gradient norm over seeds, for the progress bar."""
     return {
-        "loss": f"{figures['loss'].min():.4f}",
-        "gradient": f"{figures['gradient_norm'].max():.1e}",
+        "loss": f"{metrics['loss'].min():.4f}",
+        "gradient": f"{metrics['gradient_norm'].max():.1e}",
     }
-
-
-def compile_in_background(function: PyTree, *given: PyTree) -> Callable[[], None]:
-    """Compiles a jitted function in another thread; returns a function that waits for it."""
-    lowered = function.lower(*given)
-
-    def work() -> None:
-        with contextlib.suppress(Exception):  # the call itself raises it
-            lowered.compile()
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    return thread.join
 
 
 def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
@@ -140,7 +122,7 @@ def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
-def about(task: LearningTask) -> Record:
+def about(task: FormulaFile) -> Record:
     """The first entries of a result."""
     return {"task": task.name, "formula": task.formula, "method": task.learner.method}
 

@@ -17,15 +17,15 @@ from jax.tree_util import Partial
 from jaxltl.core.validation import errors_in
 from jaxltl.algos import mlirl
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import learn as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.learn import (
     live as live,
     pictures as pictures,
+    report as report,
     task_pictures as task_pictures,
 )
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
 
-from jaxltl.app.files.task_mlirl import MlirlTask, read_task as read_task
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import World, load_world
 from jaxltl.algos.mlirl.constrained import Point, constrained_points
 from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, kept
@@ -33,13 +33,11 @@ from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, ste
 from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
     about,
-    compile_in_background,
     one_seed,
     plain,
     postfix as postfix,
     run_seeds,
     settings,
-    took,
 )
 from jaxltl.core.models import Product, Trajectories, lift_policy, product, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
@@ -52,7 +50,7 @@ from jaxltl.app.wording import Record, enclosure, many
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.policies.policy_file import save_policy
 
-DOUBLE = True
+DOUBLE, FILE = True, MlirlFile
 
 # Bounds of the search for a required probability, in steps so that it is deterministic: product
 # states times steps that cost about as much as compilation (benchmarks/required_probability.py),
@@ -109,11 +107,9 @@ def _train(
 ) -> Learned:
     """Reward weights and policies of N seeds."""
     table, model = setup.task.learner, setup.model
-    wait = _compile_policy(problem, hparams)
     options = Options(until=Partial(_ends, table.tolerance), keep="before")
     steps = num_steps or table.steps
     found, history = run_seeds(mlirl, problem, hparams, training, num_steps=steps, options=options)
-    wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
     weights = states.parameters
     lanes = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(len(weights))]
@@ -277,14 +273,6 @@ def _policy_and_likelihood(
     return _solved(state.parameters, problem, hparams)
 
 
-def _compile_policy(problem: mlirl.Problem, hparams: mlirl.Hparams) -> Callable[[], None]:
-    """Compiles :func:`_softmax_policy` in the background; returns a function that waits."""
-    if hparams.optimizer != "lbfgs":
-        return lambda: None
-    value = jax.ShapeDtypeStruct(problem.model.state_shape, problem.model.dtype)
-    return compile_in_background(_softmax_policy, problem.start, value, problem, hparams)
-
-
 @jax.jit
 def _softmax_policy(
     parameters: PyTree, value: jax.Array, problem: mlirl.Problem, hparams: mlirl.Hparams
@@ -307,7 +295,7 @@ def _solved(
 
 @dataclass(frozen=True)
 class Setup:
-    task: MlirlTask
+    task: MlirlFile
     world: World
     model: Product
     demonstrations: Trajectories
@@ -362,10 +350,9 @@ class Outcome:
     # guarantee of the kept policy from a log, if the world is estimated from one
     data: Record | None
     seed: int  # the first seed
-    seconds: float = 0.0  # wall time
 
 
-def prepare(task: MlirlTask, seed: int) -> Setup:
+def prepare(task: MlirlFile, seed: int) -> Setup:
     """The learning problem of a task file: product, demonstrations, guarantee and features."""
     world = load_world(task.path, task.world)
     with errors_in(f"{task.path}: [task] "):
@@ -489,7 +476,6 @@ def summary(outcome: Outcome) -> Record:
             "neg_log_likelihood": learned.neg_log_likelihood,
         },
         **({} if outcome.data is None else {"data": outcome.data}),
-        **took(outcome.seconds),
     }
     return plain(result)
 

@@ -21,9 +21,10 @@ from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.environment_source import load_environment, load_world
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import learn_environment as report, proof as proofs  # noqa: F401 - part of the job
+from jaxltl.app.reports import proof as proofs
+from jaxltl.app.reports.learn_environment import report as report
 from jaxltl.app.reports.explorer import Curves, curves
-from jaxltl.app.files.task_environment import EnvironmentTask, read_task as read_task
+from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     about,
@@ -32,7 +33,6 @@ from jaxltl.app.job import (
     over_seeds,
     plain,
     run_seeds,
-    took,
 )
 from jaxltl.core.types import Status
 from jaxltl.core.automata import Automaton, to_automaton
@@ -60,6 +60,7 @@ from jaxltl.core.policies.policy_file import read_policy_file
 from jaxltl.io.network_policy import save_network
 from jaxltl.core.models.protocols import PyTree
 
+FILE = EnvironmentFile
 DOUBLE = False  # environments are written for single precision
 _DRAWN = 4  # trajectories
 
@@ -70,7 +71,7 @@ Report = Callable[[str], None]
 class Setup:
     """A task, ready for learning."""
 
-    task: EnvironmentTask  # the file
+    task: EnvironmentFile  # the file
     automaton: Automaton  # of the formula
     environment: Environment  # the world with the task
     method: Method  # the learner
@@ -97,10 +98,9 @@ class Outcome:
     episodes: list[Episode]  # some of the kept policy, for pictures
     seed: int  # the first seed
     proof: proofs.Proof | str | None = None  # or the reason for which there is none
-    seconds: float = 0.0  # wall time
 
 
-def prepare(task: EnvironmentTask, seed: int, world: Environment | Dynamics | None = None) -> Setup:
+def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | None = None) -> Setup:
     """The environment with its task and the learner; ValueError for a task that does not fit."""
     del seed
     loaded = load_world(task) if world is None else world
@@ -132,7 +132,7 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | Dynamics | No
     return Setup(task, automaton, environment, method, num_steps, trivial, dynamics)
 
 
-def _reward(task: EnvironmentTask, automaton: Automaton) -> Record:
+def _reward(task: EnvironmentFile, automaton: Automaton) -> Record:
     """The options of the reward, shaped by default where that changes no optimal policy."""
     given = {key: value for key, value in task.task.given().items() if key != "formula"}
     shaping = given.pop("shaping", "auto")
@@ -176,11 +176,11 @@ def describe(setup: Setup) -> str:
     )
 
 
-def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     """Medians of two metrics over seeds, for the progress bar."""
     names = ("episode_return", "objective", "reward", "cost")
-    known = [n for n in names if n in figures and np.isfinite(figures[n]).any()]
-    return {n: f"{np.nanmedian(figures[n]):.3g}" for n in known[:2]}
+    known = [n for n in names if n in metrics and np.isfinite(metrics[n]).any()]
+    return {n: f"{np.nanmedian(metrics[n]):.3g}" for n in known[:2]}
 
 
 def learn(setup: Setup, training: Training) -> Outcome:
@@ -308,7 +308,7 @@ def summary(outcome: Outcome) -> Record:
                 "transitions": _transitions(outcome),
                 "troubled_rows": int((status > Status.COMPLETED).sum()),
                 "last": last,
-                "hyperparameters": task.given,
+                "hyperparameters": task.settings.given(),
             },
             "seeds": {
                 "first": outcome.seed,
@@ -318,7 +318,6 @@ def summary(outcome: Outcome) -> Record:
             },
             "drawn": _pictured(outcome) is not None,
             "proof": None if outcome.proof is None else proofs.entry(outcome.proof),
-            **took(outcome.seconds),
         }
     )
 
@@ -340,8 +339,8 @@ def _as_numbers(found: Evaluation) -> Record:
 
 def _drawn(outcome: Outcome) -> list[str]:
     """Names of the scalar metrics with finite values."""
-    figures = ((name, outcome.history[name]) for name in outcome.setup.method.figures)
-    return [name for name, x in figures if x.ndim == 2 and np.isfinite(x).any()]
+    metrics = ((name, outcome.history[name]) for name in outcome.setup.method.drawn)
+    return [name for name, x in metrics if x.ndim == 2 and np.isfinite(x).any()]
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
@@ -403,7 +402,7 @@ def save(out: Path, outcome: Outcome) -> None:
         automaton=outcome.setup.automaton,
         more={
             **dict(_parts(outcome.setup.method, one)),
-            "task": task.text,
+            "task": task.raw.decode(),
             "task_file": str(task.path.absolute()),
         },
     )
@@ -453,7 +452,7 @@ def load_policy(
 ) -> tuple[Setup, Agent]:
     """The task of a policy file, and its agent; see :func:`load_agent`."""
     arrays = read_policy_file(policy_file)
-    task = read_task(task_file) if task_file else _kept_task(policy_file, arrays)
+    task = EnvironmentFile.read(task_file) if task_file else _kept_task(policy_file, arrays)
     setup = prepare(task, 0, environment)
     method = setup.method
     state = jax.eval_shape(
@@ -474,7 +473,7 @@ def load_policy(
     return setup, _acting(setup, state)
 
 
-def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentTask:
+def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentFile:
     """The task of a policy file, in the directory that has the files that it names."""
     if not all(name in arrays and arrays[name].dtype.kind == "U" for name in ("task", "task_file")):
         raise ValueError(
@@ -483,13 +482,13 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
         )
     path, raw = Path(str(arrays["task_file"])), str(arrays["task"]).encode()
     beside = policy_file.absolute().parent
-    named = read_task(path, raw).world.named_files()
+    named = EnvironmentFile.read(path, raw).named_files()
     there = [
         folder
         for folder in (path.parent, beside)
         if all((folder / name).is_file() for name in named)
     ]
-    return read_task((there or [path.parent])[0] / path.name, raw)
+    return EnvironmentFile.read((there or [path.parent])[0] / path.name, raw)
 
 
 def certify_policy_file(policy: Path, formula: str | None, say: Report) -> proofs.Proof:

@@ -30,10 +30,10 @@ from jaxltl.app.todirl.guarantee import (
 from jaxltl.app.todirl.results import summary as summary
 from jaxltl.app.todirl.results import LENGTH, Judged, Learned, Outcome, Setup, Worlds, part_of
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import learn_todirl as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.learn_todirl import (
     live as live,
     pictures as pictures,
+    report as report,
     task_pictures as task_pictures,
 )
 from jaxltl.app.files.demonstrations import require_cosafe, synthetic_demonstrations
@@ -45,7 +45,7 @@ from jaxltl.app.files.scenes import (
     load_scenes,
 )
 
-from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
+from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.guarantee import check_formula, is_weighable, mistakes, used_steps
 from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
@@ -78,14 +78,14 @@ from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 
-DOUBLE = True
+DOUBLE, FILE = True, TodirlFile
 
 _BATCH = 64  # worlds in a batch of planning
 
 _EXPERT_DISCOUNT = 0.99  # largest default
 
 
-def prepare(task: TodirlTask, seed: int) -> Setup:
+def prepare(task: TodirlFile, seed: int) -> Setup:
     """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
     judge, memory = load_automata(task)
     shown = task.demonstrations
@@ -177,7 +177,7 @@ def _narrowed(setup: Setup) -> Setup:
 
 
 def _experts(
-    task: TodirlTask, scenes: list[Scene], judge: Automaton, *, soft: bool
+    task: TodirlFile, scenes: list[Scene], judge: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
     """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft-optimal."""
     if soft:
@@ -194,7 +194,7 @@ def _experts(
     return np.eye(len(ACTIONS))[np.stack(chosen)], bests
 
 
-def _stack(task: TodirlTask, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
+def _stack(task: TodirlFile, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
     """Stacks all worlds, so that one program serves them."""
     mdps = [scene.mdp for scene in scenes]
     both = judge if memory is judge else synchronize(memory, judge)

@@ -7,22 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
-from jaxltl.app.wording import Result
+from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
-    from jaxltl.core.array_types import PyTree
     import numpy as np
     from jax.sharding import Mesh
 
+    from jaxltl.app.files.task import FormulaFile
     from jaxltl.app.reports.drawing import Picture
-    from jaxltl.app.reports.explorer import Curves, Explorer, TooLarge
-    from jaxltl.app.reports.page import Part
+    from jaxltl.app.reports.explorer import Curves, Explorer
+    from jaxltl.app.reports.page import Report
+    from jaxltl.core.array_types import PyTree
 
 Progress = Callable[[int, Mapping[str, "np.ndarray"]], None]  # steps, and metrics ``[T, N]``
 
-T = TypeVar("T", bound="LearningTask")
+T = TypeVar("T", bound="FormulaFile")
 S = TypeVar("S")
-O = TypeVar("O", bound="Outcome")  # noqa: E741
+O = TypeVar("O")  # noqa: E741
 
 
 class Algorithm(Protocol):
@@ -30,36 +31,6 @@ class Algorithm(Protocol):
 
     init: Callable[..., PyTree]
     step: Callable[..., tuple[PyTree, PyTree]]
-
-
-class Learner(Protocol):
-    """``[learner]`` of a task file."""
-
-    @property
-    def method(self) -> str: ...
-    @property
-    def steps(self) -> int: ...
-
-
-class LearningTask(Protocol):
-    """A checked task file."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def formula(self) -> str: ...
-    @property
-    def learner(self) -> Learner: ...
-    @property
-    def digest(self) -> str: ...
-
-
-class Outcome(Protocol):
-    """A finished job; `seconds` is its wall time."""
-
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -75,36 +46,24 @@ class Training:
     mesh: Mesh | None = None  # devices over which several seeds are distributed
 
 
-class Report(Protocol):
-    """The report of a job's result: an HTML page with the task's text, and text for the terminal."""
-
-    def page(
-        self,
-        result: Result,
-        parts: Sequence[Part],
-        pictures: Sequence[tuple[Picture, bytes]],
-        task_text: str,
-    ) -> str: ...
-    def table(self, result: Result) -> str: ...
-
-
 class Job(Protocol[T, S, O]):
     """A kind of learning job, with its task, setup and outcome; implemented by modules."""
 
     @property
     def DOUBLE(self) -> bool: ...  # True if figures are computed in double precision
     @property
+    def FILE(self) -> type[T]: ...  # the schema of task files
+    @property
     def report(self) -> Report: ...
-    def read_task(self, path: Path) -> T: ...  # the checked task file
     def prepare(self, task: T, seed: int) -> S: ...  # the objects that a task file describes
     def describe(self, setup: S) -> str: ...  # sizes of a setup, in one line
     def learn(self, setup: S, training: Training) -> O: ...  # with several seeds, keeping one
-    def postfix(self, figures: Mapping[str, np.ndarray]) -> dict[str, str]: ...  # newest metrics
-    def summary(self, outcome: O) -> Result: ...  # the contents of ``result.json``
+    def postfix(self, metrics: Mapping[str, np.ndarray]) -> dict[str, str]: ...  # newest metrics
+    def summary(self, outcome: O) -> Record: ...  # the contents of ``result.json``
     def save(self, out: Path, outcome: O) -> None: ...  # writes the policy into a directory
     def task_pictures(self, setup: S) -> list[Picture]: ...  # those that need no outcome
     def pictures(self, outcome: O) -> list[Picture]: ...
-    def live(self, outcome: O) -> Sequence[Explorer | TooLarge | Curves]: ...  # of the report
+    def live(self, outcome: O) -> Sequence[Explorer | Curves]: ...  # of the report
 
 
 SomeJob: TypeAlias = Job[Any, Any, Any]  # of a kind that a task file decides

@@ -6,20 +6,21 @@ Heavy modules are imported inside functions, so that the command's first line co
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, cast
 
 from jaxltl.app.compilation import float64
-from jaxltl.app.protocols import Job, LearningTask, SomeJob, O, S, T, Training
+from jaxltl.app.protocols import Job, O, S, SomeJob, T, Training
 from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
@@ -28,8 +29,15 @@ if TYPE_CHECKING:
 
     from jaxltl.app.processes import ProcessGroup
     from jaxltl.app.reports.drawing import Artist, Drawing, Picture
+    from jaxltl.app.reports.page import Part, Report
 
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
+_JOBS = {
+    "environment": "jaxltl.app.learn_environment",
+    "grounding": "jaxltl.app.grounding.job",
+    "todirl": "jaxltl.app.learn_todirl",
+    "mlirl": "jaxltl.app.learn",
+}
 
 Drawn = Callable[[], bytes]  # waits for a picture
 
@@ -42,20 +50,6 @@ class Options:
     seed: int  # seed, num_seeds: the first seed, and the number of seeds
     num_seeds: int
     again: bool = False  # whether a result, also of another task, is overwritten
-
-
-@dataclass(frozen=True)
-class Request:
-    """A run of a job."""
-
-    out: Path  # directory of results, in which an interrupted job leaves its checkpoint
-    options: Options
-    mark: str  # the job's fingerprint, which the checkpoint must have
-
-    @property
-    def checkpoint(self) -> Path:
-        """File from which an interrupted job resumes."""
-        return self.out / f"checkpoint-{self.mark}.npz"
 
 
 @dataclass(frozen=True)
@@ -81,21 +75,7 @@ def job_of(task_file: Path) -> SomeJob:
     """The kind of job that a task file describes."""
     from jaxltl.app.files.task import kind_of
 
-    if (kind := kind_of(task_file)) == "environment":
-        from jaxltl.app import learn_environment
-
-        return learn_environment
-    if kind == "grounding":
-        from jaxltl.app.grounding import job
-
-        return job
-    if kind == "todirl":
-        from jaxltl.app import learn_todirl
-
-        return learn_todirl
-    from jaxltl.app import learn
-
-    return learn
+    return cast("SomeJob", importlib.import_module(_JOBS[kind_of(task_file)]))
 
 
 def _precision(job: SomeJob) -> contextlib.AbstractContextManager[None]:
@@ -107,7 +87,7 @@ def check(task_file: Path) -> str:
     """Sizes of the problem of a task file, whose parts are all read and checked."""
     job = job_of(task_file)
     with _precision(job):
-        return job.describe(job.prepare(job.read_task(task_file), seed=0))
+        return job.describe(job.prepare(job.FILE.read(task_file), seed=0))
 
 
 def learn(task_file: Path, options: Options, console: Console) -> Finished | None:
@@ -116,7 +96,7 @@ def learn(task_file: Path, options: Options, console: Console) -> Finished | Non
     job = group.together(lambda: job_of(task_file))
     from jaxltl.app.job import fingerprint
 
-    task = group.together(lambda: job.read_task(task_file))
+    task = group.together(lambda: job.FILE.read(task_file))
     out = directory(options.out, task.name)
     with _precision(job):
         mark = fingerprint(task.digest, options.seed, options.num_seeds)
@@ -131,7 +111,8 @@ def learn(task_file: Path, options: Options, console: Console) -> Finished | Non
         )
         result = None if options.again else _finished(out, mark)
         before = group.sees(f"{out}/result.json", result is not None)
-        result = result or _run_job(job, task, Request(out, options, mark), console)
+        run = _Run(job, out, options, mark, console)
+        result = result or run.interruptible(task)
     if not group.is_first or result is None:
         return None
     return Finished(out, result, job.report.table(result), before)
@@ -175,8 +156,6 @@ def claim_directory(out: Path, name: str, content: bytes, again: bool) -> None:
     Raises:
       ValueError: it cannot be written to, or it has a result of another file and `again` is False.
     """
-    from jaxltl.core.files import atomic_write
-
     copy = make_directory(out) / name
     done = (out / "result.json").exists()
     if done and not again and not (copy.exists() and copy.read_bytes() == content):
@@ -184,8 +163,7 @@ def claim_directory(out: Path, name: str, content: bytes, again: bool) -> None:
             f"{str(out)!r} has the result of another file, or of this one before it was changed; "
             "choose another directory with --out, or overwrite it with --again."
         )
-    with atomic_write(copy) as file:
-        file.write(content)
+    write_files(out, [(name, content)])
 
 
 @contextlib.contextmanager
@@ -220,64 +198,124 @@ def locked(out: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def _run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
-    """Runs a job, and returns the contents of ``result.json``; None in all processes but the first."""
-    try:
-        with ExitStack() as held:
-            return _run(job, task, request, console, held)
-    except KeyboardInterrupt:
-        kept = "; the same command goes on from the last checkpoint"
-        console.say(f"interrupted{kept if request.checkpoint.exists() else ''}")
-        raise SystemExit(130) from None
+@dataclass(frozen=True)
+class _Run(Generic[T, S, O]):
+    """A run of a job into a directory of results."""
+
+    job: Job[T, S, O]
+    out: Path
+    options: Options
+    mark: str  # the job's fingerprint, which the checkpoint must have
+    console: Console
+
+    @property
+    def checkpoint(self) -> Path:
+        """File from which an interrupted job resumes."""
+        return self.out / f"checkpoint-{self.mark}.npz"
+
+    def interruptible(self, task: T) -> Result | None:
+        """The contents of ``result.json``; None in all processes but the first."""
+        try:
+            with ExitStack() as held:
+                return self._result(task, held)
+        except KeyboardInterrupt:
+            kept = "; the same command goes on from the last checkpoint"
+            self.console.say(f"interrupted{kept if self.checkpoint.exists() else ''}")
+            raise SystemExit(130) from None
+
+    def _result(self, task: T, held: ExitStack) -> Result | None:
+        from jaxltl.algos.common import checkpoint as files
+
+        start = time.perf_counter()
+        job, group, say, options = self.job, self.console.group, self.console.say, self.options
+        setup = group.together(lambda: job.prepare(task, options.seed))
+        say(job.describe(setup))
+        if group.mesh is not None:
+            say(spread(options.num_seeds, group.num_devices))
+        group.together(lambda: self._claim(task, held))
+        if group.sees(str(self.checkpoint), self.checkpoint.exists()):
+            say(f"going on from {self.checkpoint}")
+        group.sees(str(self.out), (self.out / "task.toml").exists())
+        with _progress_bar(task.learner.steps, shown=group.is_first) as bar:
+            early = job.task_pictures(setup) if group.is_first else []
+            pictures = [(p, self._begun(p)) for p in early]
+
+            def report(step: int, metrics: Mapping[str, np.ndarray]) -> None:
+                bar.set_description_str("learning", refresh=False)
+                bar.update(step - bar.n)
+                bar.set_postfix(job.postfix(metrics))
+
+            training = Training(
+                options.seed,
+                options.num_seeds,
+                report=report,
+                stage=bar.set_description_str,
+                checkpoint=self.checkpoint,
+                mesh=group.mesh,
+            )
+            outcome = job.learn(setup, training)
+            if not group.is_first:
+                return None
+            files.remove(self.checkpoint)
+            seconds = time.perf_counter() - start
+            bar.set_description_str("drawing")
+            pictures += [(p, self._begun(p)) for p in job.pictures(outcome)]
+            return self._write(outcome, seconds, pictures)
+
+    def _claim(self, task: T, held: ExitStack) -> None:
+        """Takes the directory of results; before the work, since it may not be writable."""
+        if self.console.group.is_first:
+            held.enter_context(locked(self.out))
+            claim_directory(self.out, "task.toml", task.path.read_bytes(), self.options.again)
+
+    def _begun(self, picture: Picture) -> Drawn:
+        """Begins a picture, unless it is drawn already."""
+        drawing: Drawing | bytes = picture.drawing or b""
+        if isinstance(drawing, bytes):
+            return lambda: drawing
+        return self.console.artist(drawing)
+
+    def _write(self, outcome: O, seconds: float, pictures: list[tuple[Picture, Drawn]]) -> Result:
+        from jaxltl.app.job import took
+
+        job, begin = self.job, self.console.artist
+        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
+        result = {**job.summary(outcome), **took(seconds), "fingerprint": self.mark}
+        job.save(self.out, outcome)
+        shown = [(picture, drawn()) for picture, drawn in pictures]
+        parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
+        write_results(self.out / "task.toml", job.report, result, parts, shown)
+        return result
 
 
-def _run(
-    job: Job[T, S, O], task: T, request: Request, console: Console, held: ExitStack
-) -> Result | None:
-    from jaxltl.algos.common import checkpoint as files
-
-    start = time.perf_counter()
-    group, begin, checkpoint = console.group, console.artist, request.checkpoint
-    setup = group.together(lambda: job.prepare(task, request.options.seed))
-    console.say(job.describe(setup))
-    if group.mesh is not None:
-        console.say(spread(request.options.num_seeds, group.num_devices))
-    group.together(lambda: _claim(request, task, group, held))
-    if group.sees(str(checkpoint), checkpoint.exists()):
-        console.say(f"going on from {checkpoint}")
-    group.sees(str(request.out), (request.out / "task.toml").exists())
-    with _progress_bar(task.learner.steps, shown=group.is_first) as bar:
-        early = job.task_pictures(setup) if group.is_first else []
-        pictures = [(p, _begun(begin, p)) for p in early]
-
-        def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
-            bar.set_description_str("learning", refresh=False)
-            bar.update(step - bar.n)
-            bar.set_postfix(job.postfix(figures))
-
-        training = Training(
-            request.options.seed,
-            request.options.num_seeds,
-            report=report,
-            stage=bar.set_description_str,
-            checkpoint=checkpoint,
-            mesh=group.mesh,
-        )
-        outcome = job.learn(setup, training)
-        if not group.is_first:
-            return None
-        files.remove(checkpoint)
-        outcome.seconds = time.perf_counter() - start
-        bar.set_description_str("drawing")
-        pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
-        return _write(job, outcome, request, pictures, begin)
+def write_results(
+    file: Path,
+    report: Report,
+    result: Result,
+    parts: Sequence[Part],
+    pictures: Sequence[tuple[Picture, bytes]],
+) -> None:
+    """Writes pictures, report and result beside the copy of the task or game file."""
+    page = report.page(result, parts, pictures, file.read_text())
+    content = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    write_files(
+        file.parent,
+        [
+            *((picture.name, svg) for picture, svg in pictures),
+            ("report.html", page.encode()),
+            # Last, so that its presence implies that all other files are complete.
+            ("result.json", content.encode()),
+        ],
+    )
 
 
-def _claim(request: Request, task: LearningTask, group: ProcessGroup, held: ExitStack) -> None:
-    """Takes the directory of results; before the work, since it may not be writable."""
-    if group.is_first:
-        held.enter_context(locked(request.out))
-        claim_directory(request.out, "task.toml", task.path.read_bytes(), request.options.again)
+def write_files(out: Path, files: Iterable[tuple[str, bytes]]) -> None:
+    """Writes files by name into a directory, in order and each atomically."""
+    from jaxltl.core.files import atomic_write
+
+    for name, content in files:
+        with atomic_write(out / name) as file:
+            file.write(content)
 
 
 def spread(num_seeds: int, num_devices: int) -> str:
@@ -297,12 +335,6 @@ def spread(num_seeds: int, num_devices: int) -> str:
     idle = f"; {enough} enough for that" if used < num_devices else ""
     noun = "devices" if num_devices > 1 else "device"
     return f"{num_seeds} seeds on {num_devices} {noun}, at most {most} on each{idle}"
-
-
-def _begun(begin: Artist, picture: Picture) -> Drawn:
-    """Begins a picture, unless it is drawn already."""
-    drawing: Drawing | bytes = picture.drawing or b""
-    return (lambda: drawing) if isinstance(drawing, bytes) else begin(drawing)
 
 
 @contextlib.contextmanager
@@ -342,31 +374,3 @@ def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
         finally:
             done.set()
             clock.join()
-
-
-def _write(
-    job: Job[T, S, O],
-    outcome: O,
-    request: Request,
-    pictures: list[tuple[Picture, Drawn]],
-    begin: Artist,
-) -> Result:
-    from jaxltl.core.files import atomic_write
-
-    out = request.out
-    live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
-    result = {**job.summary(outcome), "fingerprint": request.mark}
-    job.save(out, outcome)
-    shown = []
-    for picture, drawn in pictures:
-        shown.append((picture, drawn()))
-        with atomic_write(out / picture.name) as file:
-            file.write(shown[-1][1])
-    parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-    page = job.report.page(result, parts, shown, (out / "task.toml").read_text())
-    with atomic_write(out / "report.html") as file:
-        file.write(page.encode())
-    # Last, so that its presence implies that all other files are complete.
-    with atomic_write(out / "result.json") as file:
-        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
-    return result

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.app.files.game import GameFile, World, automaton_of, load_game, load_objective
+from jaxltl.app.files.game import (
+    GameFile,
+    StrategyTable,
+    World,
+    automaton_of,
+    load_game,
+    load_objective,
+)
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, make_monitor
@@ -82,6 +90,12 @@ class Synthesis:
         """``bool[S]``: the system wins the runs that start in a state of the world."""
         return np.asarray(self.winning.region)[self.nodes.start]
 
+    @functools.cached_property
+    def base(self) -> np.ndarray:
+        """``int[N']``: the node of each state of the restricted game."""
+        assert self.strategy is not None and self.restricted is not None
+        return np.asarray(self.strategy.base_state)[np.asarray(self.restricted.base_state)]
+
     @property
     def starts(self) -> np.ndarray:
         return np.flatnonzero(np.asarray(self.world.game.initial) > 0)
@@ -105,9 +119,11 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
     progress("strategy")
     strategy = restricted = strategy_verdict = moves = None
     if wins[initial].any():
-        method, bound = file.strategy.method, file.strategy.bound
+        table = file.strategy or StrategyTable()
         with errors_in(f"{file.path}: [strategy] "):
-            strategy = permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
+            strategy = permissive_strategy(
+                nodes.game, nodes.objective, method=table.method, bound=table.bound
+            )
         restricted = apply_strategy(strategy)
         strategy_verdict = check_strategy(nodes, strategy, restricted)
         moves = expected_moves(nodes, strategy, restricted)
@@ -235,7 +251,7 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
 
 def demand(found: Synthesis) -> None:
     """Raises ValueError if the file demands a strategy and the task is unrealizable."""
-    if found.file.demanded and found.strategy is None:
+    if found.file.strategy and found.strategy is None:
         where = found.world.describe(int(found.starts[0]))
         raise ValueError(
             f"{found.file.path}: [strategy] demands a strategy, but the task is unrealizable: the "

@@ -11,7 +11,7 @@ import jaxltl as jl
 from benchmarks.mistakes import losses
 from jaxltl.app import learn as job
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports.learn import remarks, table
+from jaxltl.app.reports.learn import report
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401
@@ -21,7 +21,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 def learned(path, seed=0):
     """The outcome of a task file, and its summary."""
-    setup = job.prepare(job.read_task(path), seed)
+    setup = job.prepare(job.FILE.read(path), seed)
     outcome = job.learn(setup, Training(seed, 1))
     return outcome, job.summary(outcome)
 
@@ -89,7 +89,7 @@ def test_one_demonstration_is_enough(fetched):
         "By the transition graph: from every initial state the policy satisfies the formula with "
         "probability 1, whatever the transition probabilities are. It takes only actions that "
         "preserve this.",
-    ) in remarks(result)
+    ) in report.remarks(result)
     *_, sure = bottoms(outcome.setup.model, kept_policy(outcome))
     start = int(outcome.setup.demonstrations.state[0, 0])
     assert sure[start, int(outcome.setup.model.initial_memory[start])]
@@ -276,16 +276,21 @@ def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
 )
 def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
     mean = {"value": 0.5, "lower": lower, "upper": upper}
-    solved = {"mean": mean, "minimum": {"lower": 0.4}, "status": "CONVERGED", "num_starts": 1}
+    least = {"value": 0.4, "lower": 0.4, "upper": 0.5, "state": 0}
+    solved = {"mean": mean, "minimum": least, "status": "CONVERGED", "num_starts": 1}
     result = {
         "satisfaction": solved,
         "best_achievable": solved,
         "guarantee": {"asked": "best"},
-        "training": {"converged": True},
+        "training": {"converged": True, "steps": 1},
+        "neg_log_likelihood": 1.0,
+        "weights": {},
         "expected_steps": None,
         "impossible_starts": [],
+        "remark": None,
+        "trivial": None,
     }
-    ((found, text),) = remarks(result)
+    ((found, text),) = report.remarks(result)
     assert found == kind and words in text
 
 
@@ -307,7 +312,7 @@ def asking(guarantee):
 
 
 def prepared(path):
-    return job.prepare(job.read_task(path), 0)
+    return job.prepare(job.FILE.read(path), 0)
 
 
 @pytest.mark.slow
@@ -333,14 +338,14 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
     assert lost["from"] > lost["to"] + 0.01
     counts = np.asarray(setup.problem.counts)
     assert counts.sum() == 3 and counts[4, start, 0] == 0
-    texts = [text for kind, text in remarks(result) if kind == "note"]
+    texts = [text for kind, text in report.remarks(result) if kind == "note"]
     assert texts == [
         "1 of 5 demonstrated steps lowers the maximal satisfaction probability and was left out; first at "
         f"row 2, column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}.",
         "1 of 5 demonstrated steps comes after the formula was lost, or after a mistake left the best "
         "probability, and was not used.",
     ]
-    (good,) = (text for kind, text in remarks(result) if kind == "good")
+    (good,) = (text for kind, text in report.remarks(result) if kind == "good")
     assert good.startswith("By construction no policy has a greater satisfaction probability")
     value, _ = evaluate(model, kept_policy(outcome))
     np.testing.assert_allclose(value, best, rtol=1e-9, atol=1e-15)
@@ -413,7 +418,7 @@ def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  
     )
     _, result = learned(path)
     assert result["guarantee"]["left_out"]["to"] == 1
-    (text,) = (text for kind, text in remarks(result) if kind == "note")
+    (text,) = (text for kind, text in report.remarks(result) if kind == "note")
     assert text == (
         "1 of 2 demonstrated steps leads away from the goal and back, which violates the formula "
         "if repeated for ever, and was left out; first at row 1, column 1 (demonstration 1, step "
@@ -433,7 +438,7 @@ def test_a_demonstrated_mistake_is_weighed_or_optimal_actions_are_mixed_in(write
     value, _ = evaluate(outcome.setup.model, kept_policy(outcome))
     assert at_starts(outcome.setup.model, value, "worst")[0] == pytest.approx(found["attained"])
     assert np.isfinite(result["neg_log_likelihood"])
-    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    (text,) = (text for kind, text in report.remarks(result) if kind == "good")
     assert text.startswith("Asked for 0.9000 from the worst initial state, certified 0.9")
     assert found["share"] == 0 or text.endswith("mixed into the likeliest policy.")
 
@@ -445,10 +450,10 @@ def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa:
     assert result["guarantee"]["share"] == 1 and result["guarantee"]["attained"] == 1
     assert result["neg_log_likelihood"] is None  # a demonstrated step is never taken
     never = result["guarantee"]["never"]
-    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    (text,) = (text for kind, text in report.remarks(result) if kind == "good")
     assert "the only policy found that attains it is one of optimal actions alone." in text
     assert never > 0 and f"It never takes {never} of the demonstrated steps" in text
-    shown_in = table(result)
+    shown_in = report.table(result)
     assert "negative log-likelihood  infinite" in shown_in and "unknown" not in shown_in
     _, sure = evaluate(outcome.setup.model, kept_policy(outcome))
     assert sure[3, int(outcome.setup.model.initial_memory[3])]
@@ -457,7 +462,7 @@ def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa:
 def test_a_weight_is_not_both_given_and_sought(write):  # noqa: F811
     path = write(asking(0.5), ("discount = 0.9", "discount = 0.9\nmu = 1"))
     with pytest.raises(ValueError, match=r"leave mu out of \[learner\]"):
-        job.read_task(path)
+        job.FILE.read(path)
 
 
 @pytest.mark.parametrize("asked", ['"best"', '"none"', "0.5"])

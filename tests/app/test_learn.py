@@ -9,9 +9,9 @@ import pytest
 from jaxltl.algos import mlirl
 from jaxltl.algos.mlirl import features
 from jaxltl.app import learn
-from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports.learn import remarks
+from jaxltl.app.reports.learn import report
 from tests.app.test_task import write  # noqa: F401
 
 
@@ -19,7 +19,7 @@ from tests.app.test_task import write  # noqa: F401
 @pytest.mark.parametrize("optimizer", ["lbfgs", "adam", "lion"])
 def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
     """Whether or not the last evaluation was at them, before the first step too."""
-    setup = learn.prepare(read_task(write()), 0)
+    setup = learn.prepare(MlirlFile.read(write()), 0)
     problem = setup.problem
     hparams = mlirl.Hparams(discount=0.9, optimizer=optimizer)
     state = mlirl.init(jax.random.key(0), problem, hparams)
@@ -38,8 +38,8 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
 
 def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811
     monkeypatch.setattr(features, "expected_steps", lambda *_: None)
-    setup = learn.prepare(read_task(write()), 0)
+    setup = learn.prepare(MlirlFile.read(write()), 0)
     assert "nearer" not in setup.features.names
     outcome = learn.learn(setup, Training(0, 1))
-    notes = [text for kind, text in remarks(learn.summary(outcome)) if kind == "note"]
+    notes = [text for kind, text in report.remarks(learn.summary(outcome)) if kind == "note"]
     assert [text for text in notes if text.startswith("The feature nearer is left out")]

@@ -14,7 +14,7 @@ from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.files.task import kind_of
-from jaxltl.app.files.task_environment import read_task
+from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.cli import main
 from jaxltl.core.environments.task_environment import task_tables
 from jaxltl.core.values.evaluation.evaluation import evaluate
@@ -187,7 +187,7 @@ def test_the_written_policy_does_what_the_result_says(learned):
 @pytest.mark.slow
 def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     path, out, _ = learned
-    world = load_environment(read_task(path))
+    world = load_environment(EnvironmentFile.read(path))
     here = tmp_path / "policy.npz"
     arrays = arrays_of(out / "policy.npz")
     assert arrays["task"].item() == path.read_text()
@@ -212,7 +212,11 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     for given, message in (
         ({"environment": 3}, "environment is int; give one of make_environment"),
         (
-            {"environment": load_environment(read_task(path)).replace(propositions=("a", "b"))},
+            {
+                "environment": load_environment(EnvironmentFile.read(path)).replace(
+                    propositions=("a", "b")
+                )
+            },
             r"task.toml: \[task\] formula: .*'goal'",
         ),
     ):
@@ -423,15 +427,15 @@ def test_labels_and_limits_of_the_file(write):
         ("!pit U goal", "F goal & F one"),
     )
     assert kind_of(path) == "environment"
-    found = load_environment(read_task(path))
+    found = load_environment(EnvironmentFile.read(path))
     assert found.propositions == ("goal", "one") and found.horizon == 5
 
 
 def test_a_fingerprint_changes_with_the_function(write, tmp_path):
     path = write()
-    before = read_task(path).digest
+    before = EnvironmentFile.read(path).digest
     (tmp_path / "own.py").write_text(WORLD + "\n")
-    assert read_task(path).digest != before
+    assert EnvironmentFile.read(path).digest != before
 
 
 @pytest.mark.slow
@@ -494,7 +498,7 @@ def test_the_page_in_a_browser(learned, browser, tmp_path, width):  # noqa: F811
 def test_rewards_are_shaped_where_it_changes_no_optimum(write, task, learner, shaped, discounts):
     formula = 'formula = "!pit U goal"'
     made = write((formula, f"{formula}\n{task}"), ("[ppo]", f"[ppo]\n{learner}"))
-    setup = job.prepare(read_task(made), 0)
+    setup = job.prepare(EnvironmentFile.read(made), 0)
     tables = task_tables(setup.environment)
     assert bool(np.any(tables.potential)) == shaped
     open_ = np.asarray(tables.verdict) == 0
@@ -507,6 +511,9 @@ def test_rewards_are_shaped_where_it_changes_no_optimum(write, task, learner, sh
 def test_rewards_of_whole_episodes_are_not_shaped(write):
     formula = 'formula = "!pit U goal"'
     setup = job.prepare(
-        read_task(write(CCE, ('"ppo"', '"cce"'), (formula, f"{formula}\ndiscount = 0.9"))), 0
+        EnvironmentFile.read(
+            write(CCE, ('"ppo"', '"cce"'), (formula, f"{formula}\ndiscount = 0.9"))
+        ),
+        0,
     )
     assert not np.any(task_tables(setup.environment).potential)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.app.files.task_grounding import read_task
+from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.grounding import job
 from jaxltl.app.protocols import Training
 from jaxltl.app.run_job import job_of
@@ -49,7 +49,7 @@ def write(tmp_path):
 
 
 def outcome_of(path, seed=0):
-    return job.learn(job.prepare(read_task(path), seed), Training(seed, 1))
+    return job.learn(job.prepare(GroundingFile.read(path), seed), Training(seed, 1))
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_bad_input_is_refused(write, old, new, message):
     files = {"x_csv": seen(3), "y_csv": seen(4, "0.5"), "z_csv": seen(4, "?")}
     path = write(TEXT, (old, new), **files)
     with pytest.raises(ValueError, match=message):
-        job.prepare(read_task(path), 0)
+        job.prepare(GroundingFile.read(path), 0)
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import jaxltl as jl
 from jaxltl.app import learn_todirl
 from jaxltl.app.files.scenes import cell_observations, load_automata, load_scenes
 from jaxltl.app.files.task import kind_of
-from jaxltl.app.files.task_todirl import read_task
-from jaxltl.app.reports import learn_todirl as report_todirl
+from jaxltl.app.files.task_todirl import TodirlFile
+from jaxltl.app.reports.learn_todirl import report as report_todirl
 from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.envs import temporal_gridworld
@@ -138,7 +138,7 @@ def write_files(place):
 
 def test_a_task_is_read(write):
     path = write()
-    task = read_task(path)
+    task = TodirlFile.read(path)
     assert kind_of(path) == "todirl"
     assert task.label_on == "exit" and task.memory == task.formula and task.is_colored
     judge, memory = load_automata(task)
@@ -163,7 +163,7 @@ def test_kinds_slip_and_maps_in_the_task_file(write):
         ),
         ("(!o2 & !ob) U (o1 & (!ob U o2))", "!z U (x & (!z U y))"),
     )
-    task = read_task(path)
+    task = TodirlFile.read(path)
     training, test = load_scenes(task, load_automata(task)[0])
     assert training[0].name == "map 1" and training[0].mdp.propositions == ("x", "y", "z")
     assert training[0].mdp.num_successors == test[0].mdp.num_successors == 3
@@ -171,10 +171,10 @@ def test_kinds_slip_and_maps_in_the_task_file(write):
 
 
 def test_the_digest_covers_named_files(write, tmp_path):
-    first = read_task(write()).digest
+    first = TodirlFile.read(write()).digest
     (tmp_path / "world.txt").write_text("margin: 1\nwwww\nwbbw\nwwww\n")
-    assert read_task(tmp_path / "task.toml").digest != first
-    assert read_task(write()).digest == first
+    assert TodirlFile.read(tmp_path / "task.toml").digest != first
+    assert TodirlFile.read(write()).digest == first
 
 
 def test_what_is_seen_on_a_text_map():
@@ -212,7 +212,7 @@ def test_what_is_seen_on_a_text_map():
 )
 def test_mistakes_in_the_task_file(write, replacement, message):
     with pytest.raises(ValueError, match=message):
-        read_task(write(replacement))
+        TodirlFile.read(write(replacement))
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_mistakes_in_the_task_file(write, replacement, message):
 )
 def test_mistakes_in_the_worlds(write, tmp_path, replacement, message):
     (tmp_path / "another.txt").write_text("o1: 9 white\nwwww\nwbbw\nwwww\n")
-    task = read_task(write(replacement))
+    task = TodirlFile.read(write(replacement))
     with pytest.raises(ValueError, match=message):
         learn_todirl.prepare(task, 0)
 
@@ -460,7 +460,7 @@ def test_the_probability_within_a_horizon():
 
 
 def test_the_example_is_sound():
-    task = read_task("examples/in_order.toml")
+    task = TodirlFile.read("examples/in_order.toml")
     training, test = load_scenes(task, load_automata(task)[0])
     world = temporal_gridworld.training_world(0)
     assert np.array_equal(training[0].colored.colors, world.colors) and len(test) == 20

@@ -9,9 +9,9 @@ import pytest
 import jaxltl as jl
 from jaxltl.app.certify import guaranteed
 from jaxltl.app.files.demonstrations import load_demonstrations
-from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import load_world
-from jaxltl.app.reports.learn import remarks
+from jaxltl.app.reports.learn import report
 from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.models.product import product
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
@@ -66,7 +66,7 @@ def write(tmp_path):
 
 
 def test_the_world_is_what_was_counted(write):
-    task = read_task(write())
+    task = MlirlFile.read(write())
     world = load_world(task.path, task.world)
     assert world.logged.states == ("dock", "goal", "pit")
     assert world.actions == ("any", "ledge", "ramp", "rest") or len(world.actions) == 4
@@ -86,7 +86,7 @@ def test_the_world_is_what_was_counted(write):
 
 def test_names_that_are_numbers(write):
     """A state of a demonstration is the one of that name, not of that place."""
-    task = read_task(
+    task = MlirlFile.read(
         write(
             ("dock", "12"),
             ('"pit"]', '"5"]'),
@@ -106,7 +106,7 @@ def test_names_that_are_numbers(write):
 @pytest.mark.parametrize("method", ["anytime", "weissman"])
 def test_what_is_guaranteed_of_a_policy(write, label_on, method):
     """Of the best it is what is learned of the log, and of one more timid it is less."""
-    task = read_task(write(("[task]", f'method = "{method}"\n[task]')))
+    task = MlirlFile.read(write(("[task]", f'method = "{method}"\n[task]')))
     world = load_world(task.path, task.world)
     prod = product(world.mdp, task.formula, label_on=label_on)
     best = optimal_satisfaction(prod)
@@ -233,22 +233,22 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     robot = jl.io.load_policy(out / "policy.npz").controller()
     robot.start("dock")
     assert robot.policy.actions[robot.act()] in ("ramp", "ledge")
-    before = read_task(path).digest
+    before = MlirlFile.read(path).digest
     (tmp_path / "log.csv").write_text(LOG.replace("900", "901"))
-    assert read_task(path).digest != before
+    assert MlirlFile.read(path).digest != before
     # Where the graph is what was logged, the page says so.
     found["satisfaction"]["minimum"]["lower"] = 1
-    ((kind, told),) = [x for x in remarks(found) if "transition graph" in x[1]]
+    ((kind, told),) = [x for x in report.remarks(found) if "transition graph" in x[1]]
     assert kind == "note" and told.startswith("By the log's transition graph: ")
     found["guarantee"] |= {"asked": 0.5, "attained": 0.6, "share": 0, "weight": 0}
-    ((kind, told),) = [x for x in remarks(found) if "sked for" in x[1]]
+    ((kind, told),) = [x for x in report.remarks(found) if "sked for" in x[1]]
     assert kind == "note" and told.startswith("If the log's frequencies were the truth: asked for")
 
 
 def test_what_the_log_never_showed_is_taken_for_impossible_or_not(write):
     """By the graph that was seen the goal is sure; if anything is possible it is not."""
     for graph, low, high in (("seen", 1 - 1e-6, 1), ("complete", 0.9, 0.999)):
-        task = read_task(
+        task = MlirlFile.read(
             write(
                 ('graph = "seen"', f'graph = "{graph}"'),
                 log=LOG.replace("ramp,pit,100", "ramp,goal,1"),

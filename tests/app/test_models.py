@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxltl.app.files.game import load_game, read_game
+from jaxltl.app.files.game import GameFile, load_game
 from jaxltl.app.files.models import read_padded
-from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.product import product
@@ -60,7 +60,7 @@ def task(tmp_path):
 @pytest.mark.parametrize("name", ["m.umb", "m.umb.xz", "m.drn", "m.tra", "m.pexp", "m.npz"])
 def test_a_model_in_any_format(tmp_path, task, name):
     write_model(tmp_path / name, MODEL)
-    read = read_task(task(name))
+    read = MlirlFile.read(task(name))
     world = load_world(read.path, read.world)
     assert sorted(world.actions) == ["go", "stay", "wait"]
     column = [world.actions.index(x) for x in ("wait", "go", "stay")]
@@ -72,16 +72,16 @@ def test_a_model_in_any_format(tmp_path, task, name):
 
 def test_what_stands_beside_a_file_is_part_of_the_task(tmp_path, task):
     write_model(tmp_path / "m.tra", MODEL)
-    before = read_task(task("m.tra")).digest
+    before = MlirlFile.read(task("m.tra")).digest
     labels = tmp_path / "m.lab"
     labels.write_text(labels.read_text().replace("goal", "gaol"))
-    assert read_task(task("m.tra")).digest != before
+    assert MlirlFile.read(task("m.tra")).digest != before
 
 
 def test_names_that_need_quotes(tmp_path, task):
     write_model(tmp_path / "m.umb", MODEL)
     text = TASK.replace("[task]", "initial = '!\"Red cell\" & !goal'\n[task]")
-    read = read_task(task("m.umb", text))
+    read = MlirlFile.read(task("m.umb", text))
     world = load_world(read.path, read.world)
     assert np.asarray(world.mdp.initial).tolist() == [1, 0, 0]
     prod = product(world.mdp, read.formula)
@@ -129,7 +129,7 @@ def test_a_game_is_for_synthesis(tmp_path, task):
     assert "m.umb' holds a game of two players, expected a model of one" in failure(
         "check", task("m.umb"))  # fmt: skip
     text = GAME.replace("TASK", "formula = '!\"Red cell\" U goal'")
-    world = load_game(read_game(task("m.umb", text)))
+    world = load_game(GameFile.read(task("m.umb", text)))
     assert np.asarray(world.game.system).tolist() == [True, False, True]
     result = run("synthesize", task("m.umb", text), "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.output

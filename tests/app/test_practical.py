@@ -11,7 +11,7 @@ from jaxltl.app import learn as job
 from jaxltl.app.practical import neg_log_likelihood, step_bound
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps as report
-from jaxltl.app.reports.learn import remarks, table
+from jaxltl.app.reports.learn import report as learn_report
 from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
@@ -99,7 +99,7 @@ def write(folder, text, formula, goals, task="", seed=0, detours=0.3):
 
 
 def learned(path):
-    setup = job.prepare(job.read_task(path), 0)
+    setup = job.prepare(job.FILE.read(path), 0)
     outcome = job.learn(setup, Training(0, 1))
     return outcome, job.summary(outcome)
 
@@ -179,22 +179,22 @@ def check_mixture(outcome, result):
 def test_the_report_has_both_numbers_and_what_relaxing_gives(harbour):
     _, _, result = harbour
     time = result["expected_steps"]
-    text = table(result)
+    text = learn_report.table(result)
     assert "at most 1.1 times those of the quickest optimal policy" in text
     for value in (time["learned"], time["quickest"], time["front"][1]["steps"]["value"]):
         assert f"{value:.4g}" in text
     assert "a share of" in text and "steps_factor in [task] sets the multiple" in text
-    assert not any("suffice" in text for _, text in remarks(result))
+    assert not any("suffice" in text for _, text in learn_report.remarks(result))
     (picture,) = report.pictures(time)
     assert picture.name == "steps.svg" and len(picture.drawing.arguments[0][""]) == 2
 
 
 def test_the_bound_can_be_switched_off_or_changed(harbour, tmp_path):
     path, outcome, _ = harbour
-    task = job.read_task(path)
+    task = job.FILE.read(path)
     assert (task.steps, task.steps_factor) == (None, 1.1)
     for line, factor in (("", 2), ('steps_factor = "none"', None), ("steps_factor = 5", 5.0)):
-        other = job.read_task(write(tmp_path, HARBOUR, "F a", "a", line))
+        other = job.FILE.read(write(tmp_path, HARBOUR, "F a", "a", line))
         assert other.steps_factor == factor
     setup = outcome.setup
     bound = step_bound(setup.model, setup.guarantee.actions, "best", "mean", None, None)
@@ -217,15 +217,15 @@ def test_the_bound_can_be_switched_off_or_changed(harbour, tmp_path):
 def test_mistakes_name_the_fix(tmp_path, line, message):
     path = write(tmp_path, HARBOUR, "F a & (!o U a)", "a", line)
     with pytest.raises(ValueError, match=message):
-        job.prepare(job.read_task(path), 0)
+        job.prepare(job.FILE.read(path), 0)
 
 
 def test_safety_formulas_have_no_steps(tmp_path):
     path = write(tmp_path, HARBOUR, "G !o", "a", "guarantee = { probability = 0.9, steps = 9 }")
     with pytest.raises(ValueError, match="leave steps out"):
-        job.prepare(job.read_task(path), 0)
+        job.prepare(job.FILE.read(path), 0)
     path = write(tmp_path, HARBOUR, "G !o", "a")
-    assert job.prepare(job.read_task(path), 0).bound is None
+    assert job.prepare(job.FILE.read(path), 0).bound is None
 
 
 @pytest.mark.parametrize("probability", [0.3, 0.8])

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.app import learn_environment as job
-from jaxltl.app.files.task_environment import read_task
+from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.app.reports import proof
 from jaxltl.cli import main
 from jaxltl.core.environments import make_agent
@@ -41,7 +41,7 @@ def test_a_task_file_learns_and_proves_and_certify_proves_the_saved_policy(tmp_p
 
 @pytest.mark.slow
 def test_a_refuted_policy_comes_with_a_run():
-    setup = job.prepare(read_task(EXAMPLE), 0)
+    setup = job.prepare(EnvironmentFile.read(EXAMPLE), 0)
     upwards = make_agent(lambda seen, key: jnp.array([0.0, 1.0]) + 0 * seen.world)
     lines = []
     found = job.prove(setup, upwards, "G !rock", lines.append)
@@ -65,7 +65,7 @@ def test_bounds_are_printed_rounded_outward():
 
 
 def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():
-    setup = job.prepare(read_task(EXAMPLE), 0)
+    setup = job.prepare(EnvironmentFile.read(EXAMPLE), 0)
     assert setup.dynamics is not None and setup.acts == "likeliest"
 
 
@@ -73,7 +73,7 @@ def test_a_proof_needs_dynamics(tmp_path):
     text = EXAMPLE.with_name("flat_world.toml").read_text() + "\n[proof]\nthreshold = 0.9\n"
     (tmp_path / "task.toml").write_text(text)
     with pytest.raises(ValueError, match=r"\[proof\] is for dynamics"):
-        read_task(tmp_path / "task.toml")
+        EnvironmentFile.read(tmp_path / "task.toml")
 
 
 WORLD = 'dynamics = "shuttle.py:make"'
@@ -101,7 +101,7 @@ def test_refused_task_files(tmp_path, change, message):
     (tmp_path / "shuttle.py").write_text(EXAMPLE.with_suffix(".py").read_text())
     (tmp_path / "task.toml").write_text(EXAMPLE.read_text().replace(*change))
     with pytest.raises(ValueError, match=message):
-        job.prepare(read_task(tmp_path / "task.toml"), 0)
+        job.prepare(EnvironmentFile.read(tmp_path / "task.toml"), 0)
 
 
 def test_an_environment_that_is_dynamics_is_refused(tmp_path):
@@ -109,4 +109,4 @@ def test_an_environment_that_is_dynamics_is_refused(tmp_path):
     (tmp_path / "shuttle.py").write_text(EXAMPLE.with_suffix(".py").read_text())
     (tmp_path / "task.toml").write_text(text)
     with pytest.raises(ValueError, match="returns dynamics; write dynamics = "):
-        job.prepare(read_task(tmp_path / "task.toml"), 0)
+        job.prepare(EnvironmentFile.read(tmp_path / "task.toml"), 0)

@@ -16,9 +16,8 @@ from jaxltl.app.reports import explorer as exploring
 from jaxltl.app.reports.drawing import Picture, draw, drawing
 from jaxltl.app.reports.explorer import (
     START,
+    Explorer,
     Layer,
-    TooLarge,
-    View,
     curves,
     demonstrated_runs,
     learned_runs,
@@ -77,8 +76,8 @@ def runs():
 
 def made(**options):
     options = {"place": CELLS, "actions": ACTIONS, "label": "probability", "size": 12} | options
-    view = View(name="policy", title="Learned policy", caption="A caption", **options)
-    return exploring.explorer(view, MODEL.automaton, layers(), runs())
+    texts = {"name": "policy", "title": "Learned policy", "caption": "A caption"}
+    return Explorer(automaton=MODEL.automaton, layers=layers(), runs=runs(), **texts, **options)
 
 
 def page(*parts, remarks=()):
@@ -227,7 +226,7 @@ def test_a_model_without_a_map_and_a_marked_step():
 def test_what_is_too_large_is_said_and_shown_as_a_picture(monkeypatch):
     monkeypatch.setattr(exploring, "MOST_CELLS", 30)
     part = made()
-    assert isinstance(part, TooLarge)
+    assert part.too_large and not part.drawings
     text = page(part)
     assert "12 states by 3 maps" in text and "As a picture" in text and "data:image" in text
 

@@ -29,7 +29,7 @@ def check_case(case, place, monkeypatch):
             "_likelihood_and_policy",
             counted(job._likelihood_and_policy, evaluations),
         )
-        setup = job.prepare(job.read_task(write(case, case.probability, place)), 0)
+        setup = job.prepare(job.FILE.read(write(case, case.probability, place)), 0)
         outcome = job.learn(setup, Training(0, 1))
     assert len(runs) <= 2 and len(evaluations) <= job._EVALUATIONS
     assert outcome.attempt.attained >= case.probability
@@ -41,7 +41,7 @@ def check_case(case, place, monkeypatch):
 def test_where_no_reward_attains_a_probability_none_is_searched(tmp_path):
     """A patrol: a softmax policy enters the river at some time."""
     patrol = next(x for x in cases(8) if str(x.text["formula"]).startswith("G"))
-    setup = job.prepare(job.read_task(write(patrol, patrol.probability, tmp_path)), 0)
+    setup = job.prepare(job.FILE.read(write(patrol, patrol.probability, tmp_path)), 0)
     available = np.asarray(setup.model.available)
     uniform, counts = available / available.sum(-1, keepdims=True), np.zeros(available.shape)
     best = np.eye(available.shape[-1])[np.asarray(setup.guarantee.best.policy)]

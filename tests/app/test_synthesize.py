@@ -8,7 +8,7 @@ import pytest
 
 from jaxltl import plot
 from jaxltl.app import synthesize as synthesis
-from jaxltl.app.files.game import load_game, read_game
+from jaxltl.app.files.game import GameFile, load_game
 from jaxltl.app.reports import synthesize as report
 from jaxltl.app.reports.synthesize import play_explorer
 from jaxltl.io.policies import load_policy
@@ -152,7 +152,7 @@ def test_the_written_strategies_are_policies(won, lost):
     """Both players' files, loaded and played in the world alone."""
     rng = np.random.default_rng(2)
     for (_, _, out), name, mover in ((won, "strategy", 1), (lost, "counter_strategy", 0)):
-        world = load_game(read_game(out / "game.toml")).game
+        world = load_game(GameFile.read(out / "game.toml")).game
         collides = np.asarray(world.label)[:, world.propositions.index("collision")]
         robot = load_policy(out / f"{name}.npz").controller()
         assert robot.policy.num_states == world.num_states and robot.policy.actions[0] == "up"
@@ -283,15 +283,15 @@ def test_chance_may_be_an_adversary(arrays, tmp_path):
         probability=[[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]],
         actions=["try"],
     )
-    found = synthesis.synthesize(read_game(path))
+    found = synthesis.synthesize(GameFile.read(path))
     result = report.summary(found, 0.0)
     assert result["outcome"] == "realizable" and result["strategy"]["confirmed"]
-    assert "wins almost surely from 1 of 1" in report.table(result, found)
+    assert "wins almost surely from 1 of 1" in report.report_of(found).table(result)
     path.write_text(path.read_text() + 'chance = "adversarial"\n')
-    found = synthesis.synthesize(read_game(path))
+    found = synthesis.synthesize(GameFile.read(path))
     result = report.summary(found, 0.0)
     assert result["outcome"] == "unrealizable" and report.is_confirmed(result)
-    printed = report.table(result, found)
+    printed = report.report_of(found).table(result)
     assert "wins surely from 0 of 1" in printed and "2     chance" in printed
     assert "steps 0 to 2 repeat for ever, and violate the objective" in printed
 
@@ -324,7 +324,7 @@ def test_the_page_says_and_plays_what_was_found(won, lost):
 
 def test_a_play_of_the_strategy_is_one(tmp_path):
     (tmp_path / "game.toml").write_text(SQUARE)
-    found = synthesis.synthesize(read_game(tmp_path / "game.toml"))
+    found = synthesis.synthesize(GameFile.read(tmp_path / "game.toml"))
     part = play_explorer(found)
     (run,), game = part.runs, found.world.game
     successor = np.asarray(game.mdp.successor)
@@ -342,13 +342,13 @@ def test_a_play_of_the_strategy_is_one(tmp_path):
 
 
 def test_the_examples_are_sound():
-    robots = synthesis.synthesize(read_game("examples/robots.toml"))
+    robots = synthesis.synthesize(GameFile.read("examples/robots.toml"))
     result = report.summary(robots, 0.0)
     # The dissertation's table 5 for N = 4.
     strategy = result["strategy"]
     assert strategy["maximal"] and strategy["confirmed"] and result["outcome"] == "realizable"
     assert (strategy["num_states"], strategy["num_system_moves"]) == (432, 760)
-    patrol = load_game(read_game("examples/patrol.toml"))
+    patrol = load_game(GameFile.read("examples/patrol.toml"))
     assert patrol.game.num_states == 512
     assert {"system_b", "environment_a"} <= set(patrol.game.propositions)
 
@@ -360,11 +360,11 @@ def test_a_picture_for_each_memory_of_a_strategy(tmp_path):
         'assumptions = ["environment_a & !system_b", "environment_b"]',
     )
     (tmp_path / "game.toml").write_text(text)
-    found = synthesis.synthesize(read_game(tmp_path / "game.toml"))
+    found = synthesis.synthesize(GameFile.read(tmp_path / "game.toml"))
     assert found.strategy is not None and not found.strategy.maximal
     titles = [axes.get_title(loc="left") for axes in report._moves_picture(found, None).axes]
     assert titles == ["towards system_a", "towards system_b"]
-    names = [name for name, _ in report.pictures(found)]
+    names = [picture.name for picture, _ in report.pictures(found)]
     assert names == ["region.svg", "moves.svg"]
 
 
@@ -376,7 +376,7 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
     monkeypatch.setattr(
         plot, "game_region", lambda *a, **k: shown.append(k["environment"]) or real(*a, **k)
     )
-    report.pictures(synthesis.synthesize(read_game(tmp_path / "game.toml")))
+    report.pictures(synthesis.synthesize(GameFile.read(tmp_path / "game.toml")))
     assert shown == [[0, 1, 2]]
 
 
@@ -519,11 +519,11 @@ def test_methods_that_do_not_fit(arrays, tmp_path):
 
 def test_the_expected_moves_until_acceptance_are_certified(arrays):
     """One move to the label, and one that reads it."""
-    found = synthesis.synthesize(read_game(arrays("F bad")))
+    found = synthesis.synthesize(GameFile.read(arrays("F bad")))
     result = report.summary(found, 1.0)
     for upper in result["expected_moves"].values():
         assert 2 <= upper <= 2 + 1e-5
-    text = report.table(result, found)
+    text = report.report_of(found).table(result)
     assert "until acceptance at most 2 if drawn uniformly, 2 for any choice, certified" in text
 
 
@@ -532,11 +532,11 @@ def test_expected_moves_are_those_of_the_worst_choice(arrays):
     probability = [[[0.25, 0.75], [1.0, 0]], [[1.0, 0], [0, 0]], [[1.0, 0], [0, 0]]]
     successor = [[[2, 0], [2, 0]], [[0, 0], [0, 0]], [[2, 0], [0, 0]]]
     found = synthesis.synthesize(
-        read_game(arrays("F bad", probability=probability, successor=successor))
+        GameFile.read(arrays("F bad", probability=probability, successor=successor))
     )
     assert found.moves == pytest.approx((1 / 0.625 + 1, 5), rel=1e-5)
 
 
 def test_safety_has_no_expected_moves(arrays):
-    found = synthesis.synthesize(read_game(arrays("G !bad")))
+    found = synthesis.synthesize(GameFile.read(arrays("G !bad")))
     assert report.summary(found, 1.0)["expected_moves"] is None

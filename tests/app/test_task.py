@@ -13,8 +13,8 @@ import pytest
 import jaxltl
 from jaxltl.app import run_job
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
-from jaxltl.app.files.task import Task
-from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.schema import File
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -57,7 +57,7 @@ def write(tmp_path):
 
 
 def test_a_task_is_read(write):
-    task = read_task(write())
+    task = MlirlFile.read(write())
     world = load_world(task.path, task.world)
     assert task.name == "task" and task.label_on == "entry"
     assert world.cells.shape == (2, 3) and world.place(5) == "row 2, column 3"
@@ -67,13 +67,13 @@ def test_a_task_is_read(write):
 
 def test_states_and_action_numbers_from_zero(write):
     shown = {"demonstrations": [{"states": [3, 4], "actions": [3, "right"]}]}
-    task = read_task(write(shown=shown))
+    task = MlirlFile.read(write(shown=shown))
     assert load_demonstrations(task, load_world(task.path, task.world)).state.tolist() == [[3, 4]]
 
 
 def test_a_map_and_legend_from_a_file(write, tmp_path):
     (tmp_path / "map.txt").write_text("a b\nb a\n")
-    task = read_task(
+    task = MlirlFile.read(
         write(
             (
                 "map = '''\n. . r\nb . y\n'''",
@@ -87,11 +87,11 @@ def test_a_map_and_legend_from_a_file(write, tmp_path):
 
 
 def test_the_digest_covers_named_files(write):
-    first = read_task(write()).digest
+    first = MlirlFile.read(write()).digest
     other = {"demonstrations": [{"cells": [[2, 2]], "actions": ["right"]}]}
-    assert read_task(write(shown=other)).digest != first
-    assert read_task(write(("0.9", "0.8"))).digest != first
-    assert read_task(write()).digest == first
+    assert MlirlFile.read(write(shown=other)).digest != first
+    assert MlirlFile.read(write(("0.9", "0.8"))).digest != first
+    assert MlirlFile.read(write()).digest == first
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_the_digest_covers_named_files(write):
 )
 def test_mistakes_in_the_task_file(write, replacement, message):
     with pytest.raises(ValueError, match=message):
-        read_task(write(replacement))
+        MlirlFile.read(write(replacement))
 
 
 @pytest.mark.parametrize(
@@ -160,22 +160,22 @@ def test_mistakes_in_the_task_file(write, replacement, message):
 )
 def test_names_are_plain(write, name):
     with pytest.raises(ValueError, match=r"name = .*; it must be a plain name of letters, digits"):
-        read_task(write(("\n[world]", f'name = "{name}"\n[world]')))
+        MlirlFile.read(write(("\n[world]", f'name = "{name}"\n[world]')))
 
 
 @pytest.mark.parametrize("name", ["two goals", "-1_a.b", "Größe 3"])
 def test_plain_names_are_taken(write, name):
-    assert read_task(write(("\n[world]", f'name = "{name}"\n[world]'))).name == name
+    assert MlirlFile.read(write(("\n[world]", f'name = "{name}"\n[world]'))).name == name
 
 
 def test_a_learning_rate_of_an_optimizer_that_takes_one(write):
     given = 'discount = 0.9\noptimizer = "adam"\nlearning_rate = 0.1'
-    assert read_task(write(("discount = 0.9", given))).learner.learning_rate == 0.1
+    assert MlirlFile.read(write(("discount = 0.9", given))).learner.learning_rate == 0.1
 
 
 def test_a_missing_task_file(tmp_path):
     with pytest.raises(ValueError, match=r"the task file cannot be read: '.*none\.toml'"):
-        read_task(tmp_path / "none.toml")
+        MlirlFile.read(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_missing_task_file(tmp_path):
 )
 def test_mistakes_in_the_world(write, replacement, message):
     with pytest.raises(ValueError, match=message):
-        task = read_task(write(replacement))
+        task = MlirlFile.read(write(replacement))
         load_world(task.path, task.world)
 
 
@@ -236,7 +236,7 @@ def test_mistakes_in_the_world(write, replacement, message):
     ],
 )
 def test_mistakes_in_demonstrations(write, shown, message):
-    task = read_task(write(shown=shown))
+    task = MlirlFile.read(write(shown=shown))
     with pytest.raises(ValueError, match=message):
         load_demonstrations(task, load_world(task.path, task.world))
 
@@ -248,7 +248,7 @@ def _model_task(write, *more, **arrays):
         *more,
     )
     np.savez(path.parent / "m.npz", **arrays)
-    return read_task(path)
+    return MlirlFile.read(path)
 
 
 CHAIN = np.array([[[0.5, 0.5], [1, 0]], [[0, 1], [0, 1]]])
@@ -357,7 +357,7 @@ def simulate(task, model, key, best):
 @pytest.mark.parametrize("discount", ["discount = 0.9", ""])
 def test_synthetic_demonstrations_do_the_task(write, discount):
     synthetic = ('file = "shown.json"', f"synthetic = 5\n{discount}\nlength = 9")
-    task = read_task(write(synthetic))
+    task = MlirlFile.read(write(synthetic))
     world = load_world(task.path, task.world)
     model = product(world.mdp, task.formula)
     shown, dropped = simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
@@ -371,7 +371,7 @@ def test_synthetic_demonstrations_do_the_task(write, discount):
 @pytest.mark.slow
 def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
     synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 1")
-    task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
+    task = MlirlFile.read(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
     model = product(load_world(task.path, task.world).mdp, task.formula)
     with pytest.raises(
         ValueError, match=r"none of 5 synthetic rollouts satisfies the formula within 1 steps"
@@ -384,7 +384,7 @@ def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
 
 @pytest.mark.parametrize("runs", ["synthetic = 2000000000", "synthetic = 20\nlength = 2000000000"])
 def test_more_runs_than_memory_holds_are_refused(write, runs):
-    task = read_task(write(('file = "shown.json"', runs)))
+    task = MlirlFile.read(write(('file = "shown.json"', runs)))
     model = product(load_world(task.path, task.world).mdp, task.formula)
     with pytest.raises(ValueError, match=r"would take about .* GB; ask for fewer or shorter ones"):
         simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
@@ -392,7 +392,7 @@ def test_more_runs_than_memory_holds_are_refused(write, runs):
 
 def test_synthetic_runs_of_a_task_without_end(write):
     """They have the asked length, and what they have to visit they visit again and again."""
-    task = read_task(
+    task = MlirlFile.read(
         write(
             ('file = "shown.json"', "synthetic = 4\nlength = 12"),
             ('absorbing = ["y"]', "absorbing = []"),
@@ -405,10 +405,10 @@ def test_synthetic_runs_of_a_task_without_end(write):
         assert 2 not in states and {3, 5} <= set(states.tolist())
 
 
-def test_at_most_eight_files_pass_the_formula_on(write, monkeypatch):
+def test_at_most_nine_files_pass_the_formula_on(write, monkeypatch):
     """The text of the formula, or a task with it, from the file to the translation."""
     path, files = write(), set()
-    formula = read_task(path).formula
+    formula = MlirlFile.read(path).formula
 
     class Translated(Exception):
         pass
@@ -422,7 +422,7 @@ def test_at_most_eight_files_pass_the_formula_on(write, monkeypatch):
             found = [frame.f_locals.get(name) for name in names]
         else:
             found = [arg] if event == "return" else []
-        if any(isinstance(x, Task) or (isinstance(x, str) and x == formula) for x in found):
+        if any(isinstance(x, File) or (isinstance(x, str) and x == formula) for x in found):
             files.add(frame.f_code.co_filename)
 
     monkeypatch.setattr(sys.modules[product.__module__], "to_automaton", translate)
@@ -433,5 +433,5 @@ def test_at_most_eight_files_pass_the_formula_on(write, monkeypatch):
     finally:
         sys.setprofile(None)
     package = {Path(x).stem for x in files if Path(x).is_relative_to(Path(jaxltl.__file__).parent)}
-    # Eight with the modules that run these in `jaxltl learn`.
-    assert package == {"schema", "task_mlirl", "learn", "product", "ltl"}
+    # Nine with the modules that run these in `jaxltl learn`.
+    assert package == {"schema", "task", "task_mlirl", "learn", "product", "ltl"}

@@ -9,10 +9,11 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.app import learn_todirl as job
-from jaxltl.app.files.task_todirl import read_task
+from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.learn_todirl import remarks
+from jaxltl.app.reports.learn_todirl import report
+from jaxltl.app.reports.page import render_text
 from jaxltl.app.todirl.results import part_of
 from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
@@ -74,7 +75,7 @@ def write(tmp_path):
 
 
 def prepared(path, seed=0):
-    return job.prepare(read_task(path), seed)
+    return job.prepare(TodirlFile.read(path), seed)
 
 
 def own(setup, w):
@@ -310,7 +311,7 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     assert check_reached(outcome, 0.85, "mean") > 0
     assert outcome.learned.weight > 0 and result["guarantee"]["weight"] == outcome.learned.weight
     counted = result["training"]["worlds"] + result["test"]["worlds"][:2]
-    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    (text,) = (text for kind, text in report.remarks(result) if kind == "good")
     least = min(world["attained"] for world in counted)
     assert text.startswith(
         "Asked for 0.8500 in every world, also in new ones, on average over initial states; certified "
@@ -390,8 +391,9 @@ def test_steps_after_the_formula_is_lost_are_not_used(write, tmp_path, asked):
     setup = prepared(write(*changes, text=RISKY))
     (used,) = setup.demonstrations
     assert used.length.tolist() == [4] and setup.unused == 2
-    (remark,) = steps.unused({"unused": {"steps": setup.unused, "of": 6}})
-    assert remark[1].startswith("2 of 6 demonstrated steps come after the formula was lost")
+    lost = {"guarantee": {"unused": {"steps": setup.unused, "of": 6}}}
+    (remark,) = render_text("unused_remark.txt", result=lost)
+    assert remark.startswith("note: 2 of 6 demonstrated steps come after the formula was lost")
 
 
 @pytest.mark.slow

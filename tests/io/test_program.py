@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 import jaxltl as jl
 from jaxltl.app import solve as solving
-from jaxltl.app.files.game import load_game, read_game
+from jaxltl.app.files.game import GameFile, load_game
 from jaxltl.cli import main
 from jaxltl.io.prism.program import constants_of
 
@@ -156,6 +156,6 @@ def test_game_files_take_programs(tmp_path):
     (tmp_path / "g.prism").write_text(game)
     path = tmp_path / "g.toml"
     path.write_text('[game]\nmodel = "g.prism"\nconstants = "N=2"\n[task]\nformula = "F goal"\n')
-    world = load_game(read_game(path))
+    world = load_game(GameFile.read(path))
     system = np.asarray(world.game.system)
     assert (system.size, system.sum()) == (12, 6)  # x in 0, 1, 2 and y in 0, 1, at each turn

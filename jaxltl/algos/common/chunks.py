@@ -172,23 +172,6 @@ def _metrics_of(
     return jax.eval_shape(jax.jit(step), one[0], problem, one[1])[1]
 
 
-def trace_lanes(step: Step, state: PyTree, problem: PyTree, hparams: PyTree) -> None:
-    """Traces the step of :func:`run_in_chunks` with lanes, for which shapes of states suffice.
-
-    Of `step`, `problem` and `hparams` as there, and the `state` of N runs, or its shapes.
-
-    >>> from jaxltl.core import struct
-    >>> @struct.dataclass
-    ... class State:
-    ...     step: jax.Array
-    ...     x: jax.Array
-    >>> def step(state, problem, hparams):
-    ...     return State(state.step + 1, state.x * hparams), {"x": state.x}
-    >>> trace_lanes(step, State(jnp.zeros(2, jnp.int32), jnp.ones(2)), (), 0.5)
-    """
-    _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
-
-
 @cache  # compiled once for each step, so it must stay the same function
 def _progress_step(step: Step, keep: str) -> Step:
     """A step of :class:`Progress`, with rows of counts and metrics."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import off_map, read_bytes
 from jaxltl.app.files.task import SyntheticTable
-from jaxltl.app.files.task_mlirl import MlirlTask
+from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import World
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.construct.counts import listed
@@ -24,7 +24,7 @@ _STEP_BYTES = 128  # of a simulated step, measured while demonstrations are made
 _LARGEST_BYTES = 4e9
 
 
-def load_demonstrations(task: MlirlTask, world: World) -> Trajectories:
+def load_demonstrations(task: MlirlFile, world: World) -> Trajectories:
     """The demonstrations of a task's file; see :func:`read_demonstrations`."""
     assert task.demonstrations.file is not None
     return read_demonstrations(task.path.parent / task.demonstrations.file, world)

@@ -14,7 +14,6 @@ from typing import Annotated as Key
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.app.files import schema
 from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.schema import (
     Count,
@@ -124,25 +123,13 @@ class StrategyTable(Table):
 
 
 @table
-class GameFileSchema(File):
-    """Tables of a game file."""
+class GameFile(File):
+    """A checked game file."""
 
     KIND: ClassVar[str] = "the game file"
     game: Key[GameTable, "The game."]
     task: Key[TaskTable, "The objective of the system."]
     strategy: Key[StrategyTable | None, "Demands a strategy."] = None
-
-
-@dataclass(frozen=True)
-class GameFile:
-    """A checked game file."""
-
-    path: Path  # the file; `name` is its stem, unless the file gives one
-    name: str
-    game: GameTable  # game, task, strategy: the tables
-    task: TaskTable
-    strategy: StrategyTable
-    demanded: bool  # whether the file has a table [strategy]
 
 
 @dataclass(frozen=True)
@@ -162,15 +149,19 @@ class World:
         """Both robots' rows and columns from 1, or the state's number from 0."""
         if self.places is None:
             return {"state": int(state)}
-        count = len(self.places)
-        environment, system, _ = np.unravel_index(int(state), (count, count, 2))
         return {
             name: {"row": int(row) + 1, "column": int(column) + 1}
-            for name, (row, column) in (
-                ("system", self.places[system]),
-                ("environment", self.places[environment]),
+            for name, (row, column) in zip(
+                ("system", "environment"), self.places[list(self.robots(state))], strict=True
             )
         }
+
+    def robots(self, state: int) -> tuple[int, int]:
+        """The places of the system and of the environment in a state of a map."""
+        assert self.places is not None
+        count = len(self.places)
+        environment, system, _ = np.unravel_index(int(state), (count, count, 2))
+        return int(system), int(environment)
 
     def describe(self, state: int) -> str:
         where = self.where(state)
@@ -179,20 +170,6 @@ class World:
         return ", ".join(
             f"{name} in row {cell['row']}, column {cell['column']}" for name, cell in where.items()
         )
-
-
-def read_game(path: str | Path) -> GameFile:
-    """Checked contents of a game file; ValueError names the key and the fix."""
-    path = Path(path)
-    file, _ = schema.read_file(path, GameFileSchema)
-    return GameFile(
-        path=path,
-        name=file.name or path.stem,
-        game=file.game,
-        task=file.task,
-        strategy=file.strategy or StrategyTable(),
-        demanded=file.strategy is not None,
-    )
 
 
 def load_game(file: GameFile) -> World:

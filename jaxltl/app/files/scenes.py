@@ -12,7 +12,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_map
-from jaxltl.app.files.task_todirl import TodirlTask, WorldTable, map_file
+from jaxltl.app.files.task_todirl import TodirlFile, WorldTable, map_file
 from jaxltl.app.files.worlds import World, grid_options
 from jaxltl.app.wording import where
 from jaxltl.core.automata import Automaton, to_automaton
@@ -42,7 +42,7 @@ class Scene:
         return where(state, self.shape)
 
 
-def load_scenes(task: TodirlTask, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
+def load_scenes(task: TodirlFile, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
     """The training worlds and the test worlds."""
     test_maps = (task.test and task.test.maps) or []
     training = [_read_scene(task, "world", i, x) for i, x in enumerate(task.world.maps)]
@@ -70,7 +70,7 @@ def load_scenes(task: TodirlTask, judge: Automaton) -> tuple[list[Scene], list[S
     return training, test
 
 
-def _read_scene(task: TodirlTask, table: str, number: int, entry: str | dict[str, str]) -> Scene:
+def _read_scene(task: TodirlFile, table: str, number: int, entry: str | dict[str, str]) -> Scene:
     file = map_file(entry)
     name = f"map {number + 1}" if file is None else file
     with errors_in(f"{task.path}: [{table}] {name}: "):
@@ -157,7 +157,7 @@ def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> n
     return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)
 
 
-def _generate(task: TodirlTask, number: int, first: Scene, judge: Automaton) -> list[Scene]:
+def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> list[Scene]:
     table, colored = task.test, first.colored
     assert table is not None and colored is not None
     objects, obstacles = _objects(task.world), _obstacles(task.world)
@@ -195,7 +195,7 @@ def _generate(task: TodirlTask, number: int, first: Scene, judge: Automaton) -> 
 # --- automata -------------------------------------------------------------------------------
 
 
-def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
+def load_automata(task: TodirlFile) -> tuple[Automaton, Automaton]:
     """Automata of the formula and the memory, over the labels of all kinds of cells."""
     alphabet = _alphabet(task)
     judge = _translate(task, "[task] formula", task.formula, alphabet)
@@ -210,7 +210,7 @@ def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
     return judge, _translate(task, "[learner] memory", task.memory, alphabet)
 
 
-def _alphabet(task: TodirlTask) -> list[frozenset[str]]:
+def _alphabet(task: TodirlFile) -> list[frozenset[str]]:
     if task.world.legend is not None:
         shown = [frozenset(names) for names in task.world.legend.values()]
         return list(dict.fromkeys([frozenset(), *shown]))
@@ -220,7 +220,7 @@ def _alphabet(task: TodirlTask) -> list[frozenset[str]]:
 
 
 def _translate(
-    task: TodirlTask, place: str, text: str, alphabet: list[frozenset[str]]
+    task: TodirlFile, place: str, text: str, alphabet: list[frozenset[str]]
 ) -> Automaton:
     names = sorted(frozenset().union(*alphabet))
     with errors_in(f"{task.path}: {place}: "):
@@ -230,7 +230,7 @@ def _translate(
         return to_automaton(formula, letters=list(letters))
 
 
-def load_demonstrations(task: TodirlTask, scenes: Sequence[Scene]) -> list[Trajectories]:
+def load_demonstrations(task: TodirlFile, scenes: Sequence[Scene]) -> list[Trajectories]:
     """The demonstrations in each of the training worlds, from their files."""
     blank = (np.arange(x.mdp.num_states).reshape(x.shape).astype(str) for x in scenes)
     worlds = (World(x.mdp, cells, ACTIONS) for x, cells in zip(scenes, blank, strict=True))

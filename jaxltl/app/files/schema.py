@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import hashlib
 import math
 import re
@@ -22,6 +23,7 @@ from typing import (
     ClassVar,
     Literal,
     NamedTuple,
+    Self,
     TypeVar,
     Union,
     cast,
@@ -37,7 +39,6 @@ import attrs
 from jaxltl.core.validation import errors_in
 
 _Table = TypeVar("_Table", bound="Table")
-_File = TypeVar("_File", bound="File")
 LARGEST_INT = 2**31 - 1  # int32 of compiled loops
 
 
@@ -95,7 +96,8 @@ def key_name(field: attrs.Attribute[Any]) -> str:
 
 
 def _fields(schema: Any) -> tuple[attrs.Attribute[Any], ...]:
-    return attrs.fields(schema)
+    """The keys of a table: its fields of a type ``Key[...]``."""
+    return tuple(field for field in attrs.fields(schema) if get_origin(field.type) is Annotated)
 
 
 def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attribute[Any]]:
@@ -133,12 +135,35 @@ class Table:
 
 @table
 class File(Table):
-    """The tables of a file; a field that is a :class:`Table` is a table, others are keys."""
+    """A checked file; a field that is a :class:`Table` is a table, others are keys."""
 
     KIND: ClassVar[str] = "the task file"  # begins the error if it cannot be read
-    name: Key[
-        Name | None, "Name of the results' folder; default the file's own name.", '"two goals"'
-    ] = None
+    path: Path = Path()
+    raw: bytes = b""  # its content
+    name: Key[Name, "Name of the results' folder; default the file's own name.", '"two goals"'] = (
+        attrs.field(default=None)
+    )
+
+    @classmethod
+    def read(cls, path: str | Path, raw: bytes | None = None) -> Self:
+        """Checked content of a file, or of `raw`; ValueError names the key and the fix."""
+        path = Path(path)
+        data, content = read_toml(path, cls.KIND, raw)
+        found = convert(path, cls, data, raw=content)
+        if raw is None:
+            _ = found.digest  # raises errors of the files that it names
+        return found
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of the file and of the files that it names, in its directory."""
+        found = hashlib.sha256(self.raw)
+        for name in self.named_files():
+            found.update(read_bytes(self.path.parent / name, f"{self.path} names a file that"))
+        return found.hexdigest()
+
+    def named_files(self) -> Sequence[str]:
+        return ()
 
 
 # --- reading --------------------------------------------------------------------------------
@@ -151,12 +176,6 @@ def read_toml(path: Path, kind: str, raw: bytes | None = None) -> tuple[dict[str
         return tomllib.loads(raw.decode()), raw
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: this is not TOML: {error}") from None
-
-
-def read_file(path: Path, schema: type[_File]) -> tuple[_File, bytes]:
-    """A file as an instance of its schema, and its bytes."""
-    data, raw = read_toml(path, schema.KIND)
-    return convert(path, schema, data), raw
 
 
 def read_bytes(path: Path, kind: str) -> bytes:
@@ -176,14 +195,6 @@ def read_map(path: Path, given: str | Mapping[str, str]) -> str:
     )
 
 
-def digest(path: Path, raw: bytes, names: Iterable[str]) -> str:
-    """SHA-256 of the bytes of a file and of the files that it names, in its directory."""
-    found = hashlib.sha256(raw)
-    for name in names:
-        found.update(read_bytes(path.parent / name, f"{path} names a file that"))
-    return found.hexdigest()
-
-
 def off_map(shape: Sequence[int]) -> str:
     """End of an error about a cell that is not on a map."""
     return f"off the map, which has rows 1 to {shape[0]} and columns 1 to {shape[1]}."
@@ -192,7 +203,9 @@ def off_map(shape: Sequence[int]) -> str:
 # --- conversion -----------------------------------------------------------------------------
 
 
-def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str = "") -> _Table:
+def convert(
+    path: Path, schema: type[_Table], data: Mapping[str, Any], name: str = "", raw: bytes = b""
+) -> _Table:
     """Table of a file as an instance of its schema; ValueError for invalid or missing keys."""
     where = f"{path}: [{name}]" if name else f"{path}:"
     fields = {key_name(field): field for field in _fields(schema)}
@@ -217,6 +230,8 @@ def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str
     for key, field in fields.items():
         if key in data and (part := _table_of(field.type)):
             values[field.name] = convert(path, part, data[key], key)
+    if issubclass(schema, File):
+        values |= {"path": path, "raw": raw, "name": values.get("name") or path.stem}
     with errors_in(f"{where} "):
         return schema(**values)
 

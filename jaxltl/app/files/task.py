@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 from typing import Annotated as Key
 
 from jaxltl.app.files.schema import (
@@ -81,10 +80,16 @@ class GridTable(Table):
 
 
 @table
-class TaskTable(Table):
-    """``[task]``: the formula, and the guarantee."""
+class FormulaTable(Table):
+    """``[task]``: the formula."""
 
     formula: Key[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
+
+
+@table
+class TaskTable(FormulaTable):
+    """``[task]``: the formula, and the guarantee."""
+
     label_on: Key[
         Literal["entry", "exit"] | None,
         "Label read by a step: of the state entered (default with mlirl) or left (with todirl); "
@@ -121,11 +126,24 @@ class SyntheticTable(Table):
 
 
 @table
-class OptimizerTable(Table):
-    """Keys of ``[learner]`` of every method."""
+class LearnerTable(Table):
+    """``[learner]`` of any method."""
+
+    method: Key[str, "Learning algorithm."]
+    steps: Key[Count, "Steps of the learner."]
+
+
+@table
+class OptimizerTable(LearnerTable):
+    """Keys of ``[learner]`` of all methods of learning from demonstrations."""
 
     l2: Key[NonNegative | None, "Precision of the Gaussian prior on the parameters."] = None
     learning_rate: Key[NonNegative | None, "Step size of the optimizer."] = None
+
+    @property
+    def hides_formula(self) -> str | None:
+        """The key that hides the formula from the learner, if there is one."""
+        raise NotImplementedError
 
     def hyperparameters(self) -> Record:
         """The keys that have a value, but the method."""
@@ -133,65 +151,73 @@ class OptimizerTable(Table):
 
 
 @table
-class TaskFile(File):
-    """Tables common to task files of learning from demonstrations."""
+class FormulaFile(File):
+    """A task file of any method."""
 
+    task: Key[FormulaTable, "The formula."]
+    learner: Key[LearnerTable, "The learner."]
+
+    @property
+    def formula(self) -> str:
+        """Formula of linear temporal logic."""
+        return self.task.formula
+
+
+@table
+class TaskFile(FormulaFile):
+    """A task file of learning from demonstrations."""
+
+    LABEL_ON: ClassVar[str] = "entry"  # default of label_on
     task: Key[TaskTable, "The formula, and the guarantee."]
+    learner: Key[OptimizerTable, "The learner and its hyperparameters."]
+
+    @property
+    def label_on(self) -> str:
+        """The label that a step of the product reads, of its "entry" or "exit"."""
+        return self.task.label_on or self.LABEL_ON
+
+    @property
+    def guarantee(self) -> str | float:
+        """Either "best", "none" or a probability to certify."""
+        asked = self.task.guarantee or ("none" if self.learner.hides_formula else "best")
+        return asked["probability"] if isinstance(asked, dict) else asked
+
+    @property
+    def over(self) -> str:
+        """Initial states of a probability to certify, "mean" or "worst"."""
+        return self.task.over or "mean"
+
+    @property
+    def steps(self) -> float | None:
+        """Bound on the expected steps to satisfaction, if it is a number."""
+        asked = self.task.guarantee
+        return asked["steps"] if isinstance(asked, dict) else None
+
+    @property
+    def steps_factor(self) -> float | None:
+        """The same bound as a multiple of the quickest optimal policy's steps."""
+        factor = self.task.steps_factor
+        return None if factor == "none" or self.steps else float(factor or _STEPS_FACTOR)
+
+    def __attrs_post_init__(self) -> None:
+        guarantee, factor = self.guarantee, self.task.steps_factor
+        if self.learner.hides_formula and guarantee != "none":
+            raise ValueError(
+                f"[task] guarantee = {guarantee!r} needs a learner that sees the formula and has "
+                f"no horizon: leave out {self.learner.hides_formula}."
+            )
+        if self.task.over is not None and isinstance(guarantee, str):
+            raise ValueError("[task] over belongs to a guarantee that is a probability.")
+        if factor not in (None, "none") and (self.steps is not None or guarantee == "none"):
+            other = 'none, with guarantee = "none"' if self.steps is None else "steps in guarantee"
+            raise ValueError(
+                f"[task] steps_factor = {factor:g} bounds the steps, but there is {other}."
+            )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """A checked task file of learning from demonstrations."""
-
-    path: Path  # the file; `name` is its stem, unless the file gives one
-    name: str
-    formula: str  # of linear temporal logic
-    label_on: str  # which label a step of the product reads, "entry" or "exit"
-    guarantee: str | float  # "best", "none" or a probability to certify
-    over: str  # initial states of a probability to certify, "mean" or "worst"
-    steps: float | None  # bound on the expected steps to satisfaction, or
-    steps_factor: float | None  # as a multiple of the quickest optimal policy's
-    digest: str  # SHA-256 of the file and of every file that it names
-
-
-def common_fields(
-    path: Path, file: TaskFile, hidden: str | None, digest: str, label_on: str
-) -> Record:
-    """Fields of :class:`Task`, checked; `hidden` is a key that hides the formula from the learner."""
-    task = file.task
-    asked = task.guarantee or ("none" if hidden else "best")
-    guarantee = asked["probability"] if isinstance(asked, dict) else asked
-    steps = asked["steps"] if isinstance(asked, dict) else None
-    where = f"{path}: [task]"
-    if hidden and guarantee != "none":
-        raise ValueError(
-            f"{where} guarantee = {guarantee!r} needs a learner that sees the formula and has "
-            f"no horizon: leave out {hidden}."
-        )
-    if task.over is not None and isinstance(guarantee, str):
-        raise ValueError(f"{where} over belongs to a guarantee that is a probability.")
-    factor = task.steps_factor
-    if factor not in (None, "none") and (steps is not None or guarantee == "none"):
-        other = 'none, with guarantee = "none"' if steps is None else "steps in guarantee"
-        raise ValueError(
-            f"{where} steps_factor = {factor:g} bounds the steps, but there is {other}."
-        )
-    return {
-        "path": path,
-        "name": file.name or path.stem,
-        "formula": task.formula,
-        "label_on": task.label_on or label_on,
-        "guarantee": guarantee,
-        "over": task.over or "mean",
-        "steps": steps,
-        "steps_factor": None if factor == "none" or steps else float(factor or _STEPS_FACTOR),
-        "digest": digest,
-    }
-
-
-def kind_of(path: str | Path) -> Literal["environment", "grounding", "todirl", "mlirl"]:
+def kind_of(path: Path) -> Literal["environment", "grounding", "todirl", "mlirl"]:
     """The kind of a task file, unchecked: by its world, its tables or its method."""
-    data = read_toml(Path(path), TaskFile.KIND)[0]
+    data = read_toml(path, TaskFile.KIND)[0]
     world, learner = (x if isinstance(x := data.get(k), dict) else {} for k in ("world", "learner"))
     method, simulated = learner.get("method"), world.keys() & {"environment", "dynamics"}
     if simulated or method in ("ppo", "cce", "cpo"):

@@ -7,8 +7,7 @@ for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` show
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 from typing import Annotated as Key
 
@@ -16,11 +15,9 @@ import attrs
 
 from jaxltl.algos import cce, ppo, trust_region
 
-from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
-    File,
     NonNegative,
     Number,
     Table,
@@ -30,6 +27,7 @@ from jaxltl.app.files.schema import (
     Meta,
     table,
 )
+from jaxltl.app.files.task import FormulaFile, FormulaTable, LearnerTable as AnyLearnerTable
 from jaxltl.app.wording import Record
 
 Schedule = Annotated[
@@ -99,10 +97,9 @@ class WorldTable(Table):
 
 
 @table
-class TaskTable(Table):
+class TaskTable(FormulaTable):
     """``[task]``: the formula and its reward; see ``jaxltl.task_environment``."""
 
-    formula: Key[Text, "Formula of linear temporal logic.", '"G !out & F goal"']
     reward: Key[
         Literal["auto", "reach", "keep", "eventual", "two-discount", "parity"] | None,
         "Reward of the formula; default auto.",
@@ -128,7 +125,7 @@ class TaskTable(Table):
 
 
 @table
-class LearnerTable(Table):
+class LearnerTable(AnyLearnerTable):
     """``[learner]``: the method."""
 
     method: Key[Literal["ppo", "cce", "cpo"], "Learning algorithm."]
@@ -140,7 +137,8 @@ def hparams_table(hparams: type[Any], *omit: str) -> Any:
     fields = {}
     for field in dataclasses.fields(hparams):
         if "valid" in field.metadata and field.name not in omit:
-            fields[field.name] = attrs.field(default=None, type=_type_of(field) | None)
+            kind: Any = Key[_type_of(field) | None, ""]
+            fields[field.name] = attrs.field(default=None, type=kind)
     return attrs.make_class(
         "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
     )
@@ -250,8 +248,8 @@ class ProofTable(Table):
 
 
 @table
-class EnvironmentFile(File):
-    """Tables of a task file of a simulated world."""
+class EnvironmentFile(FormulaFile):
+    """A task file of a simulated world."""
 
     world: Key[WorldTable, "The environment."]
     task: Key[TaskTable, "The formula and its reward."]
@@ -262,66 +260,34 @@ class EnvironmentFile(File):
     evaluation: Key[EvaluationTable, "Episodes of the evaluation."] = EvaluationTable()
     proof: Key[ProofTable, "Proof of the learned policy."] = ProofTable()
 
-
-@dataclass(frozen=True)
-class EnvironmentTask:
-    """A checked task file of a simulated world."""
-
-    path: Path  # the file; `name` is its stem, unless the file gives one
-    name: str
-    world: WorldTable  # world, task, learner, evaluation: the tables
-    task: TaskTable
-    learner: LearnerTable
-    settings: PpoTable | CceTable | CpoTable  # the table of the method's name
-    evaluation: EvaluationTable
-    proof: ProofTable
-    given: Record  # the keys of `settings` that the file has
-    digest: str  # SHA-256 of the file and of every file that it names
-    text: str  # of the file when it was read
-
     @property
-    def formula(self) -> str:
-        return self.task.formula
+    def settings(self) -> PpoTable | CceTable | CpoTable:
+        """The table of the method's name."""
+        method = self.learner.method
+        return getattr(self, method) or _TABLES[method]()
 
-
-def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
-    """Checked contents of a task file; ValueError names the key and the fix."""
-    path = Path(path)
-    data, found = schema.read_toml(path, EnvironmentFile.KIND, raw)
-    file = schema.convert(path, EnvironmentFile, data)
-    method = file.learner.method
-    tables = {name: getattr(file, name) for name in _TABLES}
-    for other, given in tables.items():
-        if other != method and given is not None:
+    def __attrs_post_init__(self) -> None:
+        method = self.learner.method
+        for other in _TABLES:
+            if other != method and getattr(self, other) is not None:
+                raise ValueError(
+                    f'[{other}] is for method = "{other}", and [learner] says "{method}": leave '
+                    "one of them out."
+                )
+        if self.world.dynamics is None and self.proof.given():
             raise ValueError(
-                f'{path}: [{other}] is for method = "{other}", and [learner] says "{method}": '
-                "leave one of them out."
+                f"[proof] is for dynamics, and [world] environment = {self.world.environment!r} "
+                "is simulated: leave [proof] out."
             )
-    if file.world.dynamics is None and file.proof.given():
-        raise ValueError(
-            f"{path}: [proof] is for dynamics, and [world] environment = "
-            f"{file.world.environment!r} is simulated: leave [proof] out."
-        )
-    if method == "cpo" and (file.cpo is None or file.cpo.limit is None):
-        raise ValueError(
-            f"{path}: [cpo] lacks limit, the upper bound of the expected cost of an episode."
-        )
-    if method == "cce" and file.evaluation.policy is not None:
-        raise ValueError(
-            f"{path}: [evaluation] policy is for methods whose policies draw their actions; that "
-            'of "cce" draws none.'
-        )
-    digest = schema.digest(path, found, file.world.named_files()) if raw is None else ""
-    return EnvironmentTask(
-        path=path,
-        name=file.name or path.stem,
-        world=file.world,
-        task=file.task,
-        learner=file.learner,
-        settings=tables[method] or _TABLES[method](),
-        evaluation=file.evaluation,
-        proof=file.proof,
-        given=data.get(method, {}),
-        digest=digest,
-        text=found.decode(),
-    )
+        if method == "cpo" and self.settings.limit is None:
+            raise ValueError(
+                "[cpo] lacks limit, the upper bound of the expected cost of an episode."
+            )
+        if method == "cce" and self.evaluation.policy is not None:
+            raise ValueError(
+                "[evaluation] policy is for methods whose policies draw their actions; that of "
+                '"cce" draws none.'
+            )
+
+    def named_files(self) -> Sequence[str]:
+        return self.world.named_files()

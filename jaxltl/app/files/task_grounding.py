@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated, Literal
 from typing import Annotated as Key
 
-from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
@@ -18,7 +16,13 @@ from jaxltl.app.files.schema import (
     Text,
     table,
 )
-from jaxltl.app.files.task import GridTable, SyntheticTable
+from jaxltl.app.files.task import (
+    FormulaFile,
+    FormulaTable,
+    GridTable,
+    LearnerTable,
+    SyntheticTable,
+)
 from jaxltl.app.files.task_todirl import Files, Maps, map_file
 
 Observations = Annotated[
@@ -36,13 +40,6 @@ class WorldTable(GridTable):
 
     maps: Key[Maps, "Maps with demonstrations."]
     initial: Key[Text | None, "Formula of initial cells; default all cells.", '"a"'] = None
-
-
-@table
-class FormulaTable(Table):
-    """``[task]``: the formula."""
-
-    formula: Key[Text, "Formula of linear temporal logic over symbols.", '"!trap U goal"']
 
 
 @table
@@ -82,56 +79,35 @@ class TestTable(Table):
 
 
 @table
-class GroundingFile(schema.File):
-    """Tables of a task file with a table ``[grounding]``."""
+class GroundingFile(FormulaFile):
+    """A task file with a table ``[grounding]``."""
 
+    learner: LearnerTable = LearnerTable(method="grounding", steps=1)  # no table of the file
     world: Key[WorldTable, "The worlds with demonstrations."]
     task: Key[FormulaTable, "The formula over symbols."]
     grounding: Key[GroundingTable, "Observations, and how their meaning is learned."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     test: Key[TestTable | None, "Further worlds."] = None
 
+    @property
+    def maps(self) -> list[str | dict[str, str]]:
+        """The maps with demonstrations, then those of [test]."""
+        return [*self.world.maps, *(self.test.maps if self.test else ())]
 
-@dataclass(frozen=True)
-class Method:
-    """The learner of the protocol of jobs: posterior weights in one step."""
+    @property
+    def tables(self) -> list[str]:
+        """The files of observations."""
+        seen = self.grounding.observations
+        return [] if isinstance(seen, str) else seen
 
-    method: str = "grounding"
-    steps: int = 1
+    def __attrs_post_init__(self) -> None:
+        for key, found, count in (
+            ("[grounding] observations", self.tables, len(self.maps)),
+            ("[demonstrations] files", self.demonstrations.files, len(self.world.maps)),
+        ):
+            if found and len(found) != count:
+                raise ValueError(f"{key} has {len(found)} files for {count} maps.")
 
-
-@dataclass(frozen=True, kw_only=True)
-class GroundingTask:
-    """A checked task file with a table ``[grounding]``."""
-
-    path: Path
-    name: str
-    formula: str
-    digest: str
-    file: GroundingFile
-    maps: list[str | dict[str, str]]  # with demonstrations, then those of [test]
-    learner: Method = Method()
-
-
-def read_task(path: str | Path) -> GroundingTask:
-    """Checked contents of a task file; ValueError names the key and the fix."""
-    path = Path(path)
-    file, raw = schema.read_file(path, GroundingFile)
-    maps = [*file.world.maps, *(file.test.maps if file.test else ())]
-    seen, shown = file.grounding.observations, file.demonstrations.files or []
-    tables = [] if seen == "cells" else list(seen)
-    for key, found, count in (
-        ("[grounding] observations", tables, len(maps)),
-        ("[demonstrations] files", shown, len(file.world.maps)),
-    ):
-        if found and len(found) != count:
-            raise ValueError(f"{path}: {key} has {len(found)} files for {count} maps.")
-    names = [*filter(None, map(map_file, maps)), *tables, *shown]
-    return GroundingTask(
-        path=path,
-        name=file.name or path.stem,
-        formula=file.task.formula,
-        digest=schema.digest(path, raw, names),
-        file=file,
-        maps=maps,
-    )
+    def named_files(self) -> Sequence[str]:
+        named = [*filter(None, map(map_file, self.maps)), *self.tables]
+        return named + (self.demonstrations.files or [])

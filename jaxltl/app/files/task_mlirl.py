@@ -6,12 +6,10 @@ A task file is TOML with the tables ``[world]``, ``[task]``, ``[demonstrations]`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated, Literal
 from typing import Annotated as Key
 
-from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
@@ -31,9 +29,7 @@ from jaxltl.app.files.task import (
     Optimizer,
     OptimizerTable,
     SyntheticTable,
-    Task,
     TaskFile,
-    common_fields,
 )
 from jaxltl.io.prism.explicit import files_beside
 
@@ -185,6 +181,10 @@ class LearnerTable(OptimizerTable):
         return [x for x in self.progress if isinstance(x, int)]
 
     @property
+    def hides_formula(self) -> str | None:
+        return 'in = "world"' if self.in_world else None
+
+    @property
     def in_world(self) -> bool:
         """True if the reward is one of world states, without the automaton."""
         return self.in_ == "world"
@@ -192,41 +192,25 @@ class LearnerTable(OptimizerTable):
 
 @table
 class MlirlFile(TaskFile):
-    """Tables of a task file of ``mlirl``."""
+    """A task file of ``mlirl``."""
 
     world: Key[WorldTable, "Where demonstrations were made."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
 
+    def __attrs_post_init__(self) -> None:
+        super().__attrs_post_init__()
+        if self.learner.mu is not None and not isinstance(self.guarantee, str):
+            raise ValueError(
+                f"[task] guarantee = {self.guarantee} finds the weight mu that reaches it: leave "
+                "mu out of [learner]."
+            )
 
-@dataclass(frozen=True, kw_only=True)
-class MlirlTask(Task):
-    """A checked task file of ``mlirl``."""
-
-    world: WorldTable
-    demonstrations: DemonstrationsTable
-    learner: LearnerTable
-
-
-def read_task(path: str | Path) -> MlirlTask:
-    """Checked contents of a task file; ValueError names the key and the fix."""
-    path = Path(path)
-    file, raw = schema.read_file(path, MlirlFile)
-    world, learner = file.world, file.learner
-    hidden = 'in = "world"' if learner.in_world else None
-    digest = schema.digest(path, raw, _named_files(path, world, file.demonstrations))
-    fields = common_fields(path, file, hidden, digest, "entry")
-    if learner.mu is not None and not isinstance(fields["guarantee"], str):
-        raise ValueError(
-            f"{path}: [task] guarantee = {fields['guarantee']} finds the weight mu that reaches "
-            "it: leave mu out of [learner]."
-        )
-    return MlirlTask(**fields, world=world, demonstrations=file.demonstrations, learner=learner)
-
-
-def _named_files(path: Path, world: WorldTable, shown: DemonstrationsTable) -> list[str]:
-    named = [world.map["file"]] if isinstance(world.map, dict) else []
-    named += [x for x in (world.model, world.transitions, world.labels, shown.file) if x]
-    if world.model is not None:  # PRISM keeps labels in another file
-        named += [str(x.absolute()) for x in files_beside(path.parent / world.model)]
-    return named
+    def named_files(self) -> Sequence[str]:
+        world, shown = self.world, self.demonstrations
+        named = [world.map["file"]] if isinstance(world.map, dict) else []
+        named += [x for x in (world.model, world.transitions, world.labels, shown.file) if x]
+        if world.model is not None:  # PRISM keeps labels in another file
+            beside = files_beside(self.path.parent / world.model)
+            named += [str(x.absolute()) for x in beside]
+        return named

@@ -7,14 +7,12 @@ or text maps with a legend.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
 from typing import Annotated as Key
 
 import attrs
 
-from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
     Count,
     Discount,
@@ -33,9 +31,7 @@ from jaxltl.app.files.task import (
     Optimizer,
     OptimizerTable,
     SyntheticTable,
-    Task,
     TaskFile,
-    common_fields,
 )
 
 ColorCounts = Annotated[
@@ -142,6 +138,10 @@ class LearnerTable(OptimizerTable):
                 "patience waits for a better held-out likelihood; it needs a held_out above 0."
             )
 
+    @property
+    def hides_formula(self) -> str | None:
+        return next((k for k in ("memory", "horizon") if getattr(self, k) is not None), None)
+
 
 @table
 class TestTable(Table):
@@ -166,22 +166,31 @@ class TestTable(Table):
 
 @table
 class TodirlFile(TaskFile):
-    """Tables of a task file of ``todirl``."""
+    """A task file of ``todirl``."""
 
+    LABEL_ON: ClassVar[str] = "exit"
     world: Key[WorldTable, "The training worlds."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
     test: Key[TestTable | None, "The test worlds."] = None
 
+    def __attrs_post_init__(self) -> None:
+        files, count = self.demonstrations.files, len(self.world.maps)
+        if files is not None and len(files) != count:
+            raise ValueError(
+                f"[demonstrations] names {len(files)} files for {count} worlds; give one for each "
+                "of [world] maps, in their order."
+            )
+        if self.test is not None and self.test.generate is not None and not self.is_colored:
+            raise ValueError(
+                "[test] generate makes coloured worlds; where [world] has a legend, give "
+                "maps = [...]."
+            )
+        super().__attrs_post_init__()
 
-@dataclass(frozen=True, kw_only=True)
-class TodirlTask(Task):
-    """A checked task file of ``todirl``."""
-
-    world: WorldTable
-    demonstrations: DemonstrationsTable
-    learner: LearnerTable
-    test: TestTable | None
+    def named_files(self) -> Sequence[str]:
+        maps = [*self.world.maps, *((self.test and self.test.maps) or ())]
+        return [*filter(None, map(map_file, maps)), *(self.demonstrations.files or ())]
 
     @property
     def memory(self) -> str:
@@ -197,34 +206,6 @@ class TodirlTask(Task):
     def left_out(self) -> list[str]:
         """Names of test worlds that do not count in means."""
         return [] if self.test is None else self.test.leave_out
-
-
-def read_task(path: str | Path) -> TodirlTask:
-    """Checked contents of a task file; ValueError names the key and the fix."""
-    path = Path(path)
-    file, raw = schema.read_file(path, TodirlFile)
-    world, shown, test, learner = file.world, file.demonstrations, file.test, file.learner
-    if shown.files is not None and len(shown.files) != len(world.maps):
-        raise ValueError(
-            f"{path}: [demonstrations] names {len(shown.files)} files for {len(world.maps)} "
-            "worlds; give one for each of [world] maps, in their order."
-        )
-    if test is not None and test.generate is not None and world.legend is not None:
-        raise ValueError(
-            f"{path}: [test] generate makes coloured worlds; where [world] has a legend, give "
-            "maps = [...]."
-        )
-    maps = [*world.maps, *((test and test.maps) or ())]
-    named = [name for name in map(map_file, maps) if name is not None]
-    digest = schema.digest(path, raw, [*named, *(shown.files or ())])
-    hidden = next((k for k in ("memory", "horizon") if getattr(learner, k) is not None), None)
-    return TodirlTask(
-        **common_fields(path, file, hidden, digest, "exit"),
-        world=world,
-        demonstrations=shown,
-        learner=learner,
-        test=test,
-    )
 
 
 def map_file(entry: str | dict[str, str]) -> str | None:

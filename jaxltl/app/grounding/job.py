@@ -14,12 +14,12 @@ from jaxltl.algos import grounding
 from jaxltl.algos.grounding.problem import require_task
 from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
-from jaxltl.app.files.task_grounding import GroundingTask, read_task as read_task
+from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file
 from jaxltl.app.files.worlds import World, grid_options
-from jaxltl.app.job import about, automaton_picture, plain, took
+from jaxltl.app.job import about, automaton_picture, plain
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import learn_grounding as report  # noqa: F401 - part of the job
+from jaxltl.app.reports.learn_grounding import report as report
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.wording import Record, enclosure, many
@@ -35,7 +35,7 @@ from jaxltl.core.values import optimal_actions, satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 
-DOUBLE = True
+DOUBLE, FILE = True, GroundingFile
 _MOST = 8  # groundings of a robust policy
 
 
@@ -43,7 +43,7 @@ _MOST = 8  # groundings of a robust policy
 class Setup:
     """A task, ready for learning."""
 
-    task: GroundingTask
+    task: GroundingFile
     worlds: list[World]  # W maps with demonstrations, then those of [test]
     meaning: np.ndarray  # bool[M, W', S], candidate meanings in all of them
     names: tuple[str, ...]  # of the meanings
@@ -72,16 +72,15 @@ class Outcome:
     table: list[grounding.Row]
     query: grounding.Query
     answers: list[Answer]
-    seconds: float = 0.0
 
 
-def prepare(task: GroundingTask, seed: int) -> Setup:
+def prepare(task: GroundingFile, seed: int) -> Setup:
     """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
-    file, path = task.file, task.path
+    path = task.path
     maps = zip(map(map_file, task.maps), task.maps, strict=True)
     texts = [read_map(path, str(x) if name is None else {"file": name}) for name, x in maps]
-    options = grid_options(file.world)
-    wall = file.world.wall or "#"
+    options = grid_options(task.world)
+    wall = task.world.wall or "#"
     with errors_in(f"{path}: [world] "):
         kinds = sorted(
             {str(kind) for text in texts for kind in np.unique(parse_map(text))} - {wall}
@@ -89,14 +88,14 @@ def prepare(task: GroundingTask, seed: int) -> Setup:
         options.setdefault("legend", {kind: [] if kind == "." else [kind] for kind in kinds})
         worlds = [World(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts]
     names, seen = _observations(task, worlds)
-    count, hparams = len(file.world.maps), grounding.Hparams(discount=file.demonstrations.discount)
+    count, hparams = len(task.world.maps), grounding.Hparams(discount=task.demonstrations.discount)
     shown = _demonstrations(task, worlds[:count], seed)
     with errors_in(f"{path}: "):
         mdps = [world.mdp for world in worlds]
         problem = grounding.make_problem(mdps[:count], seen[:count], shown, task.formula)
         size = max(world.num_states for world in mdps)
         wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in seen])
-        if file.grounding.clusters is None:
+        if task.grounding.clusters is None:
             meaning = np.moveaxis(wide, -1, 0) > 0
             if not ((wide == 0) | (wide == 1)).all():
                 raise ValueError(
@@ -105,16 +104,16 @@ def prepare(task: GroundingTask, seed: int) -> Setup:
                 )
         else:
             every = replace(problem, observation=jnp.asarray(wide))
-            meaning = grounding.cluster_meanings(every, file.grounding.clusters)
+            meaning = grounding.cluster_meanings(every, task.grounding.clusters)
             names = tuple(f"cluster {m + 1}" for m in range(len(meaning)))
     return Setup(task, worlds, meaning, names, problem, hparams)
 
 
 def _observations(
-    task: GroundingTask, worlds: list[World]
+    task: GroundingFile, worlds: list[World]
 ) -> tuple[tuple[str, ...], list[np.ndarray]]:
     """Names of the columns, and observations ``float[S, O]`` of each world."""
-    given = task.file.grounding.observations
+    given = task.grounding.observations
     if given == "cells":
         return worlds[0].mdp.propositions, [np.asarray(x.mdp.label, float) for x in worlds]
     names: tuple[str, ...] = ()
@@ -134,9 +133,9 @@ def _observations(
     return names, seen
 
 
-def _demonstrations(task: GroundingTask, worlds: list[World], seed: int) -> list[Trajectories]:
+def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list[Trajectories]:
     """Demonstrations in each world, read or simulated with the hidden meanings."""
-    shown, found = task.file.demonstrations, []
+    shown, found = task.demonstrations, []
     if shown.files is not None:
         files = [task.path.parent / name for name in shown.files]
         return [read_demonstrations(x, world) for x, world in zip(files, worlds, strict=True)]
@@ -185,7 +184,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
             problem, hparams, meanings=setup.meaning[:, :count, :size], names=setup.names
         )
     training.stage("certifying")
-    members = grounding.credible_set(found, task.file.grounding.level)
+    members = grounding.credible_set(found, task.grounding.level)
     return Outcome(
         setup,
         found,
@@ -215,7 +214,7 @@ def _answer(setup: Setup, found: grounding.Posterior, members: np.ndarray, w: in
     return Answer(model, policy, satisfaction_probability(model, policy), inside.best, robust)
 
 
-def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     """No metrics: there are no steps of learning."""
     return {}
 
@@ -243,13 +242,13 @@ def summary(outcome: Outcome) -> Record:
     """The results for ``result.json``."""
     setup, found, query = outcome.setup, outcome.found, outcome.query
     task, problem, members = setup.task, setup.problem, outcome.members
-    level, first = task.file.grounding.level, members[:_MOST].tolist()
+    level, first = task.grounding.level, members[:_MOST].tolist()
     result = {
         **about(task),
         "demonstrations": {
             "number": len(problem.length),
             "pairs": int(jnp.sum(problem.length)),
-            "synthetic": task.file.demonstrations.synthetic is not None,
+            "synthetic": task.demonstrations.synthetic is not None,
         },
         "num_demonstrated": len(problem.observation),
         "meanings": setup.names,
@@ -277,7 +276,6 @@ def summary(outcome: Outcome) -> Record:
             }
             for x in outcome.answers
         ],
-        **took(outcome.seconds),
     }
     return plain(result)
 

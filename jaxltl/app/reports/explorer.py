@@ -44,119 +44,105 @@ class Run:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
-    """Text and layout of an explorer."""
+class Explorer:
+    """A policy in a world, for a page."""
 
     name: str  # prefix of its HTML ids; pictures with this live are replaced by it
     title: str  # title, caption: for people
     caption: str
     size: int  # S, the number of states or cells
+    automaton: Automaton | None  # the policy's memory, or None
+    layers: Mapping[str, Layer]  # maps by memory state or :data:`START`
+    runs: list[Run]  # trajectories
     place: Any = None  # cells of a text map, a coloured world, or None without a map
     actions: Sequence[str] = ()  # A names
     label: str = ""  # of values
-    # the kind of cell that cannot be entered
-    wall: str = "#"
+    wall: str = "#"  # the kind of cell that cannot be entered
     goal: str = "the formula"  # what the automaton's verdicts are about
     # marked, marks: (state, memory state, action) that are highlighted, and their title
-    marked: Iterable[tuple[int, int, int]] = ()
+    marked: Sequence[tuple[int, int, int]] = ()
     marks: str = ""
     # cells of the pieces in some states; other states have one piece in their own cell
     cells: Mapping[int, Sequence[int]] = field(default_factory=dict)
     places: Mapping[int, str] = field(default_factory=dict)  # names of some states
 
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """Rows and columns of the map, if there is one."""
+        return None if self.place is None else (int(self.place.shape[0]), int(self.place.shape[1]))
 
-@dataclass(frozen=True, kw_only=True)
-class Explorer(View):
-    """A policy in a world, for a page."""
+    @property
+    def too_large(self) -> str:
+        """The remark in place of an explorer that is too large for a page, or no text."""
+        count = 0 if self.automaton is None else len(self.automaton.delta)
+        if self.size * len(self.layers) <= MOST_CELLS and count <= MOST_STATES:
+            return ""
+        return (
+            f"{self.size} states by {len(self.layers)} maps and an automaton of {count} states are "
+            f"too large for interactive maps (at most {MOST_CELLS} states over all maps, and "
+            f"{MOST_STATES} automaton states); pictures replace them, and the files in this "
+            "directory have the figures."
+        )
 
-    automaton: Automaton | None  # the policy's memory, or None
-    shape: tuple[int, int] | None  # rows and columns of the map, or None
-    names: list[str]  # S texts, the content of each cell
-    layers: Mapping[str, Layer]  # maps by memory state or :data:`START`
-    runs: list[Run]  # trajectories
-    drawings: Mapping[str, Drawing]  # "automaton" and, if there is one, "map"
+    @property
+    def names(self) -> list[str]:
+        """The content of each cell ``[S]``."""
+        if self.place is None:
+            return [""] * self.size
+        if isinstance(self.place, np.ndarray):
+            plain = plain_kind(self.place)
+            return ["" if kind == plain else str(kind) for kind in self.place.ravel()]
+        propositions = np.array(self.place.mdp.propositions)
+        return [", ".join(propositions[row]) for row in np.asarray(self.place.mdp.label)]
+
+    @property
+    def drawings(self) -> dict[str, Drawing]:
+        """Drawings of the automaton and of the map, if there is one."""
+        drawn: dict[str, Drawing] = {}
+        if self.too_large:
+            return drawn
+        if self.automaton is not None:
+            drawn["automaton"] = drawing("live_automaton", self.automaton, self.name)
+        if self.place is not None:
+            drawn["map"] = drawing(
+                "live_map",
+                self.place,
+                self.name,
+                {key: (x.value, x.policy) for key, x in self.layers.items()},
+                runs=[[self.cells.get(s, [s])[0] for s, _, _ in run.steps] for run in self.runs],
+                marked=self.marked,
+                actions=self.actions,
+                wall=self.wall,
+                pieces=max((len(each) for each in self.cells.values()), default=1),
+            )
+        return drawn
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Learning curves: figures ``[T, N]`` by name, and their steps ``[T]``."""
+    """Learning curves: metrics ``[T, N]`` by name, and their steps ``[T]``."""
 
     name: str
     title: str
     caption: str
-    figures: Mapping[str, np.ndarray]
+    metrics: Mapping[str, np.ndarray]
     steps: np.ndarray
-    drawings: Mapping[str, Drawing]
 
-
-@dataclass(frozen=True)
-class TooLarge:
-    """Text in place of an :class:`Explorer` that is too large for a page."""
-
-    name: str
-    text: str
-    drawings: Mapping[str, Drawing] = field(default_factory=dict)
-
-
-def explorer(
-    view: View, automaton: Automaton | None, layers: Mapping[str, Layer], runs: list[Run]
-) -> Explorer | TooLarge:
-    """The explorer of a policy, unless it is too large for a page."""
-    count = 0 if automaton is None else len(automaton.delta)
-    if view.size * len(layers) > MOST_CELLS or count > MOST_STATES:
-        text = (
-            f"{view.size} states by {len(layers)} maps and an automaton of {count} states are too "
-            f"large for interactive maps (at most {MOST_CELLS} states over all maps, and "
-            f"{MOST_STATES} automaton states); pictures replace them, and the files in this "
-            "directory have the figures."
-        )
-        return TooLarge(view.name, text)
-    marked = [(int(s), int(q), int(a)) for s, q, a in view.marked]
-    place, cells = view.place, view.cells
-    drawn = {}
-    if automaton is not None:
-        drawn["automaton"] = drawing("live_automaton", automaton, view.name)
-    if place is not None:
-        drawn["map"] = drawing(
-            "live_map",
-            place,
-            view.name,
-            {key: (x.value, x.policy) for key, x in layers.items()},
-            runs=[[cells.get(s, [s])[0] for s, _, _ in run.steps] for run in runs],
-            marked=marked,
-            actions=view.actions,
-            wall=view.wall,
-            pieces=max((len(each) for each in cells.values()), default=1),
-        )
-    return Explorer(
-        **{**vars(view), "marked": marked},
-        automaton=automaton,
-        shape=None if place is None else (int(place.shape[0]), int(place.shape[1])),
-        names=_cell_names(place, view.size),
-        layers=layers,
-        runs=runs,
-        drawings=drawn,
-    )
-
-
-def _cell_names(place: Any, size: int) -> list[str]:
-    if place is None:
-        return [""] * size
-    if isinstance(place, np.ndarray):
-        plain = plain_kind(place)
-        return ["" if kind == plain else str(kind) for kind in place.ravel()]
-    propositions = np.array(place.mdp.propositions)
-    return [", ".join(propositions[row]) for row in np.asarray(place.mdp.label)]
+    @property
+    def drawings(self) -> dict[str, Drawing]:
+        """A drawing for each metric."""
+        return {
+            name: drawing("live_curve", name.replace("_", "-"), values, self.steps)
+            for name, values in self.metrics.items()
+        }
 
 
 def curves(
     name: str, title: str, caption: str, history: Mapping[str, np.ndarray], show: Iterable[str]
 ) -> Curves:
-    """The learning curves of some figures, but of those without a finite value."""
-    figures = {k: history[k] for k in show if np.isfinite(history[k]).any()}
-    steps = history["step"]
-    drawn = {k: drawing("live_curve", k.replace("_", "-"), v, steps) for k, v in figures.items()}
-    return Curves(name, title, caption, figures, steps, drawn)
+    """The learning curves of some metrics, but of those without a finite value."""
+    shown = {k: history[k] for k in show if np.isfinite(history[k]).any()}
+    return Curves(name, title, caption, shown, history["step"])
 
 
 class _Dynamics:

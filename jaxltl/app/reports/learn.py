@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,63 +16,24 @@ from jaxltl.app.reports.explorer import (
     Curves,
     Explorer,
     Layer,
-    TooLarge,
-    View,
     curves,
     demonstrated_runs,
-    explorer,
     learned_runs,
 )
 from jaxltl.app.reports.page import (
-    Part,
-    Remark,
+    Report,
     certified,
     number,
     probability,
-    render_page,
-    render_remarks,
-    render_table,
     rounded_down,
 )
-from jaxltl.app.wording import Result, many, place
+from jaxltl.app.wording import Record, Result, many, place
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict
 from jaxltl.core.values.undiscounted.mixture import from_starts
 
 _OPTIMAL = 1e-6  # certified loss up to which a policy is reported as optimal
 _NEGLIGIBLE = 0.05  # weight without a reported meaning
-
-
-def page(
-    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
-) -> str:
-    """The report in HTML."""
-    return render_page(
-        "mlirl.html",
-        result,
-        parts,
-        pictures,
-        task_text,
-        remarks=remarks(result),
-        tiles=_tiles(result),
-        evidence=[(f"{policy}, {kind}", *rest) for policy, kind, *rest in _evidence(result)],
-        weights=_weights(result),
-        steps=steps,
-    )
-
-
-def table(result: Result) -> str:
-    """The result as text."""
-    return render_table(
-        "mlirl.txt",
-        remarks(result),
-        result=result,
-        evidence=_evidence(result),
-        weights=_weights(result),
-        likelihood=_likelihood(result),
-        guaranteed=_guaranteed(result),
-        steps=steps,
-    )
 
 
 def _evidence(result: Result) -> list[tuple[str, ...]]:
@@ -164,22 +124,21 @@ def _weights(result: Result) -> list[tuple[str, str, str]]:
     ]
 
 
-def remarks(result: Result) -> list[Remark]:
-    """Remarks on the result, with their kinds."""
-    learned, best = (result[k]["mean"] for k in ("satisfaction", "best_achievable"))
-    known = learned["lower"] is not None and best["upper"] is not None
-    return [
-        *render_remarks(
-            "mlirl_remarks.txt",
-            result=result,
-            guaranteed=_guaranteed(result),
-            gap=best["upper"] - learned["lower"] if known else None,
-            optimal=_OPTIMAL,
-        ),
-        *steps.unused(result["guarantee"]),
-        *steps.mixing(result["expected_steps"]),
-        *(("note", result[key]) for key in ("remark", "trivial") if result.get(key)),
-    ]
+def _values(result: Result) -> Record:
+    evidence = _evidence(result)
+    return {
+        "tiles": _tiles(result),
+        "evidence": evidence,
+        "evidence_rows": [(f"{policy}, {kind}", *rest) for policy, kind, *rest in evidence],
+        "weights": _weights(result),
+        "likelihood": _likelihood(result),
+        "guaranteed": _guaranteed(result),
+        "optimal": _OPTIMAL,
+        "steps": steps,
+    }
+
+
+report = Report("mlirl", _values)
 
 
 # --- pictures --------------------------------------------------------------------------------
@@ -207,33 +166,31 @@ def pictures(outcome: Any) -> list[Picture]:
     ]
 
 
-def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
+def live(outcome: Any) -> list[Explorer | Curves]:
     """Interactive policy on the map, and learning curves."""
     setup, model = outcome.setup, outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     caption = _CURVES + over_seeds(len(outcome.learned.loss))
     logged = setup.world.logged
     return [
-        explorer(
-            View(
-                name=LIVE,
-                title="Learned policy",
-                caption=_TABLE if setup.world.cells is None else _MAP,
-                size=setup.world.mdp.num_states,
-                place=setup.world.cells,
-                actions=setup.world.actions,
-                places={} if logged is None else dict(enumerate(logged.states)),
-                label=_LABEL,
-                wall=setup.task.world.wall or "#",
-                marked=left_out(model, setup.guarantee, setup.demonstrations),
-                marks="Demonstrated steps that lower the maximal satisfaction probability",
-            ),
-            model.automaton,
-            _layers(outcome),
-            [
+        Explorer(
+            name=LIVE,
+            title="Learned policy",
+            caption=_TABLE if setup.world.cells is None else _MAP,
+            size=setup.world.mdp.num_states,
+            automaton=model.automaton,
+            layers=_layers(outcome),
+            runs=[
                 *demonstrated_runs(model, setup.demonstrations),
                 *learned_runs(model, policy, outcome.seed),
             ],
+            place=setup.world.cells,
+            actions=setup.world.actions,
+            places={} if logged is None else dict(enumerate(logged.states)),
+            label=_LABEL,
+            wall=setup.task.world.wall or "#",
+            marked=left_out(model, setup.guarantee, setup.demonstrations),
+            marks="Demonstrated steps that lower the maximal satisfaction probability",
         ),
         curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
     ]

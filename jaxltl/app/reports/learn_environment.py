@@ -2,57 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from jaxltl.app.reports import proof
-from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.page import (
-    Part,
-    Remark,
-    number,
-    probability,
-    render_page,
-    render_remarks,
-    render_table,
-)
-from jaxltl.app.wording import Result, many
+from jaxltl.app.reports.page import Report, number, probability
+from jaxltl.app.wording import Record, Result, many
 
 _PROBABILITIES = ("success", "violation", "undecided")
-
-
-def page(
-    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
-) -> str:
-    """The report in HTML."""
-    seeds, names = result["seeds"], (*_PROBABILITIES, *_visits(result))
-    return render_page(
-        "environment.html",
-        result,
-        parts,
-        pictures,
-        task_text,
-        **_texts(result),
-        remarks=remarks(result),
-        tiles=_tiles(result),
-        seed_header=("seed", *names),
-        seed_rows=[
-            (
-                f"{i}{' (kept)' if i == seeds['kept'] else ''}",
-                *(" ".join(_numbers(name, found)) for name in names),
-            )
-            for i, found in enumerate(seeds["evaluations"])
-        ],
-    )
-
-
-def table(result: Result) -> str:
-    """The result as text."""
-    return render_table("environment.txt", remarks(result), result=result, **_texts(result))
-
-
-def remarks(result: Result) -> list[Remark]:
-    """Remarks on the result, with their kinds."""
-    return render_remarks("environment_remarks.txt", result=result)
 
 
 def _visits(result: Result) -> list[str]:
@@ -60,13 +14,16 @@ def _visits(result: Result) -> list[str]:
     return [] if result["acceptance"] in ("cosafe", "safety") else ["visits"]
 
 
-def _texts(result: Result) -> dict[str, object]:
-    """Sentences on learning, evaluation and proof, and the rows of the estimates."""
+def _values(result: Result) -> Record:
+    """Sentences on learning, evaluation and proof, and rows of estimates."""
     world, found = result["environment"], result["evaluation"]
     actions, drawn = world["actions"], result["policy"]["acts"] == "drawn"
     kind = f"{actions} actions" if isinstance(actions, int) else f"actions in a box {actions}"
     acts = "" if result["method"] == "cce" else f" ({'random' if drawn else 'likeliest'} actions)"
+    names = (*_PROBABILITIES, *_visits(result))
+    seeds = result["seeds"]
     return {
+        "tiles": _tiles(result),
         "sentence": (
             f"{result['method']} in {world['name']}: {kind}, "
             f"{many(result['num_memory'], 'automaton state')}, "
@@ -82,6 +39,14 @@ def _texts(result: Result) -> dict[str, object]:
             (name.replace("_", " "), *_numbers(name, found), found[name]["method"])
             for name in found["estimates"]
             if _visits(result) or "visits" not in name
+        ],
+        "seed_header": ("seed", *names),
+        "seed_rows": [
+            (
+                f"{i}{' (kept)' if i == seeds['kept'] else ''}",
+                *(" ".join(_numbers(name, one)) for name in names),
+            )
+            for i, one in enumerate(seeds["evaluations"])
         ],
     }
 
@@ -104,3 +69,6 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     )
     tiles = [(value, f"{title}, in {interval}") for title, value, interval in rows]
     return [*proof.tiles(result.get("proof") or {}), *tiles]
+
+
+report = Report("environment", _values)

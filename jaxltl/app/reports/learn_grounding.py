@@ -2,52 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.page import (
-    Part,
-    Remark,
+    Report,
     aligned,
     certified,
     number,
     probability,
-    remark_lines,
-    render_page,
-    render_remarks,
     rounded_down,
 )
-from jaxltl.app.wording import Result, many
+from jaxltl.app.wording import Record, Result, many
 
 _HEADER = ("symbol", "meaning", "weight", "alternatives", "decisive steps")
 _WORLDS = ("map", "probability", "certified", "maximum", "robust policy, at least")
-
-
-def page(
-    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
-) -> str:
-    """The report in HTML."""
-    return render_page(
-        "grounding.html",
-        result,
-        parts,
-        pictures,
-        task_text,
-        sentence=_sentence(result),
-        remarks=remarks(result),
-        tables=(
-            ("Grounding", _HEADER, _rows(result)),
-            ("Satisfaction probability", _WORLDS, _worlds(result)),
-        ),
-    )
-
-
-def table(result: Result) -> str:
-    """The result as text."""
-    lines = [f"{result['task']}: {_sentence(result)}", ""]
-    for header, rows in ((_HEADER, _rows(result)), (_WORLDS, _worlds(result))):
-        lines += [*aligned([header, *rows]), ""]
-    return "\n".join([*lines[:-1], *remark_lines(remarks(result))])
 
 
 def _sentence(result: Result) -> str:
@@ -90,6 +56,15 @@ def _worlds(result: Result) -> list[tuple[str, ...]]:
     ]
 
 
-def remarks(result: Result) -> list[Remark]:
-    """Remarks on the grounding: undecided symbols, the query, and solvers without a proof."""
-    return render_remarks("grounding_remarks.txt", result=result)
+def _values(result: Result) -> Record:
+    return {
+        "sentence": _sentence(result),
+        "tables": (
+            ("Grounding", _HEADER, _rows(result)),
+            ("Satisfaction probability", _WORLDS, _worlds(result)),
+        ),
+        "aligned": aligned,
+    }
+
+
+report = Report("grounding", _values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -18,26 +18,19 @@ from jaxltl.app.reports.explorer import (
     Explorer,
     Layer,
     Run,
-    TooLarge,
-    View,
     curves,
     demonstrated_runs,
-    explorer,
     learned_runs,
 )
 from jaxltl.app.reports.page import (
-    Part,
-    Remark,
+    Report,
     certified,
     number,
     probability,
-    render_page,
-    render_remarks,
-    render_table,
 )
 from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.todirl.results import summary
-from jaxltl.app.wording import Result, many
+from jaxltl.app.wording import Record, Result, many
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
@@ -52,53 +45,6 @@ _EXPERT = {
     "quickest": "The expert knows the formula: its policy is the quickest of those with maximal "
     "satisfaction probability.",
 }
-
-
-def page(
-    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
-) -> str:
-    """The report in HTML."""
-    titles = (("test", "Test worlds"), ("training", "Training worlds"))
-
-    def mean_value(world: Result) -> float:
-        value: float | None = world["mean"]["value"]
-        return -1.0 if value is None else value
-
-    return render_page(
-        "todirl.html",
-        result,
-        parts,
-        pictures,
-        task_text,
-        sentence=_sentence(result),
-        remarks=remarks(result),
-        tiles=_tiles(result),
-        within=_within(result),
-        evidence=_evidence(result),
-        steps=steps,
-        expert=_EXPERT[result["expert"]],
-        world_tables=[
-            (title, result[key], sorted(result[key]["worlds"], key=mean_value))
-            for key, title in titles
-            if result[key]
-        ],
-    )
-
-
-def table(result: Result) -> str:
-    """The result as text."""
-    return render_table(
-        "todirl.txt",
-        remarks(result),
-        result=result,
-        sentence=_sentence(result),
-        within=_within(result),
-        groups=_groups(result),
-        policies=_POLICIES,
-        counted=_number_of_worlds,
-        ended=_how_it_ended(result),
-        steps=steps,
-    )
 
 
 def _groups(result: Result) -> list[tuple[str, Result]]:
@@ -182,18 +128,35 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
     ]
 
 
-def remarks(result: Result) -> list[Remark]:
-    """Remarks on the result, with their kinds."""
+def _values(result: Result) -> Record:
     groups = _groups(result)
-    counted = [x for _, y in groups for x in y["worlds"] if x["name"] not in y["left_out"]]
-    found = render_remarks(
-        "todirl_remarks.txt",
-        result=result,
-        groups=groups,
-        policies=_POLICIES,
-        counted_worlds=counted,
-    )
-    return found + steps.unused(result["guarantee"])
+
+    def mean_value(world: Result) -> float:
+        value: float | None = world["mean"]["value"]
+        return -1.0 if value is None else value
+
+    return {
+        "sentence": _sentence(result),
+        "within": _within(result),
+        "tiles": _tiles(result),
+        "evidence": _evidence(result),
+        "steps": steps,
+        "expert": _EXPERT[result["expert"]],
+        "groups": groups,
+        "policies": _POLICIES,
+        "counted": _number_of_worlds,
+        "ended": _how_it_ended(result),
+        "world_tables": [
+            (f"{kind.capitalize()} worlds", about, sorted(about["worlds"], key=mean_value))
+            for kind, about in reversed(groups)
+        ],
+        "counted_worlds": [
+            x for _, about in groups for x in about["worlds"] if x["name"] not in about["left_out"]
+        ],
+    }
+
+
+report = Report("todirl", _values)
 
 
 # --- pictures --------------------------------------------------------------------------------
@@ -235,7 +198,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
     return found
 
 
-def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
+def live(outcome: Outcome) -> list[Explorer | Curves]:
     """Interactive policies in worlds, and learning curves."""
     caption, history = _caption_of_curves(outcome), outcome.learned.history
     return [
@@ -312,7 +275,7 @@ def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
             yield _Drawn(test, outcome.test, w, f"test_{n + 1}", text, n == 0, None)
 
 
-def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
+def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
     setup, scene = outcome.setup, one.worlds.scenes[one.w]
     names = _memory_names(setup)
     layers = {str(q): Layer(name, None, one.moving[:, q]) for q, name in names.items()}
@@ -321,21 +284,19 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     model = part_of(one.worlds.model, one.w)
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
     place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
-    return explorer(
-        View(
-            name=one.live,
-            title=one.title,
-            caption=one.caption,
-            size=scene.mdp.num_states,
-            place=place,
-            actions=ACTIONS,
-            label="satisfaction probability",
-            wall=setup.task.world.wall or "#",
-            goal="the formula" if setup.memory is setup.judge else "the memory's formula",
-        ),
-        setup.memory,
-        layers,
-        [*shown, *_runs(outcome, one)],
+    return Explorer(
+        name=one.live,
+        title=one.title,
+        caption=one.caption,
+        size=scene.mdp.num_states,
+        automaton=setup.memory,
+        layers=layers,
+        runs=[*shown, *_runs(outcome, one)],
+        place=place,
+        actions=ACTIONS,
+        label="satisfaction probability",
+        wall=setup.task.world.wall or "#",
+        goal="the formula" if setup.memory is setup.judge else "the memory's formula",
     )
 
 

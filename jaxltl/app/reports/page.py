@@ -7,7 +7,8 @@ import functools
 import json
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import click
@@ -16,22 +17,50 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.explorer import START, Curves, Explorer, Layer, TooLarge
+from jaxltl.app.reports.explorer import START, Curves, Explorer, Run
 from jaxltl.app.wording import Record, Result, many, place, where
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.io import templates
 
-Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
+Part = tuple[Explorer | Curves, Mapping[str, str]]  # with its drawings as SVG
+Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
 
-_NARROW = 24  # columns of the widest map that is shown next to the automaton
 _CURVE_ROWS = 12  # of a table of learning curves
 _ARROWS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}
-_MARKS = {
-    "buchi": " Dots: transitions to be taken infinitely often.",
-    "parity": " Numbers: the least one that occurs infinitely often must be even.",
-}
+
+
+@dataclass(frozen=True)
+class Report:
+    """The report of a kind of job, by templates ``NAME.html``, ``NAME.txt``, ``NAME_remarks.txt``."""
+
+    name: str
+    values: Callable[[Result], Record]  # that the templates read besides the result
+    has_remarks: bool = True  # whether the text ends with the remarks
+
+    def page(
+        self,
+        result: Result,
+        parts: Sequence[Part],
+        pictures: Iterable[tuple[Picture, bytes]],
+        file_text: str,
+    ) -> str:
+        """The report in HTML."""
+        values = {"remarks": self.remarks(result), **self.values(result)}
+        return render_page(f"{self.name}.html", result, parts, pictures, file_text, **values)
+
+    def table(self, result: Result) -> str:
+        """The result as text for the terminal."""
+        lines = render_text(f"{self.name}.txt", result=result, **self.values(result))
+        remarks = self.remarks(result) if self.has_remarks else []
+        return "\n".join(lines + remark_lines(remarks))
+
+    def remarks(self, result: Result) -> list[Remark]:
+        """Remarks on the result, by a template whose lines are ``kind: text``."""
+        lines = render_text(f"{self.name}_remarks.txt", result=result, **self.values(result))
+        split = (line.partition(": ") for line in lines if line)
+        return [(kind, text) for kind, _, text in split]
 
 
 def render_page(
@@ -43,23 +72,24 @@ def render_page(
     **context: object,
 ) -> str:
     """A page that needs no other file and no network."""
-    explorers = [(part, drawn) for part, drawn in parts if isinstance(part, Explorer)]
-    replaced = {part.name for part, _ in parts if not isinstance(part, TooLarge)}
-    known = json.dumps(
-        [explorer_data(part) for part, _ in explorers], separators=(",", ":"), allow_nan=False
-    )
+    large = [part.too_large for part, _ in parts if isinstance(part, Explorer) and part.too_large]
+    explorers = [(x, drawn) for x, drawn in parts if isinstance(x, Explorer) and not x.too_large]
+    curves = [(part, drawn) for part, drawn in parts if isinstance(part, Curves)]
+    replaced = {x.name for x, _ in explorers} | {x.name for x, _ in curves}
+    data = [explorer_data(part) for part, _ in explorers]
+    known = json.dumps(data, separators=(",", ":"), allow_nan=False)
     values = {
         "title": result["task"],
-        "formula": result["formula"],
+        "formula": result.get("formula"),
         "versions": result["versions"],
         "seconds": result["seconds"],
         "result": result,
         "remarks": (),
         "file_title": "Task file",
         "file_text": file_text,
-        "explorers": [_explorer_view(part, drawn) for part, drawn in explorers],
-        "curves": [_curves_view(part, drawn) for part, drawn in parts if isinstance(part, Curves)],
-        "too_large": [part.text for part, _ in parts if isinstance(part, TooLarge)],
+        "explorers": explorers,
+        "curves": curves,
+        "too_large": large,
         "pictures": [
             (picture, base64.b64encode(svg).decode())
             for picture, svg in pictures
@@ -79,22 +109,13 @@ def render_text(template: str, **values: object) -> list[str]:
     return [line.rstrip() for line in text.splitlines()]
 
 
-def render_table(template: str, remarks: Iterable[Remark], **values: object) -> str:
-    """A report for the terminal, with its remarks at the end."""
-    return "\n".join([*render_text(template, **values), *remark_lines(remarks)])
-
-
-def render_remarks(template: str, **values: object) -> list[Remark]:
-    """Remarks of a template whose lines are ``kind: text``."""
-    lines = (line.partition(": ") for line in render_text(template, **values) if line)
-    return [(kind, text) for kind, _, text in lines]
-
-
 @functools.cache
 def _environment() -> jinja2.Environment:
     found = templates.environment("jaxltl.app.reports")
-    functions = (number, probability, certified, mean_deviation, rounded_down, place, many)
-    found.filters |= {function.__name__: function for function in functions}
+    formats = (number, probability, certified, mean_deviation, rounded_down, place, many)
+    found.filters |= {function.__name__: function for function in formats}
+    parts = (position, layer_table, run_rows, automaton_rows, curve_table)
+    found.globals |= {function.__name__: function for function in parts}
     return found
 
 
@@ -156,50 +177,14 @@ def _memory_texts(part: Explorer) -> dict[str, str]:
     return {**found, START: f"Initial states: {part.label} from there"}
 
 
-def _explorer_view(part: Explorer, drawn: Mapping[str, str]) -> Record:
-    """The values that the template of an explorer reads."""
-    hint = "Choose a state of the automaton, or play a trajectory."
-    if part.shape is not None:
-        hint = "Point at a cell of the map, choose a state of the automaton, or play a trajectory."
-    marked = (
-        f"{_position(part, s)}, memory state {q}, {part.actions[a]}" for s, q, a in part.marked
-    )
-    automaton = part.automaton
-    return {
-        **{k: getattr(part, k) for k in ("name", "title", "caption", "label", "goal", "marks")},
-        "layers": [(key, layer.name) for key, layer in part.layers.items()],
-        "hint": hint,
-        "marked": "; ".join(marked),
-        "narrow": part.shape is not None and part.shape[1] <= _NARROW and automaton is not None,
-        "map": Markup(drawn["map"]) if part.shape is not None else "",
-        "colored": any(layer.value is not None for layer in part.layers.values()),
-        "automaton": automaton
-        and {
-            "drawing": Markup(drawn["automaton"]),
-            "marks": _MARKS.get(automaton.acceptance, ""),
-            "states": _automaton_rows(automaton, part.goal),
-        },
-        "tables": [_layer_table(part, key, layer) for key, layer in part.layers.items()],
-        "runs": [
-            {
-                "name": run.name,
-                "rows": [
-                    (t, _position(part, s), q, "" if a is None else part.actions[a])
-                    for t, (s, q, a) in enumerate(run.steps)
-                ],
-            }
-            for run in part.runs
-        ],
-    }
-
-
-def _position(part: Explorer, state: int) -> str:
+def position(part: Explorer, state: int) -> str:
+    """The text of a state's position."""
     return part.places.get(state) or place(where(state, part.shape))
 
 
-def _layer_table(part: Explorer, key: str, layer: Layer) -> Record:
-    """The values and likeliest actions of a layer, as a map or state by state."""
-    texts = []
+def layer_table(part: Explorer, key: str) -> tuple[tuple[object, ...], list[Any], str]:
+    """Header, rows and caption of the values and likeliest actions of a layer."""
+    layer, texts = part.layers[key], []
     for state, name in enumerate(part.names):
         value = None if layer.value is None else _finite(layer.value[state])
         chances = None if layer.policy is None else layer.policy[state]
@@ -210,18 +195,24 @@ def _layer_table(part: Explorer, key: str, layer: Layer) -> Record:
             best = part.actions[int(np.argmax(chances))]
             text.append(_ARROWS.get(best, best))
         texts.append(" ".join(text))
-    meaning = "the likeliest action" if layer.policy is not None else part.label
-    table: Record = {"key": key, "caption": f"{layer.name}: {meaning}"}
+    caption = f"{layer.name}: {part.label if layer.policy is None else 'the likeliest action'}"
     if part.shape is None:
-        return table | {"header": ("state", "values"), "rows": list(enumerate(texts))}
+        return ("state", "values"), list(enumerate(texts)), caption
     down, across = part.shape
-    return table | {
-        "header": ("row", *range(1, across + 1)),
-        "rows": [(r + 1, *texts[r * across : (r + 1) * across]) for r in range(down)],
-    }
+    rows = [(r + 1, *texts[r * across : (r + 1) * across]) for r in range(down)]
+    return ("row", *range(1, across + 1)), rows, caption
 
 
-def _automaton_rows(automaton: Automaton, goal: str) -> list[Record]:
+def run_rows(part: Explorer, run: Run) -> list[tuple[object, ...]]:
+    """Step, position, memory state and action of a trajectory."""
+    return [
+        (t, position(part, s), q, "" if a is None else part.actions[a])
+        for t, (s, q, a) in enumerate(run.steps)
+    ]
+
+
+def automaton_rows(automaton: Automaton, goal: str) -> list[Record]:
+    """The states of an automaton with their verdicts and transitions."""
     names = automaton.state_names or ("",) * len(automaton.delta)
     moves: dict[int, list[tuple[str, int]]] = {}
     for (q, target, _), guard in edge_guards(automaton).items():
@@ -240,23 +231,13 @@ def _automaton_rows(automaton: Automaton, goal: str) -> list[Record]:
     ]
 
 
-# --- curves ---------------------------------------------------------------------------------
-
-
-def _curves_view(part: Curves, drawn: Mapping[str, str]) -> Record:
-    """The values that the template of learning curves reads."""
+def curve_table(part: Curves) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """Header and rows of the medians of metrics over seeds."""
     count = len(part.steps)
     shown = sorted({int(t) for t in np.linspace(0, count - 1, min(count, _CURVE_ROWS))})
-    names = [name.replace("_", " ") for name in part.figures]
-    return {
-        **{k: getattr(part, k) for k in ("name", "title", "caption")},
-        "plots": [(name.replace("_", " "), Markup(svg)) for name, svg in drawn.items()],
-        "header": ("step", *names),
-        "rows": [
-            (int(part.steps[t]), *(number(_median(x[t])) for x in part.figures.values()))
-            for t in shown
-        ],
-    }
+    header = ("step", *(name.replace("_", " ") for name in part.metrics))
+    medians = ((number(_median(x[t])) for x in part.metrics.values()) for t in shown)
+    return header, [(int(part.steps[t]), *row) for t, row in zip(shown, medians, strict=True)]
 
 
 def _median(values: np.ndarray) -> float | None:
@@ -265,9 +246,6 @@ def _median(values: np.ndarray) -> float | None:
 
 
 # --- formats ---------------------------------------------------------------------------------
-
-
-Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
 
 
 def remark_lines(remarks: Iterable[Remark]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.page import Remark, number, probability
+from jaxltl.app.reports.page import number, probability
 from jaxltl.app.wording import Result
 
 _PRINTED = 5  # vertices of the front in the terminal
@@ -29,7 +29,7 @@ def heading(steps: Result) -> str:
 def rows(steps: Result) -> list[tuple[str, str, str]]:
     """Policy, expected steps and certificate."""
     return [
-        (title, _steps(steps[key]), _certified(steps[key], *steps[f"{key}_bounds"]))
+        (title, spent(steps[key]), _certified(steps[key], *steps[f"{key}_bounds"]))
         for title, key in (("learned policy", "learned"), ("quickest optimum", "quickest"))
     ]
 
@@ -39,7 +39,7 @@ def front_rows(steps: Result) -> list[tuple[str, str, str]]:
     return [
         (
             probability(one["probability"]["value"]),
-            _steps(one["steps"]["value"]),
+            spent(one["steps"]["value"]),
             _certified(*(one["steps"][k] for k in ("value", "lower", "upper"))),
         )
         for one in steps.get("front", ())
@@ -63,43 +63,6 @@ def trade_off(steps: Result) -> list[str]:
     others = [f"{p} in {n}" for p, n, _ in front_rows(steps)[1:]]
     more = ", ..." if len(others) > _PRINTED else ""
     return [f"  for less probability      {', '.join(others[:_PRINTED])}{more}"] if others else []
-
-
-def mixing(steps: Result | None) -> list[Remark]:
-    """Remark on the share of the quickest optimal policy."""
-    if steps is None or not steps["share"]:
-        return []
-    before = steps["likelihood"][0]
-    after = next(x for x in steps["likelihood"] if x["share"] == steps["share"])
-    losses = [x["neg_log_likelihood"] for x in (before, after)]
-    change = (
-        f"; the negative log-likelihood changes from {number(losses[0])} to {number(losses[1])}"
-    )
-    fix = (
-        "steps_factor in [task] sets the multiple."
-        if steps["factor"]
-        else "guarantee in [task] sets the number of steps."
-    )
-    return [
-        (
-            "note",
-            f"The policy of the learned reward takes {_steps(before['steps']['value'])} steps on "
-            f"average, so a share of {steps['share']:.3g} of a quick policy with the guarantee is "
-            f"mixed in{'' if None in losses else change}. {fix}",
-        )
-    ]
-
-
-def unused(guarantee: Result) -> list[Remark]:
-    """Remark on the demonstrated steps after a mistake."""
-    if not (steps := guarantee.get("unused")):
-        return []
-    verbs = ("comes", "was") if steps["steps"] == 1 else ("come", "were")
-    text = (
-        f"{steps['steps']} of {steps['of']} demonstrated steps {verbs[0]} after the formula was lost, "
-        f"or after a mistake left the best probability, and {verbs[1]} not used."
-    )
-    return [("note", text)]
 
 
 def pictures(steps: Result | None) -> list[Picture]:
@@ -145,7 +108,8 @@ def pictures(steps: Result | None) -> list[Picture]:
     ]
 
 
-def _steps(value: float | None) -> str:
+def spent(value: float | None) -> str:
+    """The text of a number of expected steps."""
     return "unbounded" if value is None else number(value)
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +12,12 @@ import numpy as np
 
 from jaxltl.app.files.game import task_text
 from jaxltl.app.job import plain, took
+from jaxltl.app.run_job import write_results
 from jaxltl.app.reports.drawing import Picture, draw
-from jaxltl.app.reports.explorer import Explorer, Run, TooLarge, View, explorer
-from jaxltl.app.reports.page import Remark, aligned, number, render_page, render_text
+from jaxltl.app.reports.explorer import Explorer, Run
+from jaxltl.app.reports.page import Report, aligned, number
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.app.wording import Record, Result
-from jaxltl.core.files import atomic_write
 from jaxltl.core.games import GR1, Permissive, Winning
 from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
 from jaxltl.core.models.game import Game, is_deterministic
@@ -98,20 +96,26 @@ def is_confirmed(result: Result) -> bool:
     return bool(claims["system"] and claims["environment"] and sound)
 
 
-def table(result: Result, found: Synthesis) -> str:
-    """A :func:`summary` as text."""
-    reason = f"permissive strategy, {(result['strategy'] or {}).get('reason')}"
-    moves = (result["expected_moves"] or {}).values()
-    lines = render_text(
-        "synthesis.txt",
-        result=result,
-        found=found,
-        reason=textwrap.fill(reason, 96, subsequent_indent="  "),
-        moves=["unbounded" if x is None else number(x) for x in moves],
-        verdict=verdict(result),
-        play=describe_play(found),
-    )
-    return "\n".join(lines)
+def report_of(found: Synthesis) -> Report:
+    """The report of a synthesis, of its :func:`summary`."""
+
+    def values(result: Result) -> Record:
+        reason = f"permissive strategy, {(result['strategy'] or {}).get('reason')}"
+        moves = (result["expected_moves"] or {}).values()
+        return {
+            "found": found,
+            "reason": textwrap.fill(reason, 96, subsequent_indent="  "),
+            "moves": ["unbounded" if x is None else number(x) for x in moves],
+            "verdict": verdict(result),
+            "confirmed": is_confirmed(result),
+            "play": describe_play(found),
+            "tiles": _tiles(result),
+            "title": result["game"],
+            "formula": result["task"],
+            "file_title": "Game file",
+        }
+
+    return Report("synthesis", values, has_remarks=False)
 
 
 def verdict(result: Result) -> str:
@@ -132,14 +136,11 @@ def describe_play(found: Synthesis) -> list[str]:
     play, world = found.play, found.world
     if play is None:
         return []
-    columns = ["state"] if world.places is None else ["system", "environment"]
-    rows = [["step", "mover", "move", *columns]]
+    rows = [["step", "mover", "move", *(world.where(0))]]
     for i, step in enumerate(play.steps):
-        where = world.where(int(found.nodes.world_state[step.node]))
-        cells = [
-            x if world.places is None else f"{x['row']}, {x['column']}" for x in where.values()
-        ]
-        rows.append([str(i), step.mover, step.action, *map(str, cells)])
+        where = world.where(int(found.nodes.world_state[step.node])).values()
+        cells = (f"{x['row']}, {x['column']}" if isinstance(x, dict) else str(x) for x in where)
+        rows.append([str(i), step.mover, step.action, *cells])
     return [f"  {line}" for line in (*aligned(rows), _ending(play, found))]
 
 
@@ -185,8 +186,7 @@ def save(out: Path, found: Synthesis) -> None:
     """
     nodes, winning = found.nodes, found.winning
     if found.strategy is not None and found.restricted is not None:
-        base = np.asarray(found.strategy.base_state[found.restricted.base_state])
-        arrays = _arrays(found, found.restricted.model, base)
+        arrays = _arrays(found, found.restricted.model, found.base)
         arrays["mask"] = found.restricted.model.available
         arrays["memory"] = found.restricted.memory
         _write(out / "strategy.npz", "strategy", found, found.strategy, arrays)
@@ -251,14 +251,16 @@ MOST_MAPS = 36  # of the environment's places
 MOST_PANELS = 6  # of a strategy's memory
 
 
-def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str, bytes]]:
-    """Pictures as SVG by file name: the automaton, and maps if the game has one."""
+def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[Picture, bytes]]:
+    """Pictures: the automaton, and maps if the game has one."""
     # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
 
     made = []
     if found.nodes.automaton is not None and len(found.nodes.automaton.delta) <= 40:
-        made.append(("automaton.svg", plot.automaton(found.nodes.automaton)))
+        caption = "States are named by the remaining formula."
+        picture = Picture("automaton.svg", "Automaton of the formula", None, caption, "play")
+        made.append((picture, plot.automaton(found.nodes.automaton)))
     world = found.world
     if world.text is not None and world.places is not None:
         count = len(world.places)
@@ -266,15 +268,17 @@ def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str
         if count > MOST_MAPS:  # those with the most losing cells, in order
             lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
             few = sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
-        made.append(
-            (
-                "region.svg",
-                plot.game_region(found.wins, world.text, environment=few, wall=world.wall),
-            )
-        )
+        caption = "A map for each place of the environment's robot."
+        region = plot.game_region(found.wins, world.text, environment=few, wall=world.wall)
+        made.append((Picture("region.svg", "Winning region", None, caption), region))
         if found.strategy is not None:
-            made.append(("moves.svg", _moves_picture(found, environment)))
-    return [(name, plot.to_bytes(figure)) for name, figure in made]
+            caption = (
+                "The allowed moves, for one place of the environment's robot; the system wins with "
+                "any choice among them."
+            )
+            picture = Picture("moves.svg", "Permissive strategy", None, caption)
+            made.append((picture, _moves_picture(found, environment)))
+    return [(picture, plot.to_bytes(figure)) for picture, figure in made]
 
 
 def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
@@ -297,17 +301,11 @@ def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
 def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     from jaxltl import plot
 
-    world, nodes, strategy, restricted = (
-        found.world,
-        found.nodes,
-        found.strategy,
-        found.restricted,
-    )
+    world, nodes = found.world, found.nodes
+    strategy, restricted = found.strategy, found.restricted
     assert strategy is not None and restricted is not None and world.places is not None
-    count = len(world.places)
-    base = np.asarray(strategy.base_state)[np.asarray(restricted.base_state)]
-    memory = np.asarray(restricted.memory)
-    state, automaton = nodes.world_state[base], nodes.automaton_state[base]
+    count, memory = len(world.places), np.asarray(restricted.memory)
+    state, automaton = nodes.world_state[found.base], nodes.automaton_state[found.base]
     mine = np.asarray(restricted.model.system)
     can = np.asarray(world.game.available)
     place = state // (2 * count)
@@ -358,15 +356,6 @@ def _title(found: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
 
 _PLAY_STEPS = 40  # of a play of the strategy
 _PLAYERS = ("system", "environment")
-_TITLES = {
-    "automaton.svg": ("Automaton of the formula", "States are named by the remaining formula."),
-    "region.svg": ("Winning region", "A map for each place of the environment's robot."),
-    "moves.svg": (
-        "Permissive strategy",
-        "The allowed moves, for one place of the environment's robot; the system wins with any "
-        "choice among them.",
-    ),
-}
 
 
 def write(found: Synthesis, out: Path, place: int | None, seconds: float) -> Result:
@@ -374,40 +363,12 @@ def write(found: Synthesis, out: Path, place: int | None, seconds: float) -> Res
     for stale in ("result.json", *FILES):
         (out / stale).unlink(missing_ok=True)
     save(out, found)
-    drawn = pictures(found, place)
-    result = summary(found, seconds)
-    text = page(result, found, drawn, (out / "game.toml").read_text())
-    # The result is last, so that its presence implies that all other files are complete.
-    encoded = (json.dumps(result, indent=2, allow_nan=False) + "\n").encode()
-    files = (("report.html", text.encode()), ("result.json", encoded))
-    for name, content in (*drawn, *files):
-        with atomic_write(out / name) as file:
-            file.write(content)
-    return result
-
-
-def page(
-    result: Result, found: Synthesis, pictures: Iterable[tuple[str, bytes]], file_text: str
-) -> str:
-    """The report in HTML."""
+    shown = pictures(found, place)
     part = play_explorer(found)
-    drawn = {key: draw(each).decode() for key, each in part.drawings.items()}
-    shown = [
-        (Picture(name, title, None, caption, "play" if name == "automaton.svg" else ""), svg)
-        for name, svg in pictures
-        for title, caption in [_TITLES[name]]
-    ]
-    return render_page(
-        "synthesis.html",
-        {**result, "task": result["game"], "formula": result["task"]},
-        [(part, drawn)],
-        shown,
-        file_text,
-        remarks=remarks(result),
-        tiles=_tiles(result),
-        play="\n".join(describe_play(found)),
-        file_title="Game file",
-    )
+    parts = [(part, {key: draw(each).decode() for key, each in part.drawings.items()})]
+    result = summary(found, seconds)
+    write_results(out / "game.toml", report_of(found), result, parts, shown)
+    return result
 
 
 def _tiles(result: Result) -> list[tuple[str, str]]:
@@ -427,87 +388,70 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     return tiles
 
 
-def remarks(result: Result) -> list[Remark]:
-    """Remarks on the result, with their kinds."""
-    kinds = {"realizable": "good", "partly realizable": "note", "unrealizable": "warning"}
-    return [
-        (kinds[result["outcome"]], f"The task is {result['outcome']}."),
-        ("good" if is_confirmed(result) else "warning", verdict(result)),
-    ]
-
-
-def play_explorer(found: Synthesis) -> Explorer | TooLarge:
+def play_explorer(found: Synthesis) -> Explorer:
     """Plays on the map: one of the strategy, and one that the environment wins."""
     world, nodes = found.world, found.nodes
     runs = []
     if found.strategy is not None and found.restricted is not None:
         runs.append(Run("the system follows its strategy", _strategy_play(found)))
     if found.play is not None:
-        runs.append(Run("the environment wins", _counter_play(found)))
+        runs.append(Run("the environment wins", _counter_play(found, found.play)))
     visited = {state for run in runs for state, _, _ in run.steps}
-    place = None
-    cells: dict[int, list[int]] = {}
-    caption = "Step by step."
+    place, cells, caption = None, {}, "Step by step."
     if world.text is not None and world.places is not None:
-        place, count = parse_map(world.text), len(world.places)
+        place = parse_map(world.text)
         number = world.places @ [place.shape[1], 1]
-        for state in visited:
-            environment, system, _ = np.unravel_index(state, (count, count, 2))
-            cells[state] = [int(number[system]), int(number[environment])]
+        cells = {state: number[list(world.robots(state))].tolist() for state in visited}
         caption = (
             "Step by step: on the map the larger piece is the system's robot, the smaller one the "
             "environment's."
         )
-    return explorer(
-        View(
-            name="play",
-            title="Plays",
-            caption=caption,
-            size=world.game.num_states if place is None else place.size,
-            place=place,
-            actions=tuple(f"{name} ({player})" for player in _PLAYERS for name in world.actions),
-            wall=world.wall,
-            cells=cells,
-            places={state: world.describe(state) for state in visited},
-        ),
-        nodes.automaton,
-        {},
-        runs,
+    return Explorer(
+        name="play",
+        title="Plays",
+        caption=caption,
+        size=world.game.num_states if place is None else place.size,
+        automaton=nodes.automaton,
+        layers={},
+        runs=runs,
+        place=place,
+        actions=tuple(f"{name} ({player})" for player in _PLAYERS for name in world.actions),
+        wall=world.wall,
+        cells=cells,
+        places={state: world.describe(state) for state in visited},
     )
 
 
-def _counter_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
+def _counter_play(found: Synthesis, play: Play) -> list[tuple[int, int, int | None]]:
     """The play that the environment wins; chance has no action."""
-    assert found.play is not None
-    world, nodes, steps = found.world, found.nodes, found.play.steps
+    nodes, actions = found.nodes, found.world.actions
     moves: list[int | None] = [
         None
         if step.mover == "chance"
-        else _PLAYERS.index(step.mover) * len(world.actions) + world.actions.index(step.action)
-        for step in steps[1:]
+        else _PLAYERS.index(step.mover) * len(actions) + actions.index(step.action)
+        for step in play.steps[1:]
     ]
     return [
         (int(nodes.world_state[step.node]), int(nodes.automaton_state[step.node]), move)
-        for step, move in zip(steps, [*moves, None], strict=True)
+        for step, move in zip(play.steps, [*moves, None], strict=True)
     ]
 
 
 def _strategy_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
     """A play with random moves among those that the strategy allows."""
-    assert found.strategy is not None and found.restricted is not None
+    assert found.restricted is not None
     game, nodes, rng = found.restricted.model, found.nodes, np.random.default_rng(0)
-    base = np.asarray(found.strategy.base_state)[np.asarray(found.restricted.base_state)]
+    base, count = found.base, len(found.world.actions)
     successor, chance = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability, float)
     allowed, system = np.asarray(game.available), np.asarray(game.system)
-    count = len(found.world.actions)
-    initial, place = np.asarray(game.initial, float), (nodes.world_state, nodes.automaton_state)
+    initial = np.asarray(game.initial, float)
     here = int(rng.choice(len(initial), p=initial / initial.sum()))
     steps: list[tuple[int, int, int | None]] = []
     for _ in range(_PLAY_STEPS):
         action = int(rng.choice(np.flatnonzero(allowed[here])))
         shown = None if action >= count else action + count * (not system[here])
-        state, memory = (int(x[base[here]]) for x in place)
-        steps.append((state, memory, shown))
+        node = base[here]
+        steps.append((int(nodes.world_state[node]), int(nodes.automaton_state[node]), shown))
         likely = chance[here, action]
         here = int(rng.choice(successor[here, action], p=likely / likely.sum()))
     return steps

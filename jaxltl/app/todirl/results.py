@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from jaxltl.app.files.scenes import Scene
-from jaxltl.app.files.task_todirl import TodirlTask
-from jaxltl.app.job import about, plain, took
+from jaxltl.app.files.task_todirl import TodirlFile
+from jaxltl.app.job import about, plain
 from jaxltl.app.practical import StepBound, front
 from jaxltl.app.wording import Record, enclosure
 from jaxltl.core.automata.automaton import Automaton
@@ -58,7 +58,7 @@ def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
 class Setup:
     """A task, ready for learning."""
 
-    task: TodirlTask  # the file
+    task: TodirlFile  # the file
     judge: Automaton  # judge, memory: the automata of the formula and of the learner's memory
     memory: Automaton
     worlds: Worlds  # training worlds, then test worlds
@@ -143,7 +143,6 @@ class Outcome:
     training: Judged  # training, test: evaluations (test: None without test worlds)
     test: Judged | None
     seed: int  # the first seed
-    seconds: float = 0.0  # wall time
 
 
 def counted_worlds(setup: Setup) -> np.ndarray:
@@ -202,7 +201,6 @@ def summary(outcome: Outcome) -> Record:
             "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
             "hidden": task.learner.hidden,
         },
-        **took(outcome.seconds),
     }
     time: Record | None = result["training"].get("expected_steps")
     if time and setup.judge.is_cosafe:  # in the world of the largest multiple
