@@ -50,17 +50,14 @@ def brief(
 ) -> Any:
     """A class decorator for a short ``repr``."""
     if cls is None:
-        return functools.partial(_given, facts=facts, drawn=drawn, codes=codes or {})
-    return _given(cls, facts=facts, drawn=drawn, codes=codes or {})
-
-
-def _given(cls: Any, *, facts: Facts | None, drawn: bool, codes: Mapping[str, Any]) -> Any:
+        return functools.partial(brief, facts=facts, drawn=drawn, codes=codes)
+    made: Any = cls
     plain = functools.partial(fields, codes=codes)
-    cls._brief_facts = staticmethod(functools.partial(_safe, facts or plain, plain))
-    cls.__repr__ = _repr
+    made._brief_facts = staticmethod(functools.partial(_safe, facts or plain, plain))
+    made.__repr__ = _repr
     if drawn:
-        cls._repr_svg_, cls._repr_html_ = _svg, _html
-    return cls
+        made._repr_svg_, made._repr_html_ = _svg, _html
+    return made
 
 
 def _repr(self: Any) -> str:
@@ -222,13 +219,10 @@ def value_range(value: object) -> str:
         return f"[{', '.join(number(x) for x in read)}]"
     if read.dtype.kind == "b":
         return f"{np.count_nonzero(read):,} of {read.size:,} true"
-    low, high = read.min(), read.max()
-    missing = 0
-    if low != low:
-        missing = int(np.count_nonzero(np.isnan(read)))
-        if missing == read.size:
-            return "all nan"
-        low, high = np.nanmin(read), np.nanmax(read)
+    known = read[read == read]
+    if not known.size:
+        return "all nan"
+    low, high, missing = known.min(), known.max(), read.size - known.size
     text = f"all {number(low)}" if low == high else f"{number(low)} to {number(high)}"
     return f"{text}, {missing:,} nan" if missing else text
 
@@ -342,10 +336,10 @@ def _leaves(value: object) -> list[Any]:
     jax = sys.modules.get("jax")
     if jax is not None:
         return list(jax.tree.leaves(value))
-    if isinstance(value, dict | list | tuple):
-        inner = value.values() if isinstance(value, dict) else value
-        return [leaf for x in inner for leaf in _leaves(x)]
-    return [value]
+    if not isinstance(value, dict | list | tuple):
+        return [value]
+    inner = value.values() if isinstance(value, dict) else value
+    return [leaf for x in inner for leaf in _leaves(x)]
 
 
 def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
@@ -356,13 +350,12 @@ def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]
         return
     yield f"the last of {' x '.join(f'{n:,}' for n in shape)} rows"
     for one in dataclasses.fields(value):
-        given = getattr(value, one.name)
-        if one.name in (codes or {}) or not is_array(given) or given.ndim < len(shape):
-            yield field(one.name, given, (codes or {}).get(one.name))
-        elif (read := readable(given)) is not None:
-            yield f"{one.name}={value_range(np.take(read, -1, axis=len(shape) - 1))}"
+        given, code = getattr(value, one.name), (codes or {}).get(one.name)
+        read = readable(given) if code is None else None
+        if read is None or read.ndim < len(shape):
+            yield field(one.name, given, code)
         else:
-            yield field(one.name, given)
+            yield f"{one.name}={value_range(np.take(read, -1, axis=len(shape) - 1))}"
 
 
 # --- pictures -------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -20,30 +21,62 @@ from flax.struct import field
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.status import Status
 
-__all__ = ["Static", "dataclass", "field", "metrics", "register", "register_annotated_pytree"]
+__all__ = ["Static", "dataclass", "field", "metrics", "register"]
 
 ClassT = TypeVar("ClassT")
 _CODES = {"status": Status}
 
 
-def register(cls: type, array_fields: Iterable[str], static_fields: Iterable[str] = ()) -> None:
-    """Registers a dataclass as a pytree of `array_fields`, with the values of `static_fields`."""
-    arrays, static = tuple(array_fields), tuple(static_fields)
+class _Text:
+    """Values of text fields, equal to all others, since programs are the same for all."""
+
+    def __init__(self, values: tuple[object, ...]) -> None:
+        self.values = values
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Text)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+def register(
+    cls: type[ClassT],
+    arrays: Iterable[str],
+    static: Iterable[str] = (),
+    text: Mapping[str, object] = MappingProxyType({}),
+) -> type[ClassT]:
+    """Registers a dataclass as a pytree of `arrays`, with the values of the fields `static` and `text`.
+
+    Text, given by field with the value when traced, is equal to any other text in the pytree's
+    structure and is dropped in traced arrays, so that formulas with automata of one shape share a
+    compiled program.
+    """
+    arrays, static = tuple(arrays), tuple(static)
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in arrays)
 
-    def flatten(x: object) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return tuple(getattr(x, f) for f in arrays), tuple(getattr(x, f) for f in static)
-
-    def flatten_with_keys(x: object) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
-        children, aux = flatten(x)
-        return tuple(zip(keys, children, strict=True)), aux
-
-    def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
-        return cls(
-            **dict(zip(arrays, children, strict=True)), **dict(zip(static, aux, strict=True))
+    def flatten(tree: ClassT) -> tuple[tuple[object, ...], tuple[object, ...]]:
+        leaves, values, texts = (
+            tuple(getattr(tree, name) for name in names) for names in (arrays, static, text)
         )
+        return leaves, (values, _Text(texts))
+
+    def flatten_with_keys(
+        tree: ClassT,
+    ) -> tuple[tuple[tuple[object, object], ...], tuple[object, ...]]:
+        leaves, rest = flatten(tree)
+        return tuple(zip(keys, leaves, strict=True)), rest
+
+    def unflatten(rest: tuple[Any, ...], leaves: Iterable[object]) -> ClassT:
+        leaves, (values, texts) = tuple(leaves), rest
+        shown = (
+            text.values() if any(isinstance(x, jax.core.Tracer) for x in leaves) else texts.values
+        )
+        names = (*arrays, *static, *text)
+        return cls(**dict(zip(names, (*leaves, *values, *shown), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))
@@ -55,9 +88,8 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
     made: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
     made.replace = _replace
     static = [f.name for f in dataclasses.fields(made) if not f.metadata.get("pytree_node", True)]
-    register(made, [f.name for f in dataclasses.fields(made) if f.name not in static], static)
-    result: type[ClassT] = made
-    return result
+    arrays = [f.name for f in dataclasses.fields(made) if f.name not in static]
+    return register(made, arrays, static)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))
@@ -76,55 +108,3 @@ class Static:
     """A hashable `value` as a static part of a pytree."""
 
     value: Any = field(pytree_node=False)
-
-
-class _Text:
-    """Values of text fields, equal to all others, since programs are the same for all."""
-
-    def __init__(self, values: tuple[object, ...]) -> None:
-        self.values = values
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Text)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-_Rest = tuple[tuple[object, ...], _Text]
-
-
-def register_annotated_pytree(
-    cls: type[ClassT], arrays: Iterable[str], static: Iterable[str], text: Mapping[str, object]
-) -> type[ClassT]:
-    """Registers a dataclass as a pytree with text, given by field with the value when traced.
-
-    Text is equal to any other text in the pytree's structure and is dropped in traced arrays, so
-    that formulas with automata of one shape share a compiled program.
-    """
-    arrays, static, names = tuple(arrays), tuple(static), tuple(text)
-
-    def flatten(tree: ClassT) -> tuple[list[object], _Rest]:
-        values = tuple(getattr(tree, name) for name in static)
-        return [getattr(tree, name) for name in arrays], (
-            values,
-            _Text(tuple(getattr(tree, name) for name in names)),
-        )
-
-    def flatten_with_keys(tree: ClassT) -> tuple[list[tuple[object, object]], _Rest]:
-        leaves, rest = flatten(tree)
-        keys = map(jax.tree_util.GetAttrKey, arrays)
-        return list(zip(keys, leaves, strict=True)), rest
-
-    def unflatten(rest: _Rest, leaves: Iterable[object]) -> ClassT:
-        values, shown = rest
-        leaves = tuple(leaves)
-        traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
-        return cls(
-            **dict(zip(arrays, leaves, strict=True)),
-            **dict(zip(static, values, strict=True)),
-            **(text if traced else dict(zip(names, shown.values, strict=True))),
-        )
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
-    return cls

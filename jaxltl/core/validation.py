@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats
 
 ROW_SUM_TOLERANCE = 1e-6  # largest error of the sum of a distribution that is given
 
 _MAX_REPR = 60  # characters of a value in an error message
-_INEXACT = 2.0**53  # integers from here on are not all floats
 
 
 @contextlib.contextmanager
@@ -119,6 +118,17 @@ def shorten(value: object) -> str:
     return text if len(text) <= _MAX_REPR else f"{text[:_MAX_REPR]}..."
 
 
+def first_true(mask: Any) -> list[Any]:
+    """At most one index, of the first True entry: an int, or a list of them along several axes.
+
+    >>> first_true(np.array([False, True, True])), first_true(np.eye(2) > 1)
+    ([1], [])
+    """
+    place = np.argwhere(mask)[:1]
+    found: list[Any] = (place[:, 0] if place.shape[1] == 1 else place).tolist()
+    return found
+
+
 def float_array(name: str, value: object) -> Floats:
     """Converts to an array in double precision."""
     try:
@@ -138,14 +148,6 @@ def boolean_array(name: str, value: object) -> Booleans:
     if array.dtype != bool and (array.dtype.kind not in "iuf" or not np.isin(array, (0, 1)).all()):
         raise ValueError(f"{name} is {shorten(value)}; give True or False for each entry.")
     return array.astype(bool)
-
-
-def integer_array(name: str, value: object) -> Integers:
-    """Converts to an array of integers."""
-    array = float_array(name, value)
-    if not (np.abs(array) < _INEXACT).all() or (array != np.floor(array)).any():
-        raise ValueError(f"{name} is {shorten(value)}; give integers.")
-    return array.astype(np.int64)
 
 
 def finite_number(name: str, value: object) -> float:

@@ -156,7 +156,7 @@ def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: 
     environment, agent = require_environment(environment), require_agent(agent)
     begin, path = begin_episode(require_key(key), environment, agent)
 
-    def move(now: Underway, time: jax.Array) -> tuple[Underway, Move]:
+    def move(now: Underway, time: jax.Array) -> tuple[Underway, Episode]:
         return continue_episode(now, environment, agent, jax.random.fold_in(path, time))
 
     end, made = lax.scan(move, begin, jnp.arange(num_steps))
@@ -164,17 +164,11 @@ def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: 
     def append(row: PyTree, end: PyTree) -> PyTree:
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
-    return Episode(
-        append(made.world, end.world),
-        made.observation,
-        made.action,
-        made.reward,
-        made.cost,
-        append(made.label, environment.labels(end.world)),
-        made.valid,
-        end.terminated,
-        end.truncated,
-        made.discount,
+    return made._replace(
+        world=append(made.world, end.world),
+        label=append(made.label, environment.labels(end.world)),
+        terminated=end.terminated,
+        truncated=end.truncated,
     )
 
 
@@ -188,20 +182,6 @@ class Underway(NamedTuple):
     truncated: jax.Array
 
 
-@brief
-class Move(NamedTuple):
-    """One step of an :class:`Episode`, with the state before it."""
-
-    world: PyTree
-    observation: PyTree
-    action: PyTree
-    reward: jax.Array
-    cost: jax.Array
-    label: jax.Array
-    valid: jax.Array
-    discount: jax.Array
-
-
 def begin_episode(key: Key, environment: Environment, agent: Agent) -> tuple[Underway, Key]:
     """The initial state of an episode, and the key into which step numbers are folded."""
     start, path = jax.random.split(key)
@@ -211,8 +191,8 @@ def begin_episode(key: Key, environment: Environment, agent: Agent) -> tuple[Und
 
 def continue_episode(
     now: Underway, environment: Environment, agent: Agent, key: Key
-) -> tuple[Underway, Move]:
-    """One step of an episode; the identity after its end."""
+) -> tuple[Underway, Episode]:
+    """One step of an episode, with the state and the label before it; the identity after the end."""
     world, active = now.world, ~(now.terminated | now.truncated)
     act_key, step_key = jax.random.split(key)
     observation, allowed = environment.observe(world), allowed_in(environment, world)
@@ -225,8 +205,17 @@ def continue_episode(
         t | (active & jnp.asarray(f, bool))
         for t, f in ((now.terminated, found.terminated), (now.truncated, found.truncated))
     )
-    return Underway(after, memory, terminated, truncated), Move(
-        world, observation, action, reward, cost, environment.labels(world), active, discount
+    return Underway(after, memory, terminated, truncated), Episode(
+        world,
+        observation,
+        action,
+        reward,
+        cost,
+        environment.labels(world),
+        active,
+        terminated,
+        truncated,
+        discount,
     )
 
 
@@ -311,10 +300,12 @@ def _reset_clock(reset: Callable[..., PyTree], key: Key) -> PyTree:
 def _step_clock(
     limit: jax.Array, step: Callable[..., Timestep], timed: PyTree, action: PyTree, key: Key
 ) -> Timestep:
-    found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
-    return found._replace(
-        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
-    )
+    return _ticked(limit, Timestep(*step(timed[0], action, key)), timed[1] + 1)
+
+
+def _ticked(limit: jax.Array, found: Timestep, time: jax.Array) -> Timestep:
+    truncated = jnp.asarray(found.truncated, bool) | (time >= limit)
+    return found._replace(world=(found.world, time), truncated=truncated)
 
 
 def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
@@ -326,11 +317,8 @@ def _clocked(
     limit: jax.Array, outcomes: Callable[..., PyTree], timed: PyTree, action: PyTree
 ) -> tuple[Timestep, jax.Array]:
     found, probability = outcomes(timed[0], action)
-    found, time = Timestep(*found), timed[1] + 1
-    times = jnp.full(jnp.shape(probability), time)
-    return found._replace(
-        world=(found.world, times), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
-    ), probability
+    times = jnp.full(jnp.shape(probability), timed[1] + 1)
+    return _ticked(limit, Timestep(*found), times), probability
 
 
 def _of_first(function: Callable[..., PyTree], timed: PyTree) -> PyTree:

@@ -9,6 +9,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
+from jaxltl.core.validation import first_true
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models import MDP, DenseMDP, Game, SparseMDP, sample_successor, to_padded
@@ -127,7 +128,7 @@ def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | Non
             f"{list(available.shape)}, of each action in each state."
         )
     weight = np.where(available, plays, 0)
-    for state in np.flatnonzero(~system & ~weight.any(1))[:1]:
+    for state in first_true(~system & ~weight.any(1)):
         raise ValueError(
             f"opponent: it moves in state {state}, but has no weight on what is "
             "available there; give some."

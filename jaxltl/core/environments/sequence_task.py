@@ -18,6 +18,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
@@ -162,7 +163,7 @@ def sequence_sampler(
             "Booleans, a row for each set and a column for each event."
         )
     groups = np.eye(groups.size, dtype=bool)[groups] if groups.ndim == 1 else groups
-    for row in np.flatnonzero(~groups.any(-1))[:1]:
+    for row in first_true(~groups.any(-1)):
         raise ValueError(f"sets: row {row} has no event; leave it out.")
     most = int(np.flatnonzero(found["reach"])[-1]) + 1 + int(np.flatnonzero(found["avoid"])[-1])
     if most > len(groups):

@@ -12,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 from jaxltl.core.environments.environment import (
     Environment,
     Finite,
@@ -31,6 +32,7 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 _BATCH = 1024  # states of a batch, at most
 _BYTES = 2**26  # bytes of the successors of a batch, at most
 _LIVE, _TERMINATED, _TRUNCATED = range(3)
+_EVIDENCE = ("keyless", "told", "keys", "distinct")  # from the strongest to the weakest
 
 
 def _facts(value: Table) -> Iterator[str]:
@@ -129,23 +131,17 @@ def tabulate(
     kind = _Kind(inner, apart, keys, inner.reset(keys[0]))
     begun, probability, evidence = _begin(kind, environment, worlds)
     listed = _search(kind, begun, max_states)
-    if evidence == "keys" or listed.evidence == "keys":
-        evidence = "keys"
-    elif "told" in (evidence, listed.evidence):
-        evidence = "told"
-    if not _left_out_is_idle(kind):
-        evidence = "distinct"
+    idle = "keyless" if _left_out_is_idle(kind) else "distinct"
     initial = np.zeros(len(listed.ended))
     np.add.at(initial, listed.start, probability)
-    world = _joined(listed.world)
     return Table(
-        _model(kind, listed, initial, _labels(kind, world, listed.ended.size)),
-        _typed(kind, world),
+        _model(inner, listed, initial),
+        _typed(kind, listed.world),
         listed.start,
         listed.ended == _TERMINATED,
         listed.ended == _TRUNCATED,
         limit,
-        evidence,
+        max(evidence, listed.evidence, idle, key=_EVIDENCE.index),
     )
 
 
@@ -223,11 +219,10 @@ def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[PyTre
         count = _count("worlds", worlds, shape)
         return _plain(worlds), np.full(count, 1 / count), "keyless"
     drawn = jax.tree.map(np.asarray, _resets(kind))
-    seen = _rows(_told_apart(kind, drawn))
+    seen = _rows(_codes(kind, drawn)[0])
     if inner.starts is not None:
         worlds, probability = inner.starts()
-        count = _count("starts", worlds, shape)
-        probability = np.asarray(probability, np.float64)
+        count, probability = _count("starts", worlds, shape), np.asarray(probability, np.float64)
         if (
             probability.shape != (count,)
             or not (probability >= 0).all()
@@ -237,12 +232,11 @@ def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[PyTre
                 f"starts: the probabilities have shape {list(probability.shape)} and sum to "
                 f"{probability.sum():.9g}; give one for each of the {count} worlds, and 1 in sum."
             )
-        told = _rows(_told_apart(kind, _plain(worlds)))
-        if not np.isin(seen, told[probability > 0]).all():
+        possible = np.flatnonzero(probability)
+        worlds = _plain(jax.tree.map(lambda x: jnp.asarray(x)[possible], worlds))
+        if not np.isin(seen, _rows(_codes(kind, worlds)[0])).all():
             raise ValueError("reset draws a world that starts does not tell; give all of them.")
-        possible = probability > 0
-        worlds = jax.tree.map(lambda x: jnp.asarray(x)[np.flatnonzero(possible)], worlds)
-        return _plain(worlds), probability[possible] / probability.sum(), "told"
+        return worlds, probability[possible] / probability.sum(), "told"
     if len(np.unique(seen)) > 1:
         raise ValueError(
             f"tabulate: reset is random, {len(np.unique(seen))} worlds from {len(seen)} keys, and "
@@ -263,17 +257,23 @@ def _seen(kind: _Kind, world: PyTree) -> jax.Array:
 
 
 @jax.jit
-def _codes(kind: _Kind, plain: PyTree) -> jax.Array:
-    return jax.vmap(lambda x: _seen(kind, _typed(kind, x)))(plain)
+def _codes_of_batch(kind: _Kind, plain: PyTree) -> tuple[jax.Array, jax.Array]:
+    def one(x: PyTree) -> tuple[jax.Array, jax.Array]:
+        world = _typed(kind, x)
+        return _seen(kind, world), kind.environment.labels(world)
+
+    return jax.vmap(one)(plain)
 
 
-def _told_apart(kind: _Kind, plain: PyTree) -> np.ndarray:
-    """``uint8[N, W]``, the distinguishing bytes of states."""
+def _codes(kind: _Kind, plain: PyTree) -> tuple[np.ndarray, np.ndarray]:
+    """``uint8[N, W]`` and ``bool[N, P]``, the distinguishing bytes of states and their labels."""
     plain = jax.tree.map(np.asarray, plain)
-    count = len(jax.tree.leaves(plain)[0])
-    return np.concatenate(
-        [np.asarray(_codes(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
-    )
+    parts = [
+        jax.tree.map(lambda x, n=rows: np.asarray(x)[:n], _codes_of_batch(kind, batch))
+        for rows, batch in _batches(plain, len(jax.tree.leaves(plain)[0]), _BATCH)
+    ]
+    found: tuple[np.ndarray, np.ndarray] = _joined(parts)
+    return found
 
 
 def _fits(worlds: PyTree, shape: PyTree) -> bool:
@@ -334,6 +334,7 @@ class _Followers(NamedTuple):
     """Successors of a batch ``[B, A, K]``, with bytes of states `seen` and of samples `drawn` by key."""
 
     world: PyTree
+    label: Array
     seen: Array
     probability: Array
     reward: Array
@@ -343,13 +344,14 @@ class _Followers(NamedTuple):
 
 
 class _Listed(NamedTuple):
-    """The result of the search, as parts; `world` and `ended` are of states."""
+    """The result of the search: of all states, and of the transitions of those that are live."""
 
-    world: list[PyTree]
+    world: PyTree
+    label: np.ndarray
     ended: np.ndarray
     start: np.ndarray
-    successor: list[np.ndarray]
-    parts: list[_Followers]
+    successor: np.ndarray
+    followers: _Followers
     evidence: str
 
 
@@ -365,35 +367,31 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
     def seen(found: Timestep) -> jax.Array:
         return jnp.append(_seen(kind, found.world), _ended(found))
 
-    def drawn(action: PyTree) -> Timestep:
-        def one(key: Key) -> Timestep:
+    def one(action: PyTree) -> _Followers:
+        def draw(key: Key) -> Timestep:
             found = Timestep(*environment.step(world, action, key))
             return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
 
-        return jax.vmap(one)(kind.keys[:draws])
-
-    def one(action: PyTree) -> _Followers:
-        tries = drawn(action)
-        found, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
-        if environment.outcomes is not None:
+        tries = jax.vmap(draw)(kind.keys[:draws])
+        drawn = jax.vmap(seen)(tries)
+        if environment.outcomes is None:
+            found, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
+            paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
+            drawn = jnp.concatenate([drawn, paid], axis=-1)
+        else:
             told, probability = environment.outcomes(world, action)
             probability = jnp.asarray(probability)
-            told = Timestep(*told)
-            rest = [jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in told[1:]]
-            found = Timestep(told.world, *rest)
-        mask = jnp.bool_(True)
-        drawn_again = jax.vmap(seen)(tries)
-        if environment.outcomes is None:  # otherwise `outcomes` gives the rewards
-            paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
-            drawn_again = jnp.concatenate([drawn_again, paid], axis=-1)
+            rest = [jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in tuple(told)[1:]]
+            found = Timestep(told[0], *rest)
         return _Followers(
             _plain(found.world),
+            jax.vmap(environment.labels)(found.world),
             jax.vmap(seen)(found),
             probability,
             found.reward,
             found.cost,
-            mask,
-            drawn_again,
+            jnp.bool_(True),
+            drawn,
         )
 
     every = jax.vmap(one)(jnp.arange(environment.actions.num, dtype=jnp.int32))  # type: ignore[union-attr]
@@ -408,29 +406,27 @@ def _followers(draws: int, kind: _Kind, plain: PyTree) -> _Followers:
 
 def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
     """Breadth-first search in batches."""
-    environment = kind.environment
-    shape = kind.like
+    environment, shape = kind.environment, kind.like
     action = jax.ShapeDtypeStruct((), jnp.int32)
-    told = environment.outcomes is not None
+    evidence = "told"
     if environment.outcomes is not None:
         _count("outcomes", jax.eval_shape(environment.outcomes, shape, action)[0][0], shape)
-    keyless = not told and not reads_key(environment.step, shape, action, kind.keys[0])
-    draws = 1 if keyless else len(kind.keys)
-    width = sum(
-        x.size * x.dtype.itemsize
-        for x in jax.tree.leaves(
-            jax.eval_shape(partial(_followers, draws), kind, jax.tree.map(lambda x: x[:1], begun))
-        )
-    )
+    else:
+        reads = reads_key(environment.step, shape, action, kind.keys[0])
+        evidence = "keys" if reads else "keyless"
+    draws = 1 if evidence == "keyless" else len(kind.keys)
+    one = jax.tree.map(lambda x: x[:1], begun)
+    results = jax.tree.leaves(jax.eval_shape(partial(_followers, draws), kind, one))
+    width = sum(x.size * x.dtype.itemsize for x in results)
     size = int(np.clip(_BYTES // max(width, 1), 1, _BATCH))
 
     number: dict[bytes, int] = {}
     ended: list[int] = []
-    codes = _told_apart(kind, begun)
+    codes, label = _codes(kind, begun)
     live = np.full((len(codes), 1), _LIVE, np.uint8)
     start, first = _numbered(_rows(np.concatenate([codes, live], axis=1)), number, ended)
-    frontier = jax.tree.map(lambda x: np.asarray(x)[first], begun)
-    listed, successor = [frontier], []
+    listed = [jax.tree.map(lambda x: np.asarray(x)[first], (begun, label))]
+    frontier, successor = listed[0][0], []
     parts: list[_Followers] = []
     while (count := len(jax.tree.leaves(frontier)[0])) > 0:
         new = []
@@ -438,31 +434,32 @@ def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
             found = jax.tree.map(
                 lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch)
             )
-            _check(found, sum(len(x.allowed) for x in parts), told)
+            _check(found, sum(len(x.allowed) for x in parts), evidence == "told")
             real = found.allowed[..., None] & (found.probability > 0)
-            after, before = _rows(found.seen), len(ended)
-            places, first = np.zeros(real.shape, np.int64), np.flatnonzero(real)
-            places[real], new_ones = _numbered(after[real], number, ended)
-            first = first[new_ones]
+            before, places = len(ended), np.zeros(real.shape, np.int64)
+            places[real], first = _numbered(_rows(found.seen)[real], number, ended)
             if len(ended) > max_states:
                 raise ValueError(
                     f"tabulate: there are more than max_states={max_states} worlds. Allow more, "
                     "take less into a world, or say by distinct= what of it matters."
                 )
             successor.append(places)
-            parts.append(found._replace(world=None, seen=None, drawn=None))
+            parts.append(found._replace(world=None, label=None, seen=None, drawn=None))
             listed.append(
-                jax.tree.map(
-                    lambda x, n=after.shape, f=first: x.reshape(-1, *x.shape[len(n) :])[f],
-                    found.world,
-                )
+                jax.tree.map(lambda x, r=real, f=first: x[r][f], (found.world, found.label))
             )
             going = np.array(ended[before:], int) == _LIVE
-            new.append(jax.tree.map(lambda x, g=going: x[g], listed[-1]))
+            new.append(jax.tree.map(lambda x, g=going: x[g], listed[-1][0]))
         frontier = _joined(new)
-    evidence = "told" if told else "keyless" if keyless else "keys"
+    world, label = _joined(listed)
     return _Listed(
-        listed, np.array(ended, np.uint8), start.astype(np.int32), successor, parts, evidence
+        world,
+        label,
+        np.array(ended, np.uint8),
+        start.astype(np.int32),
+        np.concatenate(successor),
+        _joined(parts),
+        evidence,
     )
 
 
@@ -505,20 +502,20 @@ def _check(found: _Followers, base: int, told: bool) -> None:
     if told:
         sums = found.probability.sum(axis=-1, dtype=np.float64)
         bad = ((np.abs(sums - 1) > 1e-5) | (found.probability < 0).any(axis=-1)) & found.allowed
-        for b, a in np.argwhere(bad)[:1]:
+        for b, a in first_true(bad):
             raise ValueError(
                 f"outcomes: of action {a} in world {base + b} the probabilities are "
                 f"{found.probability[b, a].tolist()}; they must be a distribution."
             )
         seen = _rows(found.seen)
         known = (drawn[..., None] == seen[:, :, None]) & (found.probability > 0)[:, :, None]
-        for b, a in np.argwhere(~known.any(axis=-1).all(axis=-1) & found.allowed)[:1]:
+        for b, a in first_true(~known.any(axis=-1).all(axis=-1) & found.allowed):
             raise ValueError(
                 f"outcomes: action {a} in world {base + b} leads to a world that they do not tell; "
                 "give every world to which the step may lead, with how the episode ends there."
             )
         return
-    for b, a in np.argwhere((drawn != drawn[..., :1]).any(axis=-1) & found.allowed)[:1]:
+    for b, a in first_true((drawn != drawn[..., :1]).any(axis=-1) & found.allowed):
         raise ValueError(
             f"tabulate: step is random: action {a} in world {base + b} leads to "
             f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "
@@ -534,24 +531,11 @@ def _joined(parts: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-@jax.jit
-def _labeled(kind: _Kind, plain: PyTree) -> jax.Array:
-    return jax.vmap(lambda x: kind.environment.labels(_typed(kind, x)))(plain)
-
-
-def _labels(kind: _Kind, plain: PyTree, count: int) -> np.ndarray:
-    """``bool[S, P]``."""
-    return np.concatenate(
-        [np.asarray(_labeled(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
-    )
-
-
-def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray) -> SparseMDP:
-    environment = kind.environment
+def _model(environment: Environment, listed: _Listed, initial: np.ndarray) -> SparseMDP:
     num_states, live = len(listed.ended), np.flatnonzero(listed.ended == _LIVE)
-    followers = _joined(listed.parts)
+    followers = listed.followers
     state, action = np.nonzero(followers.allowed)
-    successor = np.concatenate(listed.successor)[state, action]
+    successor = listed.successor[state, action]
     columns = [
         np.asarray(x, np.float64)[state, action]
         for x in (followers.probability, followers.reward, followers.cost)
@@ -576,7 +560,7 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
         successor,
         probability,
         initial=initial,
-        label=label,
+        label=listed.label,
         propositions=environment.propositions,
         rewards=rewards,
         action=np.concatenate([action, np.zeros(len(over), np.int64)])[order],

@@ -22,7 +22,7 @@ import numpy as np
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core import validation
+from jaxltl.core import struct, validation
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.environments.environment import (
     ENDINGS,
@@ -40,7 +40,6 @@ from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.struct import register_annotated_pytree
 
 _Tree = TypeVar("_Tree")
 
@@ -124,7 +123,7 @@ class TaskTables:
     state_names: tuple[str, ...] = ()
 
 
-register_annotated_pytree(
+struct.register(
     TaskTables,
     arrays=[field.name for field in fields(TaskTables) if field.name != "state_names"],
     static=(),

@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.convert import product_rows, to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.kernels import gather, segment_ids
 from jaxltl.core.models.ops.operators import is_deterministic
-from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
@@ -36,7 +35,7 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
     if is_sharded(model):
         return _named_reward(model, reward)
     if isinstance(model, Product) and isinstance(model.mdp, SparseMDP):
-        model = _written_out(model) if is_traced(model) else to_sparse(model)
+        model = product_rows(model.mdp, model) if is_traced(model) else to_sparse(model)
     if not isinstance(model, SparseMDP):
         return model, reward
     if reward is not None:
@@ -83,47 +82,3 @@ def flatten_policy(model: Model, policy: Array) -> Array:
     if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
         return policy.reshape(-1)
     return policy
-
-
-def _written_out(model: Product) -> SparseMDP:
-    world: SparseMDP = model.mdp
-    num_memory = model.num_memory
-    row_start, entry_start = jnp.asarray(world.row_start), jnp.asarray(world.entry_start)
-    # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
-    number = np.arange(model.num_states, dtype=np.int32)
-    state, memory = number // num_memory, number % num_memory
-    starts = _repeated(row_start, num_memory)
-    of = segment_ids(starts, world.num_rows * num_memory)
-    row = gather(row_start[state], of) + jnp.arange(of.size, dtype=jnp.int32) - starts[of]
-    first = entry_start[row_start]  # of each state's entries
-    begins = gather(_repeated(first, num_memory), of) + entry_start[row] - gather(first[state], of)
-    begins = jnp.append(begins, world.num_transitions * num_memory).astype(entry_start.dtype)
-    of_entry = segment_ids(begins, world.num_transitions * num_memory)
-    entry = gather(entry_start[row], of_entry) + (
-        jnp.arange(of_entry.size, dtype=jnp.int32) - begins[of_entry]
-    )
-    place = gather(of, of_entry)
-    target = flat_successor(
-        gather(world.successor, entry),
-        model.next_memory,
-        gather(state, place),
-        gather(memory, place),
-        model.label_on,
-    )
-
-    return SparseMDP(
-        row_start=starts,
-        entry_start=begins,
-        successor=target.astype(jnp.int32),
-        probability=gather(world.probability, entry),
-        initial=model.initial.ravel(),
-        label=world.label,
-        rewards={n: x.gathered(state, row, entry) for n, x in world.rewards.items()},
-    )
-
-
-def _repeated(start: jax.Array, times: int) -> jax.Array:
-    """The starts ``[S * times + 1]`` of segments, each of which is repeated `times` times."""
-    width = jnp.diff(start)
-    begins = start[:-1, None] * times + jnp.arange(times, dtype=start.dtype) * width[:, None]
-    return jnp.append(begins.ravel(), start[-1] * times)

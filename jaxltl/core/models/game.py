@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Generic, cast
+from operator import attrgetter
+from typing import Generic
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
 
@@ -22,10 +22,8 @@ from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.protocols import (
     Arena,
     Array,
-    LabelledModel,
     Model,
     PyTree,
-    SuccessorModel,
     base_model,
 )
 from jaxltl.core.models.sparse import SparseMDP
@@ -59,55 +57,23 @@ class Game(Generic[Arena]):
     mdp: Arena
     system: jax.Array
 
-    @property
-    def num_states(self) -> int:
-        """S, or S times Q in a product."""
-        return self.mdp.num_states
-
-    @property
-    def num_actions(self) -> int:
-        """A; ValueError for a sparse model."""
-        return cast(SuccessorModel, self.mdp).num_actions
-
-    @property
-    def num_successors(self) -> int:
-        """K."""
-        return cast(SuccessorModel, self.mdp).num_successors
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """The shape of a value: ``(S,)``, or ``(S, Q)`` in a product."""
-        return self.mdp.state_shape
-
-    @property
-    def successor_probability(self) -> Array:
-        """``float[S, A, K]``."""
-        return cast(SuccessorModel, self.mdp).successor_probability
-
-    @property
-    def available(self) -> Array:
-        """``bool[S, A]``."""
-        return cast(SuccessorModel, self.mdp).available
-
-    @property
-    def initial(self) -> Array:
-        """``float[S]``, the initial distribution."""
-        return self.mdp.initial
-
-    @property
-    def label(self) -> Array:
-        """``bool[S, P]``, the propositions that hold in each state."""
-        return cast(LabelledModel, self.mdp).label
-
-    @property
-    def propositions(self) -> tuple[str, ...]:
-        """The P names."""
-        return cast(LabelledModel, self.mdp).propositions
-
-    @property
-    def dtype(self) -> jnp.dtype:
-        """The dtype of the probabilities."""
-        return self.mdp.dtype
+    num_states = property(attrgetter("mdp.num_states"), doc="S, or S times Q in a product.")
+    num_actions = property(attrgetter("mdp.num_actions"), doc="A; ValueError for a sparse model.")
+    num_successors = property(attrgetter("mdp.num_successors"), doc="K.")
+    state_shape = property(
+        attrgetter("mdp.state_shape"),
+        doc="The shape of a value: ``(S,)``, or ``(S, Q)`` in a product.",
+    )
+    successor_probability = property(
+        attrgetter("mdp.successor_probability"), doc="``float[S, A, K]``."
+    )
+    available = property(attrgetter("mdp.available"), doc="``bool[S, A]``.")
+    initial = property(attrgetter("mdp.initial"), doc="``float[S]``, the initial distribution.")
+    label = property(
+        attrgetter("mdp.label"), doc="``bool[S, P]``, the propositions that hold in each state."
+    )
+    propositions = property(attrgetter("mdp.propositions"), doc="The P names.")
+    dtype = property(attrgetter("mdp.dtype"), doc="The dtype of the probabilities.")
 
 
 def make_game(model: Arena, system: Sequence[bool] | chex.Array) -> Game[Arena]:
@@ -210,6 +176,7 @@ def _register_on_base(primitive: PyTree) -> None:
 for _primitive in (
     choices,
     choice_shape,
+    operators.combined,
     operators.expectation,
     operators.exists_successor,
     operators.forall_successor,

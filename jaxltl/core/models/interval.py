@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 
 from jaxltl.core.models import facts
 from jaxltl.core.pretty_print import brief, number, readable, value_range
@@ -19,19 +21,19 @@ from jaxltl.core.models.sparse import (
     Rewards,
     SparseMDP,
     check_entries,
-    checked_starts,
+    checked_rows,
     make_sparse,
     placed,
 )
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, uncertainty_sets
+from jaxltl.core.sparse.linear.extended_precision import two_sum
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
-# Names under which numbers of entries travel with the entries, and radii with the rows.
-_ENTRIES = {"lower": "\0lower", "upper": "\0upper", "center": "\0center"}
-_RADIUS = "\0radius"
+_ENDS = ("lower", "upper", "center", "radius")
+_PREFIX = "\0"  # of the names of rewards that are ends, centers or radii
 
 
 def _facts(model: IntervalMDP) -> Iterator[str]:
@@ -78,50 +80,21 @@ class IntervalMDP:
         """S."""
         return self.nominal.num_states
 
-    @property
-    def num_rows(self) -> int:
-        """R, the choices of all states."""
-        return self.nominal.num_rows
-
-    @property
-    def num_transitions(self) -> int:
-        """T, the entries of all choices."""
-        return self.nominal.num_transitions
-
-    @property
-    def is_chain(self) -> bool:
-        """True if every state has one choice."""
-        return self.nominal.is_chain
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """The shape of a value: ``(S,)``."""
-        return self.nominal.state_shape
-
-    @property
-    def dtype(self) -> np.dtype:
-        """The dtype of the nominal probabilities."""
-        return self.nominal.dtype
-
-    @property
-    def initial(self) -> Array:
-        """``float[S]``, the initial distribution."""
-        return self.nominal.initial
-
-    @property
-    def label(self) -> Array:
-        """``bool[S, P]``, the propositions that hold in each state."""
-        return self.nominal.label
-
-    @property
-    def propositions(self) -> tuple[str, ...]:
-        """The P names."""
-        return self.nominal.propositions
-
-    @property
-    def rewards(self) -> dict[str, Rewards]:
-        """Named :class:`~jaxltl.core.models.sparse.Rewards`."""
-        return self.nominal.rewards
+    num_rows = property(attrgetter("nominal.num_rows"), doc="R, the choices of all states.")
+    num_transitions = property(
+        attrgetter("nominal.num_transitions"), doc="T, the entries of all choices."
+    )
+    is_chain = property(attrgetter("nominal.is_chain"), doc="True if every state has one choice.")
+    state_shape = property(attrgetter("nominal.state_shape"), doc="The shape of a value: ``(S,)``.")
+    dtype = property(attrgetter("nominal.dtype"), doc="The dtype of the nominal probabilities.")
+    initial = property(attrgetter("nominal.initial"), doc="``float[S]``, the initial distribution.")
+    label = property(
+        attrgetter("nominal.label"), doc="``bool[S, P]``, the propositions that hold in each state."
+    )
+    propositions = property(attrgetter("nominal.propositions"), doc="The P names.")
+    rewards = property(
+        attrgetter("nominal.rewards"), doc="Named :class:`~jaxltl.core.models.sparse.Rewards`."
+    )
 
     @cached_property
     def host(self) -> UncertainMDP:
@@ -149,8 +122,8 @@ class IntervalMDP:
 
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but merges none."""
-        ends = _travelling(self.lower, self.upper, self.center, self.radius)
-        return _taken_apart(change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
+        ends = {name: getattr(self, name) for name in _ENDS}
+        return _arrived(change(replace(self.nominal, rewards=self.rewards | _travelling(**ends))))
 
 
 def require_interval(model: Model) -> IntervalMDP:
@@ -174,27 +147,24 @@ def refuse_ball(model: IntervalMDP, why: str) -> None:
         )
 
 
-def _travelling(lower: Array, upper: Array, center: Array, radius: Array) -> dict[str, Rewards]:
-    found = {
-        _ENTRIES["lower"]: Rewards(transition=lower),
-        _ENTRIES["upper"]: Rewards(transition=upper),
+def _travelling(**ends: Array) -> dict[str, Rewards]:
+    """Numbers of entries and rows as rewards, which travel with these."""
+    return {
+        _PREFIX + name: Rewards(**{"choice" if name == "radius" else "transition": x})
+        for name, x in ends.items()
+        if x is not None
     }
-    if radius is None:
-        return found
-    return found | {_ENTRIES["center"]: Rewards(transition=center), _RADIUS: Rewards(choice=radius)}
 
 
-def _taken_apart(model: SparseMDP) -> IntervalMDP:
-    rewards, ball = dict(model.rewards), {}
-    if _RADIUS in rewards:
-        ball = {"radius": np.asarray(rewards.pop(_RADIUS).choice)}
+def _arrived(model: SparseMDP) -> IntervalMDP:
+    """The inverse of :func:`_travelling`."""
+    own = {name: x for name, x in model.rewards.items() if not name.startswith(_PREFIX)}
     ends = {
-        name: np.asarray(rewards.pop(key).transition)
-        for name, key in _ENTRIES.items()
-        if key in rewards
+        name.removeprefix(_PREFIX): np.asarray(x.choice if x.transition is None else x.transition)
+        for name, x in model.rewards.items()
+        if name not in own
     }
-    nominal = model.replace(rewards=rewards)  # type: ignore[attr-defined]
-    return IntervalMDP(nominal=nominal, **ends, **ball)
+    return IntervalMDP(replace(model, rewards=own), **ends)
 
 
 def make_interval(
@@ -318,69 +288,83 @@ def interval_rows(
       >>> rough.num_states, rough.upper.tolist()
       (3, [0.7, 0.6, 1.0, 1.0])
     """
-    entry_start, successor = np.asarray(entry_start), np.asarray(successor)
+    successor = np.asarray(successor)
     lower, upper = validation.float_array("lower", lower), validation.float_array("upper", upper)
-    ball = _ball(center, radius, successor.shape, entry_start.size - 1)
     if not lower.shape == upper.shape == successor.shape:
         raise ValueError(
             f"successor has shape {successor.shape}, lower {lower.shape} and upper "
             f"{upper.shape}; all must be [transitions]."
         )
-    entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
-    num_rows = entry_start.size - 1
-    starts = checked_starts(
-        "row_start",
-        np.arange(num_rows + 1) if row_start is None else row_start,
-        num_rows,
-        "choices",
-    )
-    if starts.size < 2:
-        raise ValueError("the model has no state; it needs at least one.")
+    starts, entry_start = checked_rows(row_start, entry_start, successor.size)
+    given = _ball(center, radius, successor.shape, entry_start.size - 1)
     check_entries(starts, entry_start, successor, np.ones(successor.size))
-    row = np.repeat(np.arange(num_rows), np.diff(entry_start))
-    _check_ends(starts, row, successor, lower, upper)
     if rewards is not None and not isinstance(rewards, Mapping):
         raise ValueError(
             f"rewards is {validation.shorten(rewards)}; give a dict of Rewards by name."
         )
-    rewards = {} if rewards is None else dict(rewards)
-    place = row * np.int64(starts.size) + successor.astype(np.int64)
-    if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
-        every = [lower, upper] if ball is None else [lower, upper, ball[0]]
-        row, successor, every, rewards = _merged(row, successor, every, rewards)
-        entry_start = offsets_from_counts(np.bincount(row, minlength=entry_start.size - 1))
-        lower, upper = every[:2]
-        ball = None if ball is None else (every[2], ball[1])
-    lower, upper = _scaled(starts, entry_start, row, lower, upper)
-    if ball is not None:
-        _check_ball(_Intervals(starts, entry_start, row, lower, upper), *ball)
-        lower, upper, ball = _around(entry_start, row, lower, upper, *ball)
-    lower, upper = _pointed(entry_start, row, lower, upper, ball)
-    ends = uncertainty_sets(
-        entry_start, lower, upper, None if ball is None else Ball(ball[0], ball[1] / 2)
+    rows, rewards = _merged(
+        _Rows(starts, entry_start, successor, lower, upper, *given), dict(rewards or {})
     )
+    rows = _pointed(_around(_scaled(rows)))
+    ball = None if rows.center is None else Ball(rows.center, rows.radius / 2)
+    sets = uncertainty_sets(rows.entry_start, rows.lower, rows.upper, ball)
     # Nature has nothing left to give where lower ends add up to one.
-    possible = (upper > 0) & ((lower > 0) | (ends.free_mass > 0)[row])
-    nominal = np.where(possible, ends.interior_distributions(possible), 0)
-    extra = _travelling(lower, upper, *(ball or (None, None)))
-    return _taken_apart(
-        make_sparse(row_start, entry_start, successor, nominal, rewards=rewards | extra, **rest)
+    possible = (rows.upper > 0) & ((rows.lower > 0) | (sets.free_mass > 0)[rows.row])
+    nominal = np.where(possible, sets.interior_distributions(possible), 0)
+    rewards |= _travelling(**rows.ends)
+    return _arrived(
+        make_sparse(row_start, rows.entry_start, rows.successor, nominal, rewards=rewards, **rest)
     )
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of interval models under construction."""
+
+    row_start: np.ndarray
+    entry_start: np.ndarray
+    successor: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    center: Array  # or None, as the radius
+    radius: Array
+
+    @cached_property
+    def row(self) -> np.ndarray:
+        """The row of each entry."""
+        return np.repeat(np.arange(self.entry_start.size - 1), np.diff(self.entry_start))
+
+    @property
+    def ends(self) -> dict[str, Array]:
+        return {name: getattr(self, name) for name in _ENDS}
+
+    @property
+    def rounding(self) -> np.ndarray:
+        """Bounds on the relative rounding errors of sums over the rows."""
+        return (np.diff(self.entry_start) + 2) * np.finfo(np.float64).eps
+
+    def sums(self, x: np.ndarray) -> np.ndarray:
+        result: np.ndarray = np.add.reduceat(x, self.entry_start[:-1])
+        return result
+
+    def require(self, good: np.ndarray, text: Callable[[int], str], *, entries: bool) -> None:
+        """Raises ValueError, naming the choice, unless all rows or entries are good."""
+        for i in first_true(~good):
+            row = int(self.row[i] if entries else i)
+            raise ValueError(f"{placed(self.row_start, row)}: {text(i)}")
 
 
 def _ball(
     center: Array, radius: Array, entries: tuple[int, ...], num_rows: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Center and radius with checked shapes, or None."""
+) -> tuple[Array, Array]:
+    """Center and radius with checked shapes, or both None."""
     if center is None and radius is None:
-        return None
+        return None, None
     if center is None or radius is None:
         given = "radius" if center is None else "center"
         raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
-    center, radius = (
-        validation.float_array("center", center),
-        validation.float_array("radius", radius),
-    )
+    center = validation.float_array("center", center)
+    radius = validation.float_array("radius", radius)
     if center.shape != entries or radius.shape != (num_rows,):
         raise ValueError(
             f"center has shape {center.shape} and radius {radius.shape}; expected "
@@ -389,154 +373,131 @@ def _ball(
     return center, radius
 
 
-@dataclass(frozen=True)
-class _Intervals:
-    row_start: np.ndarray
-    entry_start: np.ndarray
-    row: np.ndarray  # of each entry
-    lower: np.ndarray
-    upper: np.ndarray
-
-
-def _check_ball(intervals: _Intervals, center: np.ndarray, radius: np.ndarray) -> None:
-    row_start, entry_start, row = intervals.row_start, intervals.entry_start, intervals.row
-    lower, upper = intervals.lower, intervals.upper
-    total = np.add.reduceat(center, entry_start[:-1])
-    bad = ~((radius >= 0) & (radius < np.inf))
-    if bad.any():
-        r = int(np.argmax(bad))
-        raise ValueError(
-            f"{placed(row_start, r)}: the radius is {radius[r]}; it must be a number of at least 0."
-        )
-    bad = ~(np.abs(total - 1) <= NEAR)
-    if bad.any():
-        r = int(np.argmax(bad))
-        raise ValueError(
-            f"{placed(row_start, r)}: the center sums to {total[r]:.9g}; it must be a distribution."
-        )
-    bad = ~((lower - NEAR <= center) & (center <= upper + NEAR) & (center >= 0))
-    if bad.any():
-        e = int(np.argmax(bad))
-        raise ValueError(
-            f"{placed(row_start, int(row[e]))}: the center has {center[e]:.9g} where the interval "
-            f"is [{lower[e]:.9g}, {upper[e]:.9g}]; the center must lie between the ends."
-        )
-
-
-def _around(
-    entry_start: np.ndarray,
-    row: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    center: np.ndarray,
-    radius: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Intervals tightened by the L1 ball, and the ball."""
-    total = np.add.reduceat(center, entry_start[:-1])
-    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps
-    center = np.where((np.abs(total - 1) > rounding)[row], center / total[row], center)
-    lower, upper = np.minimum(lower, center), np.maximum(upper, center)
-    radius = np.minimum(radius, 2)
-    half = (radius / 2)[row]
-    least, most = (_outwards(center, side * half, side) for side in (-1, 1))
-    least = np.where((half > 0) & (least <= 4 * rounding[row]), 0, least)
-    return np.maximum(lower, least), np.minimum(upper, most), (center, radius)
-
-
-def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
-    """``x + y``, rounded down (-1) or up (1)."""
-    total = x + y
-    part = total - x
-    off = (x - (total - part)) + (y - part)
-    result: np.ndarray = np.where(side * off > 0, np.nextafter(total, side * np.inf), total)
-    return result
-
-
-def _pointed(
-    entry_start: np.ndarray,
-    row: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    ball: tuple[np.ndarray, np.ndarray] | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ends made equal in rows that hold no distribution because of rounding."""
-    # To the upper ends where these sum to less than one, to the lower ones where these sum to more,
-    # and to the center of a ball that is farther from all distributions than its radius.
-    one = np.ones(entry_start.size - 1)
-    short = row_sums(upper, entry_start, -one) < 0
-    full = row_sums(lower, entry_start, -one) > 0
-    lower, upper = np.where(short[row], upper, lower), np.where(full[row], lower, upper)
-    if ball is not None:
-        center, radius = ball
-        apart = row_sums(-center, entry_start, one, -radius / 2) > 0
-        lower, upper = (np.where(apart[row], center, x) for x in (lower, upper))
-    return lower, upper
-
-
-def _check_ends(
-    row_start: np.ndarray,
-    row: np.ndarray,
-    successor: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-) -> None:
-    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
-    if bad.any():
-        e = int(np.flatnonzero(bad)[0])
-        raise ValueError(
-            f"{placed(row_start, int(row[e]))}: the interval of successor {successor[e]} is "
-            f"[{lower[e]:.9g}, {upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1."
-        )
-
-
-def _scaled(
-    row_start: np.ndarray,
-    entry_start: np.ndarray,
-    row: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
-    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # of a row sum
-    bad = (low > 1 + NEAR) | (high < 1 - NEAR)
-    if bad.any():
-        r = int(np.flatnonzero(bad)[0])
-        what = f"the upper ends sum to {high[r]:.9g}, which is below 1"
-        if low[r] > 1:
-            what = f"the lower ends sum to {low[r]:.9g}, which is above 1"
-        raise ValueError(f"{placed(row_start, r)}: {what}; no distribution lies between them.")
-    lower = np.where((low > 1 + rounding)[row], lower / np.maximum(low, 1)[row], lower)
-    upper = np.where((high < 1 - rounding)[row], upper / np.minimum(high, 1)[row], upper)
-    return lower, np.clip(np.maximum(upper, lower), 0, 1)
-
-
-def _merged(
-    row: np.ndarray, successor: np.ndarray, numbers: list[np.ndarray], rewards: dict[str, Rewards]
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, Rewards]]:
-    """Merges repeated successors of a row by summing their ends."""
-    order = np.lexsort((successor, row))
-    row, successor = row[order], successor[order]
-    new = np.append(True, (row[1:] != row[:-1]) | (successor[1:] != successor[:-1]))
-    start = np.flatnonzero(new)
+def _merged(rows: _Rows, rewards: dict[str, Rewards]) -> tuple[_Rows, dict[str, Rewards]]:
+    """Checked ends, with those of repeated successors of a row added up."""
+    rows.require(
+        (rows.lower >= 0) & (rows.lower <= rows.upper) & (rows.upper <= 1 + NEAR),
+        lambda e: (
+            f"the interval of successor {rows.successor[e]} is [{rows.lower[e]:.9g}, "
+            f"{rows.upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1."
+        ),
+        entries=True,
+    )
+    place = rows.row * np.int64(rows.row_start.size) + rows.successor
+    if (place[1:] > place[:-1]).all():
+        return rows, rewards
+    _, first, group = np.unique(place, return_index=True, return_inverse=True)
     for name, reward in rewards.items():
-        if reward.transition is None:
+        earned = None if reward.transition is None else np.asarray(reward.transition)
+        if earned is None:
             continue
-        earned = np.asarray(reward.transition)
-        if earned.shape != order.shape:
+        if earned.shape != place.shape:
             raise ValueError(
                 f"reward {name!r} has shape {earned.shape} on its transition part; "
-                f"expected {order.shape}."
+                f"expected {place.shape}."
             )
-        earned = earned[order]
-        if (np.maximum.reduceat(earned, start) != np.minimum.reduceat(earned, start)).any():
+        if (earned != earned[first][group]).any():
             raise ValueError(
                 f"reward {name!r} differs between entries of one row that lead to one state; give "
                 "one entry for each state."
             )
-        rewards = rewards | {
-            name: reward.replace(  # type: ignore[attr-defined]
-                transition=earned[start]
-            )
-        }
-    lower, upper, *rest = (np.add.reduceat(x[order], start) for x in numbers)
-    return row[start], successor[start], [lower, np.minimum(upper, 1), *rest], rewards
+        rewards = rewards | {name: replace(reward, transition=earned[first])}
+    lower, upper = np.bincount(group, rows.lower), np.bincount(group, rows.upper)
+    count = np.bincount(rows.row[first], minlength=rows.entry_start.size - 1)
+    merged = _Rows(
+        rows.row_start,
+        offsets_from_counts(count),
+        rows.successor[first],
+        lower,
+        np.minimum(upper, 1),
+        None if rows.center is None else np.bincount(group, rows.center),
+        rows.radius,
+    )
+    return merged, rewards
+
+
+def _scaled(rows: _Rows) -> _Rows:
+    """Ends scaled where they miss a distribution by little."""
+    low, high = rows.sums(rows.lower), rows.sums(rows.upper)
+    rows.require(
+        low <= 1 + NEAR,
+        lambda r: (
+            f"the lower ends sum to {low[r]:.9g}, which is above 1; no distribution lies between them."
+        ),
+        entries=False,
+    )
+    rows.require(
+        high >= 1 - NEAR,
+        lambda r: (
+            f"the upper ends sum to {high[r]:.9g}, which is below 1; no distribution lies between them."
+        ),
+        entries=False,
+    )
+    row, lower, upper = rows.row, rows.lower, rows.upper
+    lower = np.where((low > 1 + rows.rounding)[row], lower / np.maximum(low, 1)[row], lower)
+    upper = np.where((high < 1 - rows.rounding)[row], upper / np.minimum(high, 1)[row], upper)
+    return replace(rows, lower=lower, upper=np.clip(np.maximum(upper, lower), 0, 1))
+
+
+def _around(rows: _Rows) -> _Rows:
+    """Checked L1 balls, and intervals tightened by them."""
+    lower, upper, center, radius = rows.ends.values()
+    if center is None:
+        return rows
+    total, row = rows.sums(center), rows.row
+    rows.require(
+        (radius >= 0) & (radius < np.inf),
+        lambda r: f"the radius is {radius[r]}; it must be a number of at least 0.",
+        entries=False,
+    )
+    rows.require(
+        np.abs(total - 1) <= NEAR,
+        lambda r: f"the center sums to {total[r]:.9g}; it must be a distribution.",
+        entries=False,
+    )
+    rows.require(
+        (lower - NEAR <= center) & (center <= upper + NEAR) & (center >= 0),
+        lambda e: (
+            f"the center has {center[e]:.9g} where the interval is [{lower[e]:.9g}, "
+            f"{upper[e]:.9g}]; the center must lie between the ends."
+        ),
+        entries=True,
+    )
+    center = np.where((np.abs(total - 1) > rows.rounding)[row], center / total[row], center)
+    lower, upper, radius = (
+        np.minimum(lower, center),
+        np.maximum(upper, center),
+        np.minimum(radius, 2),
+    )
+    half = (radius / 2)[row]
+    least, most = (_outwards(center, side * half, side) for side in (-1, 1))
+    least = np.where((half > 0) & (least <= 4 * rows.rounding[row]), 0, least)
+    return replace(
+        rows,
+        lower=np.maximum(lower, least),
+        upper=np.minimum(upper, most),
+        center=center,
+        radius=radius,
+    )
+
+
+def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
+    """``x + y``, rounded down (-1) or up (1)."""
+    total, rest = two_sum(x, y)
+    result: np.ndarray = np.where(side * rest > 0, np.nextafter(total, side * np.inf), total)
+    return result
+
+
+def _pointed(rows: _Rows) -> _Rows:
+    """Ends made equal in rows that hold no distribution because of rounding."""
+    # To the upper ends where these sum to less than one, to the lower ones where these sum to more,
+    # and to the center of a ball that is farther from all distributions than its radius.
+    row, one = rows.row, np.ones(rows.entry_start.size - 1)
+    short = row_sums(rows.upper, rows.entry_start, -one) < 0
+    full = row_sums(rows.lower, rows.entry_start, -one) > 0
+    lower = np.where(short[row], rows.upper, rows.lower)
+    upper = np.where(full[row], rows.lower, rows.upper)
+    if rows.center is not None and rows.radius is not None:
+        apart = row_sums(-rows.center, rows.entry_start, one, -rows.radius / 2) > 0
+        lower, upper = (np.where(apart[row], rows.center, x) for x in (lower, upper))
+    return replace(rows, lower=lower, upper=upper)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
@@ -213,9 +214,7 @@ def make_mdp(
         raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
     _check_probability(probability)
     used = probability > 0
-    outside = used & ((successor < 0) | (successor >= num_states))
-    if outside.any():
-        s, a, k = np.argwhere(outside)[0]
+    for s, a, k in first_true(used & ((successor < 0) | (successor >= num_states))):
         raise ValueError(
             f"state {s}, action {a}: successor {successor[s, a, k]} is out of range; "
             f"states are 0 to {num_states - 1}."
@@ -323,9 +322,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
 
 
 def _check_probability(probability: np.ndarray) -> None:
-    bad = ~(probability >= 0) | np.isinf(probability)
-    if bad.any():
-        s, a, k = np.argwhere(bad)[0]
+    for s, a, k in first_true(~(probability >= 0) | np.isinf(probability)):
         raise ValueError(
             f"state {s}, action {a}: probability {probability[s, a, k]} (entry {k}); "
             "probabilities must be finite and not negative."
@@ -333,9 +330,7 @@ def _check_probability(probability: np.ndarray) -> None:
 
 
 def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
-    wrong = available & (np.abs(total - 1) > validation.ROW_SUM_TOLERANCE)
-    if wrong.any():
-        s, a = np.argwhere(wrong)[0]
+    for s, a in first_true(available & (np.abs(total - 1) > validation.ROW_SUM_TOLERANCE)):
         raise ValueError(
             f"state {s}, action {a}: the probabilities sum to {total[s, a]:.9g}, not 1; "
             "correct the row, or mark the action unavailable."
@@ -347,11 +342,9 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
     checked: np.ndarray = validation.boolean_array("available", available)
     if checked.shape != shape:
         raise ValueError(f"available has shape {checked.shape}; expected {shape}.")
-    stuck = ~checked.any(axis=1)
-    if stuck.any():
+    for s in first_true(~checked.any(axis=1)):
         raise ValueError(
-            f"state {np.flatnonzero(stuck)[0]} has no available action; give it one, "
-            "for example a loop to itself."
+            f"state {s} has no available action; give it one, for example a loop to itself."
         )
     return checked
 
@@ -378,9 +371,7 @@ def checked_initial(
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
     """Raises ValueError for a negative probability; `first` is the number of the first state."""
-    bad = ~(initial >= 0)
-    if bad.any():
-        s = np.flatnonzero(bad)[0]
+    for s in first_true(~(initial >= 0)):
         raise ValueError(
             f"initial probability of state {first + s} is {initial[s]}; "
             "it must not be negative or NaN."
@@ -437,11 +428,9 @@ def _label_by_name(
                 "a list of the numbers of the states where it holds."
             )
         states = states.astype(int)
-        outside = (states < 0) | (states >= num_states)
-        if outside.any():
+        for i in first_true((states < 0) | (states >= num_states)):
             raise ValueError(
-                f"label[{name!r}] has the state {states[outside][0]}; states are 0 to "
-                f"{num_states - 1}."
+                f"label[{name!r}] has the state {states[i]}; states are 0 to {num_states - 1}."
             )
         holds[states, column] = True
     return holds, names

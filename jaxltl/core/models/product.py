@@ -6,9 +6,9 @@ the value of a successor is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from functools import singledispatch
-from typing import Generic, cast, overload, TypeAlias
+from typing import Generic, cast, overload
 
 import chex
 import jax
@@ -22,14 +22,12 @@ from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.pretty_print import batch_text, brief, count, describe, nested_repr
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.struct import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
 from jaxltl.core.models.protocols import Array, LabelledModel, SuccessorModel, World
 
 
-register_annotated_pytree(
+struct.register(
     Automaton,
     arrays=("delta", "initial", "priority", "letters"),
     static=("acceptance",),
@@ -177,7 +175,7 @@ def occurring_letters(
 
 
 @overload
-def product(  # type: ignore[overload-overlap]  # a Game is no product's world
+def product(
     world: Game, task: Automaton | Formula | str, *, label_on: str = ...
 ) -> Game[Product]: ...
 
@@ -268,52 +266,12 @@ _SELECT = 16  # memory states up to which reading at a memory is a selection
 # --- the primitives -----------------------------------------------------------------------
 
 
-Function: TypeAlias = Callable[..., jax.Array]
-
-
-def _through(
-    model: Product,
-    operator: Function,
-    value: jax.Array,
-    term: Function,
-    combine: Function,
-    empty: float = 0,
-) -> jax.Array:
-    """Applies an operator of the base model at every memory state: ``[S, Q, A]`` from ``[S, Q]``."""
-    # On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
-    # delta(q, L(s)), after it.
-    if model.label_on == "entry":
-        value = _read_at(value, model.next_memory)
-        result = _each_memory(model.mdp, operator, value, term, combine)
-    else:
-        result = _each_memory(model.mdp, operator, value, term, combine)
-        result = _read_at(result, model.next_memory[:, :, None])
-    if model.allowed is None:
-        return result
-    return jnp.where(model.allowed, result, jnp.asarray(empty, result.dtype))
-
-
-def _each_memory(
-    world: MDP | DenseMDP,
-    operator: Function,
-    value: jax.Array,
-    term: Function,
-    combine: Function,
-) -> jax.Array:
-    """An operator of the base model on each column of ``[S, Q]``: ``[S, Q, A]``."""
-    if isinstance(world, DenseMDP):
-        return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
-    return operators.combined(world, value, term, combine)
-
-
 def reads(model: Product, marked: jax.Array) -> jax.Array:
     """``bool[S, Q, A]``: choices that may make a marked transition ``bool[Q, L]`` of the automaton."""
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    found = _each_memory(
-        model.mdp, operators.exists_successor, here, kernels.positive_hits, jnp.logical_or
-    )
+    found = operators.combined(model.mdp, here, kernels.positive_hits, jnp.logical_or)
     return found & model.available
 
 
@@ -322,7 +280,7 @@ def read_probability(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T.astype(model.dtype)
     if model.label_on == "exit":
         return here[:, :, None] * model.available
-    found = _each_memory(model.mdp, operators.expectation, here, jnp.multiply, jnp.add)
+    found = operators.combined(model.mdp, here, jnp.multiply, jnp.add)
     return found * model.available
 
 
@@ -346,34 +304,18 @@ def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
 
 @operators.combined.register
 def _(model: Product, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
-    def operator(world: MDP | DenseMDP, value: jax.Array) -> jax.Array:
-        return operators.combined(world, value, term, combine)
-
-    return _through(model, operator, value, term, combine)
-
-
-@operators.expectation.register
-def _(model: Product, value: jax.Array) -> jax.Array:
-    return _through(model, operators.expectation, value, jnp.multiply, jnp.add)
-
-
-@operators.exists_successor.register
-def _(model: Product, region: jax.Array) -> jax.Array:
-    return _through(
-        model, operators.exists_successor, region, kernels.positive_hits, jnp.logical_or
-    )
-
-
-@operators.least_successor.register
-def _(model: Product, value: jax.Array) -> jax.Array:
-    return _through(
-        model,
-        operators.least_successor,
-        value,
-        kernels.where_positive,
-        jnp.minimum,
-        kernels.dtype_max(value.dtype),
-    )
+    # On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
+    # delta(q, L(s)), after it.
+    if model.label_on == "entry":
+        value = _read_at(value, model.next_memory)
+        result = operators.combined(model.mdp, value, term, combine)
+    else:
+        result = operators.combined(model.mdp, value, term, combine)
+        result = _read_at(result, model.next_memory[:, :, None])
+    if model.allowed is None:
+        return result
+    empty = kernels.dtype_max(result.dtype) if combine is jnp.minimum else 0
+    return jnp.where(model.allowed, result, jnp.asarray(empty, result.dtype))
 
 
 @operators.sample_successor.register
@@ -385,50 +327,15 @@ def _(model: Product, key: chex.PRNGKey, state: jax.Array, action: jax.Array) ->
     return successor * model.num_memory + memory
 
 
-@operators.induced_chain.register
-def _(model: Product, policy: jax.Array) -> MDP:
-    s = jnp.arange(model.mdp.num_states)[:, None]
-    q = jnp.arange(model.num_memory)[None, :, None]
-    probability = model.mdp.successor_probability[s, policy]  # [S, Q, K]
-    successor = _successor(model.mdp)[s, policy]
-    flat = flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
-    width = flat.shape[-1]
-    return operators.make_chain(
-        flat.reshape(-1, width).astype(jnp.int32),
-        probability.reshape(-1, width),
-        model.initial.ravel(),
-    )
-
-
-@operators.transition_matrix.register
-def _(model: Product, policy: jax.Array) -> jax.Array:
-    if not isinstance(model.mdp, MDP | DenseMDP):
-        eye = jnp.eye(model.num_states, dtype=model.dtype)
-        return jax.vmap(
-            lambda v: operators.action_mean(
-                policy, operators.expectation(model, v.reshape(model.state_shape))
-            ).ravel(),
-            out_axes=-1,
-        )(eye)
+@operators.flat_transitions.register
+def _(model: Product) -> tuple[jax.Array, jax.Array]:
+    successor, probability = operators.flat_transitions(model.mdp)
     s = jnp.arange(model.mdp.num_states)[:, None, None, None]
-    q = jnp.arange(model.num_memory)[None, :, None, None]
-    successor = _successor(model.mdp)[:, None]
-    flat = flat_successor(successor, model.next_memory, s, q, model.label_on)
-    weight = policy[..., None] * model.successor_probability
-    shape = (model.num_states, *weight.shape[2:])
-    return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
-
-
-@operators.policy_operator.register
-def _(model: Product, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    if isinstance(model.mdp, MDP | DenseMDP):
-        return operators.chain_operator(operators.induced_chain(model, policy))
-
-    def onward(value: jax.Array) -> jax.Array:
-        ahead = operators.expectation(model, value.reshape(model.state_shape))
-        return jnp.take_along_axis(ahead, policy[..., None], axis=-1).ravel()
-
-    return onward
+    q = jnp.arange(model.num_memory)[:, None, None]
+    flat = flat_successor(successor[:, None], model.next_memory, s, q, model.label_on)
+    shape = (model.num_states, *successor.shape[1:])
+    probability = jnp.broadcast_to(probability[:, None], flat.shape)
+    return flat.astype(jnp.int32).reshape(shape), probability.reshape(shape)
 
 
 @operators.unpadded_states.register
@@ -449,12 +356,6 @@ def _(model: Product, quantity: jax.Array) -> jax.Array:
         return moved(operators.greatest_predecessor(model.mdp, quantity))
     quantity = jax.vmap(moved, in_axes=-1, out_axes=-1)(quantity)
     return operators.greatest_predecessor(model.mdp, quantity)
-
-
-def _successor(world: MDP | DenseMDP) -> jax.Array:
-    if isinstance(world, MDP):
-        return world.successor
-    return jnp.broadcast_to(jnp.arange(world.num_states), world.transition.shape)
 
 
 def flat_successor(

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 from numpy.typing import DTypeLike
 
 from jaxltl.core.language.parser import parse_expression
@@ -23,7 +24,7 @@ from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce
 from jaxltl.core.models.ops.underflow import underflow_text, underflows
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import SCIPY_SIZE
+from jaxltl.core.sparse.rows import SCIPY_SIZE, offsets_from_counts
 
 _PADDED = (
     "this takes models that are padded: give to_padded(model). Sparse models have choices "
@@ -259,7 +260,7 @@ def _traced_reward(model: SparseMDP, reward: Rewards) -> Array:
     if reward.transition is not None:
         row = segment_ids(model.entry_start, model.num_transitions)
         earned = model.probability * jnp.asarray(reward.transition)
-        total += segment_reduce(jax.ops.segment_sum, earned, row, model.num_rows)
+        total += segment_reduce(jnp.add, earned, row, model.num_rows)
     return total
 
 
@@ -351,14 +352,8 @@ def sparse_part(
         )
     if not np.issubdtype(successor.dtype, np.integer):
         raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
-    entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
-    num_rows = entry_start.size - 1
-    if row_start is None:
-        row_start = np.arange(num_rows + 1)
-    row_start = checked_starts("row_start", row_start, num_rows, "choices")
-    here, first = row_start.size - 1, begins[0]
-    if here == 0:
-        raise ValueError("the model has no state; it needs at least one.")
+    row_start, entry_start = checked_rows(row_start, entry_start, successor.size)
+    here, num_rows, first = row_start.size - 1, entry_start.size - 1, begins[0]
     check_entries(
         row_start, entry_start, successor, probability, first=first, num_states=num_states
     )
@@ -400,7 +395,20 @@ def sparse_part(
     )
 
 
-def checked_starts(name: str, start: Array, total: int, of: str) -> np.ndarray:
+def checked_rows(
+    row_start: Array | None, entry_start: Array, num_entries: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Validated starts of the states' rows and of the rows' entries; None: one row in each state."""
+    entry_start = _checked_starts("entry_start", entry_start, num_entries, "transitions")
+    num_rows = entry_start.size - 1
+    row_start = np.arange(num_rows + 1) if row_start is None else row_start
+    row_start = _checked_starts("row_start", row_start, num_rows, "choices")
+    if row_start.size < 2:
+        raise ValueError("the model has no state; it needs at least one.")
+    return row_start, entry_start
+
+
+def _checked_starts(name: str, start: Array, total: int, of: str) -> np.ndarray:
     """Validated span starts as ``int64``: ascending from 0 to `total`."""
     start = np.asarray(start)
     if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
@@ -414,8 +422,7 @@ def checked_starts(name: str, start: Array, total: int, of: str) -> np.ndarray:
             f"number of {of}, {total}."
         )
     falls = start[1:] < start[:-1]  # differences of unsigned numbers are never negative
-    if falls.any():
-        i = int(np.flatnonzero(falls)[0])
+    for i in first_true(falls):
         raise ValueError(
             f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must ascend."
         )
@@ -429,6 +436,10 @@ def placed(row_start: np.ndarray, row: int, first: int = 0) -> str:
     return f"state {first + state}, choice {row - int(row_start[state])}"
 
 
+def _placed_entry(row_start: np.ndarray, entry_start: np.ndarray, entry: int, first: int) -> str:
+    return placed(row_start, int(np.searchsorted(entry_start, entry, "right")) - 1, first)
+
+
 def check_entries(
     row_start: np.ndarray,
     entry_start: np.ndarray,
@@ -440,27 +451,20 @@ def check_entries(
 ) -> None:
     """Raises ValueError if a state, a row or an entry is invalid, by numbers of the whole model."""
     num_states = row_start.size - 1 if num_states is None else num_states
-    if (np.diff(row_start) == 0).any():
+    for s in first_true(np.diff(row_start) == 0):
         raise ValueError(
-            f"state {first + np.flatnonzero(np.diff(row_start) == 0)[0]} has no "
-            "choice; give it one, for example a loop to itself."
+            f"state {first + s} has no choice; give it one, for example a loop to itself."
         )
-    if (np.diff(entry_start) == 0).any():
-        row = int(np.flatnonzero(np.diff(entry_start) == 0)[0])
+    for row in first_true(np.diff(entry_start) == 0):
         raise ValueError(f"{placed(row_start, row, first)} leads nowhere; give it a successor.")
-    if successor.min() < 0 or successor.max() >= num_states:
-        e = int(np.flatnonzero((successor < 0) | (successor >= num_states))[0])
-        row = int(np.searchsorted(entry_start, e, "right")) - 1
+    for e in first_true((successor < 0) | (successor >= num_states)):
         raise ValueError(
-            f"{placed(row_start, row, first)}: successor {successor[e]} is out of "
+            f"{_placed_entry(row_start, entry_start, e, first)}: successor {successor[e]} is out of "
             f"range; states are 0 to {num_states - 1}."
         )
-    # A sum is NaN or infinite if any of it is.
-    if not probability.min() >= 0 or not np.isfinite(probability.sum()):
-        e = int(np.flatnonzero(~(probability >= 0) | np.isinf(probability))[0])
-        row = int(np.searchsorted(entry_start, e, "right")) - 1
+    for e in first_true(~(probability >= 0) | np.isinf(probability)):
         raise ValueError(
-            f"{placed(row_start, row, first)}: probability {probability[e]}; "
+            f"{_placed_entry(row_start, entry_start, e, first)}: probability {probability[e]}; "
             "probabilities must be finite and not negative."
         )
     refuse_underflow(row_start, entry_start, probability, np.float64, first=first)
@@ -477,9 +481,8 @@ def refuse_underflow(
     """Raises ValueError if a positive probability is zero or subnormal in a dtype."""
     if (small := underflows(probability, dtype)) is not None:
         e = int(np.argmax(small))
-        row = int(np.searchsorted(entry_start, e, "right")) - 1
-        text = underflow_text(probability[e], dtype)
-        raise ValueError(f"{placed(row_start, row, first)}: probability {text}.")
+        place = _placed_entry(row_start, entry_start, e, first)
+        raise ValueError(f"{place}: probability {underflow_text(probability[e], dtype)}.")
 
 
 def _checked_rewards(
@@ -497,9 +500,8 @@ def _checked_rewards(
             raise ValueError(
                 f"reward {name!r} has shape {given.shape} on its {part} part; expected ({size},)."
             )
-        if np.isnan(given).any():
-            place = f"{part} {first + np.flatnonzero(np.isnan(given))[0]}"
-            raise ValueError(f"reward {name!r} is NaN at {place}; give a number.")
+        for place in first_true(np.isnan(given)):
+            raise ValueError(f"reward {name!r} is NaN at {part} {first + place}; give a number.")
         parts[part] = given
     return Rewards(**parts)
 
@@ -554,10 +556,10 @@ def _canonical(
             )
         found[name] = reward
     count = np.bincount(row[start], minlength=entry_start.size - 1)
-    if (count == 0).any():
-        place = placed(row_start, int(np.flatnonzero(count == 0)[0]), state)
+    for empty in first_true(count == 0):
+        place = placed(row_start, empty, state)
         raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
-    starts = np.concatenate([[0], count.cumsum()]).astype(index)
+    starts = offsets_from_counts(count).astype(index)
     return starts, target[start].astype(np.int32), merged, found
 
 
@@ -581,8 +583,7 @@ def scaled(
     """Normalised rows; ValueError for a row with a sum that is not within 1e-6 of one."""
     total = np.add.reduceat(probability, entry_start[:-1])
     off = np.abs(total - 1)
-    if off.max() > validation.ROW_SUM_TOLERANCE:
-        row = int(np.flatnonzero(off > validation.ROW_SUM_TOLERANCE)[0])
+    for row in first_true(off > validation.ROW_SUM_TOLERANCE):
         raise ValueError(
             f"{placed(row_start, row, first)}: the probabilities sum to "
             f"{total[row]:.9g}, not 1; correct the row."

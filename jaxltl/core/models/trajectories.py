@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 
 from jaxltl.core.pretty_print import batch_text, brief, count, value_range
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.struct import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 
 
-register_annotated_pytree(
+struct.register(
     FiniteMemoryPolicy,
     arrays=("action", "initial_memory", "next_memory", "automaton", "letter"),
     static=("label_on",),
@@ -152,8 +152,7 @@ def require_states(trajectories: Trajectories, model: Model) -> None:
         )
     if found is None and not is_traced(trajectories):
         state = np.where(trajectories.mask, trajectories.state, 0)
-        if (wrong := np.argwhere((state < 0) | (state >= model.num_states))).size:
-            n, t = wrong[0]
+        for n, t in first_true((state < 0) | (state >= model.num_states)):
             raise ValueError(
                 f"trajectory {n}, step {t}: state {state[n, t]} does not exist; states are 0 to "
                 f"{model.num_states - 1}."
@@ -170,8 +169,7 @@ def _check_steps(
         hit = np.asarray(model.successor)[s, a] == t[..., None]
         possible = (hit & (np.asarray(model.probability)[s, a] > 0)).any(axis=-1)
     wrong = ~possible & (np.arange(s.shape[1]) < length[:, None] - 1)
-    if wrong.any():
-        n, i = np.argwhere(wrong)[0]
+    for n, i in first_true(wrong):
         raise ValueError(
             f"trajectory {n}, step {i}: action {a[n, i]} in state {s[n, i]} cannot lead to "
             f"state {t[n, i]}, which is recorded next; the demonstration does not fit the model."

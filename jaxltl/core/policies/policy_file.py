@@ -21,7 +21,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
-from jaxltl.core.validation import errors_in
+from jaxltl.core.validation import errors_in, first_true
 
 FORMAT, VERSION = "jaxltl policy", 1
 _TABLE = ("initial_memory", "next_memory", "label_on", "letter", "actions", "states")
@@ -178,8 +178,7 @@ def _check(policy: FiniteMemoryPolicy) -> None:
     if policy.is_random:
         total = action.sum(-1)
         bad = ~(np.abs(total - 1) < 1e-3) | (action < 0).any(-1)
-        if bad.any():
-            place = np.argwhere(bad)[0].tolist()
+        for place in first_true(bad):
             raise ValueError(
                 f"policy{place} sums to {total[tuple(place)]:g}; expected a distribution."
             )

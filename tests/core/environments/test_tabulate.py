@@ -312,7 +312,7 @@ def test_another_layout_is_not_compiled_anew():
 def compiles(run):
     module = importlib.import_module("jaxltl.core.environments.tabulate")
 
-    functions = [module._followers, module._codes, module._labeled, module._resets]
+    functions = [module._followers, module._codes_of_batch, module._resets]
     before = [f._cache_size() for f in functions]
     run()
     return sum(f._cache_size() for f in functions) - sum(before)

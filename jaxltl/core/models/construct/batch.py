@@ -18,7 +18,7 @@ from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, occurring_letters, product
 from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.protocols import Array, Model, PyTree
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
 
@@ -67,7 +67,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         # Padded states have the label of state 0, which adds no letter.
         shown_here = np.asarray(lane.letter)
         letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
-        padded = _pad_successors(pad_states(world, num_states), width)
+        padded = pad_states(world, num_states, width)
         products.append(replace(lane, mdp=jax.tree.map(np.asarray, padded), letter=letter))
     result: Product = to_jax(
         jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products)
@@ -101,43 +101,26 @@ def _like_first(world: Model, number: int, first: MDP) -> MDP:
     return replace(world, label=label, propositions=first.propositions)
 
 
-def pad_states(mdp: MDP, num_states: int) -> MDP:
-    """The model with unreachable absorbing states appended, labelled like state 0."""
-    extra = num_states - mdp.num_states
+def pad_states(mdp: MDP, num_states: int, num_successors: int | None = None) -> MDP:
+    """The model with unreachable absorbing states appended, labelled like state 0, and longer lists."""
+    own = mdp.num_states
+    extra, width = num_states - own, num_successors or mdp.num_successors
     if extra < 0:
-        raise ValueError(
-            f"the world has {mdp.num_states} states, more than {num_states}; pad to the most."
-        )
-    if extra == 0:
-        return mdp
-    shape = (extra, mdp.num_actions, mdp.num_successors)
-    own = np.zeros(shape, np.int32)
-    own[..., 0] = np.arange(mdp.num_states, num_states)[:, None]
-    stays = np.zeros(shape, mdp.dtype)
-    stays[..., 0] = 1
-
-    def below(array: Array, rows: np.ndarray) -> jax.Array:
-        return jax_array(np.concatenate([np.asarray(array), rows]))
-
-    return replace(
-        mdp,
-        successor=below(mdp.successor, own),
-        probability=below(mdp.probability, stays),
-        available=below(mdp.available, np.ones(shape[:2], bool)),
-        initial=below(mdp.initial, np.zeros(extra, mdp.dtype)),
-        label=below(mdp.label, np.repeat(np.asarray(mdp.label)[:1], extra, axis=0)),
+        raise ValueError(f"the world has {own} states, more than {num_states}; pad to the most.")
+    added = (0, extra), (0, 0), (0, width - mdp.num_successors)
+    successor, probability = (
+        np.pad(np.asarray(x), added) for x in (mdp.successor, mdp.probability)
     )
-
-
-def _pad_successors(mdp: MDP, width: int) -> MDP:
-    if width == mdp.num_successors:
-        return mdp
-    extra = ((0, 0), (0, 0), (0, width - mdp.num_successors))
-    return replace(
-        mdp,
-        successor=to_jax(np.pad(np.asarray(mdp.successor), extra)),
-        probability=to_jax(np.pad(np.asarray(mdp.probability), extra)),
-    )
+    successor[own:, :, 0] = np.arange(own, num_states)[:, None]
+    probability[own:, :, 0] = 1
+    parts: dict[str, PyTree] = {
+        "successor": successor,
+        "probability": probability,
+        "available": np.pad(np.asarray(mdp.available), added[:2], constant_values=True),
+        "initial": np.pad(np.asarray(mdp.initial), added[0]),
+        "label": np.asarray(mdp.label)[np.arange(num_states) * (np.arange(num_states) < own)],
+    }
+    return replace(mdp, **to_jax(parts))
 
 
 def is_stacked(model: Product) -> bool:
@@ -264,10 +247,11 @@ def split_trajectories(
     """A split of each model's trajectories: the last fraction `share` is held out."""
     if not 0 <= share < 1:
         raise ValueError(f"held_out={share}; it must be a share in [0, 1).")
-    given = _of_each_world(trajectories)
-    kept = [len(x.length) - round(share * len(x.length)) for x in given]
-    first = [jax.tree.map(lambda x, n=n: x[:n], t) for t, n in zip(given, kept, strict=True)]
-    second = [jax.tree.map(lambda x, n=n: x[n:], t) for t, n in zip(given, kept, strict=True)]
+    first, second = [], []
+    for one in _of_each_world(trajectories):
+        kept = len(one.length) - round(share * len(one.length))
+        first.append(jax.tree.map(lambda x, n=kept: x[:n], one))
+        second.append(jax.tree.map(lambda x, n=kept: x[n:], one))
     return first, second
 
 

@@ -14,9 +14,11 @@ from jax.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.product import Product, flat_successor
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.ops.array_namespace import namespace
+from jaxltl.core.models.ops.kernels import segment_ids
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import offsets_from_counts
 
 
 def to_sparse(model: Model) -> SparseMDP:
@@ -74,37 +76,61 @@ def _distribution(initial: ArrayLike) -> np.ndarray:
 
 def _product(model: Product) -> SparseMDP:
     world = to_sparse(model.mdp)
-    host, step = world.host, np.asarray(model.next_memory)
-    num_memory = step.shape[1]
-    shape = (host.num_states, num_memory)
-    kept = np.ones((host.num_rows, num_memory), bool)
+    kept = None
     if model.allowed is not None:
         action = world.rank if world.action is None else world.action
-        kept = np.asarray(model.allowed)[host.state, :, action]
-    # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
-    state, memory = np.divmod(np.arange(shape[0] * shape[1]), num_memory)
-    row, choices = row_entries(host.row_start, state)
-    q = np.repeat(memory, choices)
-    chosen = kept[row, q]
-    per_state = np.bincount(
-        np.repeat(state * num_memory + memory, choices)[chosen], minlength=state.size
-    )
-    row, q = row[chosen], q[chosen]
-    entry, width = row_entries(host.entry_start, row)
-    s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
-    target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
+        kept = np.asarray(model.allowed)[world.host.state, :, action]
+    written = product_rows(world, model, kept)
     return make_sparse(
-        offsets_from_counts(per_state),
-        offsets_from_counts(width),
-        target,
-        host.probability[entry],
+        written.row_start,
+        written.entry_start,
+        written.successor,
+        written.probability,
         initial=_distribution(model.initial).ravel(),
-        label=np.asarray(world.label)[state],
+        label=written.label,
         propositions=world.propositions,
-        rewards={name: x.gathered(state, row, entry) for name, x in world.rewards.items()},
-        action=None if world.action is None else np.asarray(world.action)[row],
+        rewards=written.rewards,
+        action=written.action,
         action_names=world.action_names,
     )
+
+
+def product_rows(world: SparseMDP, model: Product, kept: np.ndarray | None = None) -> SparseMDP:
+    """A product written out, inside ``jit`` too; only rows ``kept[r, q]`` of a sparse world."""
+    # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
+    number = np.arange(model.num_states, dtype=np.int32)
+    state, memory = np.divmod(number, model.num_memory)
+    row_start, owner, row = _members(world.row_start, state, world.num_rows * model.num_memory)
+    if kept is not None:
+        chosen = kept[row, memory[owner]]
+        owner, row = owner[chosen], row[chosen]
+        row_start = offsets_from_counts(np.bincount(owner, minlength=state.size))
+    total = world.num_transitions * model.num_memory if kept is None else None
+    entry_start, of, entry = _members(world.entry_start, row, total)
+    xp, owner, step, successor, probability = namespace(
+        owner[of], model.next_memory, world.successor, world.probability
+    )
+    s, q = xp.asarray(state)[owner], xp.asarray(memory)[owner]
+    return SparseMDP(
+        row_start=row_start,
+        entry_start=entry_start,
+        successor=flat_successor(successor[entry], step, s, q, model.label_on).astype(np.int32),
+        probability=probability[entry],
+        initial=model.initial.ravel(),
+        label=world.label[state],
+        rewards={name: x.gathered(state, row, entry) for name, x in world.rewards.items()},
+        action=None if world.action is None else world.action[row],
+    )
+
+
+def _members(start: Array, index: Array, total: int | None) -> tuple[Array, Array, Array]:
+    """Members of the segments `index`: where each begins, the place of each member's, the members."""
+    xp, start, index = namespace(start, index)
+    first = start[index]
+    begins = xp.append(xp.zeros(1, start.dtype), xp.cumsum(start[index + 1] - first))
+    total = int(begins[-1]) if total is None else total
+    owner: Array = xp.asarray(segment_ids(begins, total))
+    return begins, owner, first[owner] + xp.arange(total, dtype=start.dtype) - begins[owner]
 
 
 M = TypeVar("M")
@@ -131,6 +157,3 @@ def keep_latest(convert: Callable[[M], R]) -> Callable[[M], R]:
             del kept["latest"]
 
     return wrapper
-
-
-_LARGEST = 8 * 2**30  # bytes of the largest model that is padded

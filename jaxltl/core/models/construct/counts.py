@@ -129,10 +129,13 @@ def make_counts(
 
 def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
     """Sorted columns of state, action, successor and count, with repeated transitions added up."""
-    table = table[:, np.lexsort(table[2::-1])]
-    new = np.append(True, (table[:3, 1:] != table[:3, :-1]).any(0))
-    table[3, new] = np.add.reduceat(table[3], np.flatnonzero(new))
-    return table[:, new]
+    rows, place = np.unique(table[:3], axis=1, return_inverse=True)
+    return np.vstack([rows, _totals(place, table[3])])
+
+
+def _totals(place: Integers, count: Integers) -> NDArray[np.int64]:
+    """Sums of the counts at each place; at most `MOST_SAMPLES`, which doubles count exactly."""
+    return np.bincount(place.ravel(), count).astype(np.int64)
 
 
 def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:
@@ -286,14 +289,9 @@ def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) ->
     """
     _require_counts(counts)
     known = places(model)
-    state, action, successor = (
-        _renumbered(what, names, of[number], to)
-        for what, names, to, of, number in (
-            ("state", counts.states, known.states, counts.state, slice(None)),
-            ("action", counts.actions, known.actions, counts.action, slice(None)),
-            ("state", counts.states, known.states, counts.successor, slice(None)),
-        )
-    )
+    state = _renumbered("state", counts.states, counts.state, known.states)
+    action = _renumbered("action", counts.actions, counts.action, known.actions)
+    successor = _renumbered("state", counts.states, counts.successor, known.states)
     place, wrong = place_of(known, state, action, successor)
     if wrong:
         raise ValueError(f"the counts do not fit the model: {wrong[1]}.")
@@ -401,8 +399,7 @@ def model_from_counts(
     state, action = np.divmod(choice, len(names))
     samples = np.bincount(np.searchsorted(choice, tried), counts.count, choice.size)
     is_open = ~stays[state] & (_may_miss(graph, samples) | np.isin(choice, lone))
-    entries = _entries(counts, np.searchsorted(choice, tried), state, is_open)
-    start, successor, count = entries
+    start, successor, count = _entries(counts, np.searchsorted(choice, tried), state, is_open)
     labels = {
         name: _numbers(some, number, f"label {name!r}") for name, some in (labels or {}).items()
     }
@@ -445,11 +442,9 @@ def _entries(
     row = np.concatenate([counted_row, loop, np.repeat(np.flatnonzero(is_open), size)])
     successor = np.concatenate([counts.successor, state[loop], every])
     count = np.concatenate([counts.count, np.zeros(loop.size + every.size, np.int64)])
-    order = np.lexsort((successor, row))
-    row, successor = row[order], successor[order]
-    first = np.append(True, (np.diff(row) != 0) | (np.diff(successor) != 0))
-    start = offsets_from_counts(np.bincount(row[first]))
-    return start, successor[first], np.add.reduceat(count[order], np.flatnonzero(first))
+    key, place = np.unique(row * np.int64(size) + successor, return_inverse=True)
+    row, successor = np.divmod(key, size)
+    return offsets_from_counts(np.bincount(row)), successor, _totals(place, count)
 
 
 def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:

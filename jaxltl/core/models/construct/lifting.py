@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.validation import first_true
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import operators
@@ -122,8 +123,7 @@ def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
     )
     place = (state, memory_along(model, state)) if isinstance(model, Product) else (state,)
     kept: np.ndarray = inside & np.asarray(model.available)[(*place, action)]
-    if (lost := np.flatnonzero(inside.any(1) & ~kept.any(1))).size:
-        n = lost[0]
+    for n in first_true(inside.any(1) & ~kept.any(1)):
         raise ValueError(
             f"trajectory {n}: none of its {inside[n].sum()} steps takes an allowed action, so "
             "nothing can be learned from it; leave it out, or allow more."

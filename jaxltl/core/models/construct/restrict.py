@@ -17,6 +17,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
+from jaxltl.core.validation import first_true
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.components import forward_reachable
@@ -61,8 +62,7 @@ def _with_allowed(model: Model, allowed: chex.Array) -> Model:
         )
     if not is_traced((model, allowed)):
         mask, available = np.asarray(allowed), np.asarray(model.available)
-        if (wrong := np.argwhere(mask & ~available)).size:
-            *state, action = wrong[0].tolist()
+        for *state, action in first_true(mask & ~available):
             raise ValueError(f"allowed: action {action} is not available in state {_named(state)}.")
         if (stuck := np.argwhere(available.any(-1) & ~mask.any(-1))).size:
             raise ValueError(
@@ -224,7 +224,8 @@ def _restrict_sparse(
                 f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
                 "choices of to_sparse(model)."
             )
-    states = reachable_states(sparse, start > 0, rows)
+    host, used = sparse.host, rows[sparse.host.row]
+    states = forward_reachable(host.state[host.row[used]], host.successor[used], start > 0)
     found = submodel(replace(sparse, initial=start / start.sum()), states, rows)
     num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
     return _restriction(model, found, np.flatnonzero(states), num_memory)
@@ -239,14 +240,12 @@ def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP:
     """The sparse model of some states ``bool[S]`` and rows ``bool[R]``; ValueError for a state without rows."""
-    host = model.host
+    host, kept = model.host, np.flatnonzero(states)
     row = np.flatnonzero(rows & states[host.state])
-    kept = np.flatnonzero(states)
-    number = np.full(host.num_states, -1, np.int32)
-    number[kept] = np.arange(kept.size)
+    number = np.cumsum(states, dtype=np.int32) - 1
     choices = np.bincount(number[host.state[row]], minlength=kept.size)
-    if (choices == 0).any():
-        raise ValueError(f"no choice is left in state {kept[int(np.argmin(choices))]}; allow one.")
+    for i in first_true(choices == 0):
+        raise ValueError(f"no choice is left in state {kept[i]}; allow one.")
     entry, width = row_entries(host.entry_start, row)
     initial = np.asarray(model.initial)[kept]
     return replace(
@@ -261,10 +260,3 @@ def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMD
         action=None if model.action is None else np.asarray(model.action)[row],
         valuation={name: np.asarray(x)[kept] for name, x in model.valuation.items()},
     )
-
-
-def reachable_states(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """``bool[S]``, the states reachable from `start` by some rows."""
-    host = model.host
-    used = rows[host.row]
-    return forward_reachable(host.state[host.row[used]], host.successor[used], start)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -21,12 +21,11 @@ from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import (
+    Rewards,
     SparseMDP,
-    check_entries,
-    checked_starts,
     choice_reward,
     refuse_underflow,
-    scaled,
+    sparse_part,
 )
 from jaxltl.core.pretty_print import brief, count
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
@@ -276,17 +275,6 @@ def _order(model: SparseMDP, order: ArrayLike) -> np.ndarray:
 # --- assembling -----------------------------------------------------------------------------------
 
 
-class _Piece(NamedTuple):
-    tables: tuple[RowTable, ...]
-    place: np.ndarray | None
-    available: np.ndarray
-    initial: np.ndarray
-    kind: np.ndarray
-    rewards: dict[str, np.ndarray]
-    number: np.ndarray
-    row: np.ndarray | None
-
-
 def _assembled(
     part: Callable[[int, int], ModelPart],
     ordered: Array,
@@ -296,7 +284,9 @@ def _assembled(
     propositions: tuple[str, ...],
 ) -> ShardedMDP:
     layout = state_layout(num_states, mesh, axis)._replace(order=ordered)
-    parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
+    parts, rows = {}, {}
+    for d in layout.mine:
+        parts[d], rows[d] = _checked(part, layout, d, propositions)
     facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
     halo = _halo(layout, parts)
     total = facts[:, _INITIAL].sum()
@@ -306,15 +296,16 @@ def _assembled(
         np.concatenate(layout.exchanged({d: np.unique(x.label, axis=0) for d, x in parts.items()})),
         axis=0,
     )
-    pieces = {
-        d: _of_states(layout, facts, d, x, _tables(layout, halo, facts, d, x), labels)
-        for d, x in parts.items()
-    }
-    whole: _Piece = jax.tree.map(
+    pieces = {}
+    for d, x in parts.items():
+        tables, place = _tables(layout, halo, facts, d, x)
+        pieces[d] = _of_states(layout, facts, d, x, rows[d], labels)
+        pieces[d] |= {"tables": tables, "place": place}
+    whole = jax.tree.map(
         lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values()
     )
     return ShardedMDP(
-        **whole._asdict(),
+        **whole,
         sent=tuple(layout.array(x) for x in halo.sent),
         shown=layout.replicated(labels),
         propositions=propositions,
@@ -325,93 +316,62 @@ def _assembled(
     )
 
 
-class _Range(NamedTuple):
-    entry_start: np.ndarray
-    successor: np.ndarray
-    probability: np.ndarray
-    row_start: np.ndarray
-    action: np.ndarray
-    initial: np.ndarray
-    label: np.ndarray
-    rewards: dict[str, np.ndarray]
-    row: np.ndarray | None
-
-
 def _checked(
-    part: Callable[[int, int], ModelPart], layout: StateLayout, d: int, num_labels: int
-) -> _Range:
+    part: Callable[[int, int], ModelPart], layout: StateLayout, d: int, names: tuple[str, ...]
+) -> tuple[SparseMDP, np.ndarray | None]:
+    """The validated range of a device as a sparse model, and the numbers of its rows."""
     start, stop = layout.span(d)
-    found = part(start, stop)
+    place, count, found = f"part({start}, {stop})", stop - start, part(start, stop)
     if not isinstance(found, ModelPart):
-        raise ValueError(
-            f"part({start}, {stop}) is {validation.shorten(found)}; it must return a ModelPart."
-        )
-    successor = np.asarray(found.successor)
-    probability = validation.float_array("probability", found.probability)
-    entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
-    row_start = found.row_start
-    if row_start is None:
-        row_start = np.arange(entry_start.size)
-    row_start = checked_starts("row_start", row_start, entry_start.size - 1, "choices")
-    count = row_start.size - 1
-    if count != stop - start:
-        raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
-    dtype = target_dtype(np.float64)
-    check_entries(
-        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
+        raise ValueError(f"{place} is {validation.shorten(found)}; it must return a ModelPart.")
+    starts = found.entry_start if found.row_start is None else found.row_start
+    if np.size(starts) != count + 1:
+        raise ValueError(f"{place} has {np.size(starts) - 1} states; it must have {count}.")
+    initial = np.full(count, 1 / layout.num_given)
+    if found.initial is not None:
+        initial = validation.float_array("initial", found.initial)
+    label = np.zeros((count, len(names)), bool) if found.label is None else found.label
+    num_rows = np.size(found.entry_start) - 1
+    row = np.empty(num_rows) if found.row is None else found.row
+    shapes = {
+        "initial": (initial, (count,)),
+        "label": (label, (count, len(names))),
+        "row": (row, (num_rows,)),
+    }
+    for name, (x, shape) in shapes.items():
+        if np.shape(x) != shape:
+            raise ValueError(f"{place}: {name} has shape {np.shape(x)}; expected {shape}.")
+    model = sparse_part(
+        found.row_start,
+        found.entry_start,
+        found.successor,
+        found.probability,
+        (start, 0, 0),
+        layout.num_given,
+        label=label,
+        propositions=names,
+        action=found.action,
+        rewards={name: Rewards(choice=x) for name, x in found.rewards.items()},
     )
-    refuse_underflow(row_start, entry_start, probability, dtype, first=start)
-    probability = scaled(row_start, entry_start, probability, first=start)
-    owner = np.repeat(np.arange(count), np.diff(row_start))
-    action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action
-    initial = np.full(count, 1 / layout.num_given) if found.initial is None else found.initial
-    if (small := underflows(np.asarray(initial, np.float64), dtype)) is not None:
+    dtype, host = target_dtype(np.float64), model.host
+    refuse_underflow(host.row_start, host.entry_start, host.probability, dtype, first=start)
+    if (small := underflows(initial, dtype)) is not None:
         s = int(np.argmax(small))
         raise ValueError(
             f"initial probability of state {start + s} {underflow_text(initial[s], dtype)}."
         )
-    label = np.zeros((count, num_labels), bool) if found.label is None else found.label
-    for name, x, shape in (
-        ("action", action, (owner.size,)),
-        ("initial", initial, (count,)),
-        ("label", label, (count, num_labels)),
-        ("row", action if found.row is None else found.row, (owner.size,)),
-        *((f"reward {n!r}", r, (owner.size,)) for n, r in found.rewards.items()),
-    ):
-        if np.shape(x) != shape:
-            raise ValueError(
-                f"part({start}, {stop}): {name} has shape {np.shape(x)}; expected {shape}."
-            )
-    return _Range(
-        entry_start,
-        successor,
-        probability,
-        row_start,
-        np.asarray(action),
-        np.asarray(initial, np.float64),
-        np.asarray(label, bool),
-        dict(found.rewards),
-        found.row,
-    )
+    return replace(model, initial=initial), found.row
 
 
 _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
 
 
-def _facts(part: _Range) -> np.ndarray:
+def _facts(part: SparseMDP) -> np.ndarray:
     """Actions, widest row, transitions, initial mass, and the number of rows of each width."""
-    width = np.diff(part.entry_start)
-    return np.concatenate(
-        [
-            [
-                part.action.max(initial=0) + 1.0,
-                width.max(initial=1),
-                part.successor.size,
-                part.initial.sum(),
-            ],
-            np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size),
-        ]
-    )[None]
+    width = np.diff(part.host.entry_start)
+    most = row_actions(part).max(initial=0) + 1.0, width.max(initial=1)
+    counts = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
+    return np.array([[*most, part.num_transitions, part.initial.sum(), *counts]])
 
 
 class _Halo(NamedTuple):
@@ -443,7 +403,7 @@ def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
     return ascending[slice(*np.searchsorted(ascending, (start, stop)))]
 
 
-def _halo(layout: StateLayout, parts: Mapping[int, _Range]) -> _Halo:
+def _halo(layout: StateLayout, parts: Mapping[int, SparseMDP]) -> _Halo:
     count, size = layout.parts, layout.size
     asked = {}
     for d, part in parts.items():
@@ -464,8 +424,8 @@ def _halo(layout: StateLayout, parts: Mapping[int, _Range]) -> _Halo:
         rounds.append(tuple(((d + k) % count, d) for d, x in enumerate(lists) if x.size))
         pieces = {}
         for e in parts:
-            pieces[e] = np.zeros(longest, np.int32)
             asking = lists[(e - k) % count]
+            pieces[e] = np.zeros(longest, np.int32)
             pieces[e][: asking.size] = asking - layout.starts[e]
         sent.append(pieces)
         first.update({(d, (d + k) % count): begins for d in range(count)})
@@ -474,80 +434,79 @@ def _halo(layout: StateLayout, parts: Mapping[int, _Range]) -> _Halo:
 
 
 def _tables(
-    layout: StateLayout, halo: _Halo, facts: np.ndarray, d: int, part: _Range
+    layout: StateLayout, halo: _Halo, facts: np.ndarray, d: int, part: SparseMDP
 ) -> tuple[tuple[RowTable, ...], np.ndarray | None]:
     """Rows by width, and the row of each choice; padded states have self-loops."""
     num_actions, widest = (int(x) for x in facts[:, [_ACTIONS, _WIDEST]].max(0))
-    here, size, own = part.initial.size, layout.size, halo.own(d)
-    successor = halo.places(d, part.successor)
-    width = np.diff(part.entry_start)
-    row = np.repeat(np.arange(width.size), width)
-    rank = np.arange(row.size) - part.entry_start[row]
-    state = np.repeat(np.arange(here), np.diff(part.row_start))
+    host, action = part.host, row_actions(part)
+    here, size, own, row = host.num_states, layout.size, halo.own(d), host.row
+    successor, kept = halo.places(d, host.successor), target_dtype(np.float64)
+    width, rank = np.diff(host.entry_start), np.arange(row.size) - host.entry_start[row]
     if layout.parts * size * num_actions * widest <= _PADDED * facts[:, _TRANSITIONS].sum():
-        target = np.zeros((size * num_actions, widest), np.int32)
-        weight = np.zeros(target.shape)
-        at = (state * num_actions + part.action)[row], rank
-        target[at], weight[at] = successor, part.probability
+        table = _empty_table(size * num_actions, widest, kept)
+        table.fill(((host.state * num_actions + action)[row], rank), successor, host.probability)
         filled = np.arange(here, size)
-        target[filled * num_actions, 0], weight[filled * num_actions, 0] = own + filled, 1
-        return (RowTable(target, weight),), None
+        table.fill((filled * num_actions, 0), own + filled, 1)
+        return (table,), None
     most, kind = facts[:, _COUNTS:].max(0).astype(np.int64), np.searchsorted(_WIDTHS, width)
     # The first two rows are those of padded states and of missing choices.
-    tables = [RowTable(np.zeros((2, 1), np.int32), np.zeros((2, 1)))]
-    tables[0].successor[0, 0], tables[0].probability[0, 0] = own + min(here, size - 1), 1
+    tables = [_empty_table(2, 1, kept)]
+    tables[0].fill((0, 0), own + min(here, size - 1), 1)
     place, begins = np.ones((size, num_actions), np.int32), 2
     place[here:, 0] = 0
     for c in np.flatnonzero(most):
-        rows = np.flatnonzero(kind == c)
-        number = np.zeros(width.size, np.int64)
-        number[rows] = np.arange(rows.size)
-        target = np.zeros((int(most[c]), int(_WIDTHS[c])), np.int32)
-        weight = np.zeros(target.shape)
-        entry = kind[row] == c
-        within = number[row[entry]], rank[entry]
-        target[within], weight[within] = successor[entry], part.probability[entry]
-        place[state[rows], part.action[rows]] = begins + np.arange(rows.size)
-        tables.append(RowTable(target, weight))
+        rows, entry = np.flatnonzero(kind == c), kind[row] == c
+        number = np.cumsum(kind == c) - 1
+        table = _empty_table(int(most[c]), int(_WIDTHS[c]), kept)
+        table.fill((number[row[entry]], rank[entry]), successor[entry], host.probability[entry])
+        place[host.state[rows], action[rows]] = begins + np.arange(rows.size)
+        tables.append(table)
         begins += int(most[c])
     return tuple(tables), place
+
+
+def _empty_table(rows: int, width: int, dtype: np.dtype) -> RowTable:
+    return RowTable(np.zeros((rows, width), np.int32), np.zeros((rows, width), dtype))
 
 
 def _of_states(
     layout: StateLayout,
     facts: np.ndarray,
     d: int,
-    part: _Range,
-    rows: tuple[tuple[RowTable, ...], np.ndarray | None],
+    part: SparseMDP,
+    row: np.ndarray | None,
     labels: np.ndarray,
-) -> _Piece:
-    tables, place = rows
-    num_actions, here = int(facts[:, _ACTIONS].max()), part.initial.size
-    state = np.repeat(np.arange(here), np.diff(part.row_start))
-    pair = state, part.action
+) -> dict[str, PyTree]:
+    """Quantities on a device's states and choices, by field of :class:`ShardedMDP`."""
+    here, own, kept = part.num_states, slice(*layout.span(d)), target_dtype(np.float64)
+    num_actions, choice = int(facts[:, _ACTIONS].max()), (part.host.state, row_actions(part))
 
-    def on_choices(x: np.ndarray, fill: float, dtype: DTypeLike) -> np.ndarray:
+    def on_choices(x: Array, fill: float, dtype: DTypeLike) -> np.ndarray:
         found = np.full((layout.size, num_actions), fill, dtype)
-        found[pair] = x
+        found[choice] = x
         return found
 
-    available = on_choices(np.ones(state.size, bool), False, bool)
-    if available.sum() != state.size:
+    def on_states(x: Array, fill: float, dtype: DTypeLike) -> np.ndarray:
+        found = np.full(layout.size, fill, dtype)
+        found[:here] = x
+        return found
+
+    available = on_choices(True, False, bool)
+    if available.sum() != part.num_rows:
         raise ValueError(
             f"two choices of one of the states {layout.span(d)} have the same action; "
             "number them apart."
         )
     available[here:, 0] = True
-    kind = np.zeros(layout.size, np.int32)  # padded states have some label that occurs
     different, of = np.unique(part.label, axis=0, return_inverse=True)
     place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
-    kind[:here] = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
-    own, number = slice(*layout.span(d)), np.full(layout.size, -1, np.int32)
-    number[:here] = np.arange(own.start, own.stop) if layout.order is None else layout.order[own]
-    row = None if part.row is None else on_choices(part.row, -1, np.int32)
-    initial = np.zeros(layout.size)
-    initial[:here] = part.initial
-    kept = jax.dtypes.canonicalize_dtype(np.float64)
-    tables = tuple(RowTable(x.successor, x.probability.astype(kept)) for x in tables)
-    rewards = {name: on_choices(x, 0, kept) for name, x in part.rewards.items()}
-    return _Piece(tables, place, available, initial.astype(kept), kind, rewards, number, row)
+    kind = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
+    number = np.arange(own.start, own.stop) if layout.order is None else layout.order[own]
+    return {
+        "available": available,
+        "initial": on_states(part.initial, 0, kept),
+        "kind": on_states(kind, 0, np.int32),  # padded states have some label that occurs
+        "rewards": {name: on_choices(x.choice, 0, kept) for name, x in part.rewards.items()},
+        "number": on_states(number, -1, np.int32),
+        "row": None if row is None else on_choices(row, -1, np.int32),
+    }

@@ -30,6 +30,10 @@ class RowTable(NamedTuple):
     successor: Array  # int32[M, W]
     probability: Array  # float[M, W], zero in padding
 
+    def fill(self, place: tuple[Array, Array], successor: Array, probability: Array) -> None:
+        """Sets entries of a table of NumPy arrays."""
+        self.successor[place], self.probability[place] = successor, probability
+
 
 def _facts(model: ShardedMDP) -> Iterator[str]:
     yield count(model.num_given, "state")
@@ -288,9 +292,3 @@ def _(model: ShardedMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     return lambda value: over_devices(
         model, one, model.tables, model.place, model.sent, model.available, policy, value
     )
-
-
-@operators.transition_matrix.register
-def _(model: ShardedMDP, policy: jax.Array) -> jax.Array:
-    ahead = operators.expectation(model, jnp.eye(model.num_states, dtype=model.dtype))  # [N, N, A]
-    return jnp.einsum("nta,na->nt", ahead, policy, precision="highest")

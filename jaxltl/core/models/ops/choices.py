@@ -7,7 +7,6 @@ methods.
 from __future__ import annotations
 
 from functools import singledispatch
-from collections.abc import Callable
 from typing import NamedTuple, Protocol, TypeAlias
 
 import chex
@@ -56,14 +55,8 @@ def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array,
 
 def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
     """True where a condition ``bool[S, A]`` holds for some action, and the first such action or 0."""
-    if condition.shape[-1] > kernels.UNROLL:
-        return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
-    some = jnp.zeros(condition.shape[:-1], bool)
-    action = jnp.zeros(condition.shape[:-1], jnp.int32)
-    for a in reversed(range(condition.shape[-1])):
-        some |= condition[..., a]
-        action = jnp.where(condition[..., a], a, action)
-    return some, action
+    most, action = action_argmax(condition.astype(jnp.float32), jnp.ones_like(condition))
+    return most > 0, action
 
 
 def is_deterministic(policy: chex.Array) -> bool:
@@ -222,9 +215,7 @@ class Rows(NamedTuple):
         return kernels.gather(x, self.state)
 
     def sum(self, quantity: jax.Array) -> jax.Array:
-        if quantity.dtype == bool:
-            quantity = quantity.astype(jnp.int32)
-        return kernels.segment_reduce(jax.ops.segment_sum, quantity, self.state, self.num_states)
+        return kernels.segment_reduce(jnp.add, quantity, self.state, self.num_states)
 
     def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
         """See :class:`Actions`; the derivative is that of the maximiser."""
@@ -235,7 +226,7 @@ class Rows(NamedTuple):
 
     def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
         fixed = lax.stop_gradient(quantity)
-        best = kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
+        best = kernels.segment_reduce(jnp.maximum, fixed, self.state, self.num_states)
         some, row = self.first(fixed >= kernels.gather(best, self.state))
         return jnp.where(some, best, jnp.nan), row
 
@@ -243,7 +234,7 @@ class Rows(NamedTuple):
         last = self.shape[0]
         number = jnp.arange(last, dtype=jnp.int32)
         found = kernels.segment_reduce(
-            jax.ops.segment_min, jnp.where(condition, number, last), self.state, self.num_states
+            jnp.minimum, jnp.where(condition, number, last), self.state, self.num_states
         )
         some = found < last
         return some, jnp.where(some, found, self.start[:-1]).astype(jnp.int32)
@@ -256,7 +247,7 @@ class Rows(NamedTuple):
 
     def top(self, logits: jax.Array) -> jax.Array:
         fixed = lax.stop_gradient(logits)
-        return kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
+        return kernels.segment_reduce(jnp.maximum, fixed, self.state, self.num_states)
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
         top = lax.stop_gradient(self.top(logits))
@@ -330,15 +321,15 @@ class RowEntries(NamedTuple):
     successor: jax.Array  # int32[T]
     probability: jax.Array  # float[T]
 
-    def over_entries(self, operation: Callable[..., jax.Array], quantity: jax.Array) -> jax.Array:
-        """A reduction over the entries of each row: ``[R, ...]`` from ``[T, ...]``."""
-        return kernels.segment_reduce(operation, quantity, self.row, self.choices.shape[0])
+    def combined(self, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+        """A reduction over the entries of each row: ``[R, ...]`` from ``[S, ...]``."""
+        reached = kernels.gather(value, self.successor)
+        terms = term(self.probability.reshape(-1, *(1,) * (reached.ndim - 1)), reached)
+        return kernels.segment_reduce(combine, terms, self.row, self.choices.shape[0])
 
     def expectation(self, value: jax.Array) -> jax.Array:
         """Expected value of the next state, ``[R, ...]`` from ``[S, ...]``."""
-        reached = kernels.gather(value, self.successor)
-        weight = self.probability.reshape(-1, *(1,) * (reached.ndim - 1))
-        return self.over_entries(jax.ops.segment_sum, weight * reached)
+        return self.combined(value, jnp.multiply, jnp.add)
 
     def matrix(self, weight: jax.Array) -> jax.Array:
         """``float[S, S]`` under weights ``[R]`` of the rows."""

@@ -141,7 +141,7 @@ class Rows(NamedTuple):
     def mean(self, quantity: jax.Array) -> jax.Array:
         """Mean over the policy's actions, ``[S]``."""
         assert self.policy is not None
-        return kernels.tree(plus, product(self.policy, quantity), -1)
+        return kernels.reduced(plus, product(self.policy, quantity), -1)
 
     @property
     def terms(self) -> int:
@@ -169,7 +169,7 @@ def normalised_rows(model: ActionModel, policy: jax.Array | None = None) -> Rows
         scale = reciprocal(total)
     else:
         weight = double_word(policy)
-        whole = kernels.tree(plus, weight, -1)[..., None]
+        whole = kernels.reduced(plus, weight, -1)[..., None]
         scale = reciprocal(jnp.concatenate([total, whole], -1))
         scale, policy = scale[..., :-1], product(weight, scale[..., -1:])
     return lax.stop_gradient(Rows(model, scale, policy))

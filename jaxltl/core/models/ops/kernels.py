@@ -94,16 +94,20 @@ def folded(
     """The reduction :func:`fold` along the successor axis of whole tables, in one pass."""
     rows = gather(value, successor)
     terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - weight.ndim)), rows)
-    wholes: dict[Term, Callable[..., jax.Array]] = {
-        jnp.add: jnp.sum,
-        jnp.logical_or: jnp.any,
-        jnp.minimum: jnp.min,
-    }
-    return wholes[combine](terms, axis=axis) if combine in wholes else tree(combine, terms, axis)
+    return reduced(combine, terms, axis)
 
 
-def tree(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
-    """Reduction along an axis by an operation with the neutral element 0."""
+_REDUCTIONS: dict[Term, Callable[..., jax.Array]] = {
+    jnp.add: jnp.sum,
+    jnp.logical_or: jnp.any,
+    jnp.minimum: jnp.min,
+}
+
+
+def reduced(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
+    """Reduction along an axis by one of NumPy's operations, or one with the neutral element 0."""
+    if combine in _REDUCTIONS:
+        return _REDUCTIONS[combine](terms, axis=axis)
     result: jax.Array = lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
     return result
 
@@ -146,8 +150,18 @@ def segment_ids(start: Array, total: int) -> jax.Array:
     return jnp.cumsum(begins, dtype=jnp.int32)
 
 
-def segment_reduce(
-    operation: Callable[..., jax.Array], quantity: jax.Array, owner: jax.Array, count: int
-) -> jax.Array:
-    """A segment reduction such as ``jax.ops.segment_sum`` with sorted ids."""
-    return operation(quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")
+_SEGMENTS: dict[Term, Callable[..., jax.Array]] = {
+    jnp.add: jax.ops.segment_sum,
+    jnp.maximum: jax.ops.segment_max,
+    jnp.minimum: jax.ops.segment_min,
+    jnp.logical_or: jax.ops.segment_max,
+}
+
+
+def segment_reduce(combine: Term, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
+    """Reduction of ``[T, ...]`` over nonempty segments with ascending ids `owner`: ``[count, ...]``."""
+    numbers = quantity.astype(jnp.int32) if quantity.dtype == bool else quantity
+    found = _SEGMENTS[combine](
+        numbers, owner, count, indices_are_sorted=True, mode="promise_in_bounds"
+    )
+    return found.astype(bool) if combine is jnp.logical_or else found

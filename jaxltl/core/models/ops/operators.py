@@ -38,6 +38,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import describe_row, row_tolerance
 from jaxltl.core import validation
+from jaxltl.core.validation import first_true
 
 
 @singledispatch
@@ -137,26 +138,51 @@ def sample_successor(
 
 
 @singledispatch
+def flat_transitions(model: Model) -> tuple[jax.Array, jax.Array]:
+    """Successors ``int32[N, A, K]`` of a padded model's numbered states, and their probabilities."""
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
 def induced_chain(model: Model, policy: jax.Array) -> MDP | DenseMDP:
     """The Markov chain of a deterministic policy ``int32[S]``, as a model with one action and no labels."""
-    raise TypeError(_unknown(model))
+    pick = policy.reshape(-1, 1, 1)
+    successor, probability = (jnp.take_along_axis(x, pick, axis=1) for x in flat_transitions(model))
+    return MDP(
+        successor=successor,
+        probability=probability,
+        available=jnp.ones((len(successor), 1), bool),
+        initial=model.initial.ravel(),
+        label=jnp.zeros((len(successor), 0), bool),
+    )
 
 
 @singledispatch
 def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
     """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a dense matrix ``float[S, S]``, for small models."""
-    raise TypeError(_unknown(model))
+    size = model.num_states
+    if isinstance(base_model(model), MDP | DenseMDP):
+        successor, probability = flat_transitions(model)
+        weight, row = policy.reshape(size, -1, 1) * probability, jnp.arange(size)[:, None, None]
+        return jnp.zeros((size, size), weight.dtype).at[row, successor].add(weight)
+
+    def column(value: jax.Array) -> jax.Array:
+        ahead = expectation(model, value.reshape(model.state_shape))
+        return action_mean(policy, ahead).ravel()
+
+    result: jax.Array = jax.vmap(column, out_axes=-1)(jnp.eye(size, dtype=model.dtype))
+    return result
 
 
 @singledispatch
 def policy_operator(model: Model, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """The operator ``v -> P_pi v`` of a deterministic policy on flat values ``float[N]``."""
-    return chain_operator(induced_chain(model, policy))
-
-
-def chain_operator(chain: Model) -> Callable[[jax.Array], jax.Array]:
-    """The operator ``v -> P v`` of a model with one action."""
-    return lambda value: expectation(chain, value)[:, 0]
+    if isinstance(base_model(model), MDP | DenseMDP):
+        chain = induced_chain(model, policy)
+        return lambda value: expectation(chain, value)[:, 0]
+    return lambda value: action_mean(
+        policy, expectation(model, value.reshape(model.state_shape))
+    ).ravel()
 
 
 def pushforward(model: Model, mass: jax.Array) -> jax.Array:
@@ -255,48 +281,25 @@ def _(model: MDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax
     return model.successor[state, action, k]
 
 
-@induced_chain.register
-def _(model: MDP, policy: jax.Array) -> MDP:
-    pick = policy[:, None, None]
-    return make_chain(
-        jnp.take_along_axis(model.successor, pick, axis=1)[:, 0],
-        jnp.take_along_axis(model.successor_probability, pick, axis=1)[:, 0],
-        model.initial,
-    )
+@flat_transitions.register
+def _(model: MDP) -> tuple[jax.Array, jax.Array]:
+    return model.successor, model.successor_probability
 
 
-@transition_matrix.register
-def _(model: MDP, policy: jax.Array) -> jax.Array:
-    return scatter_matrix(model.successor, policy[:, :, None] * model.successor_probability)
-
-
-def scatter_matrix(successor: jax.Array, weight: jax.Array) -> jax.Array:
-    """``float[S, S]`` with weights ``[S, A, K]`` added at (s, successor)."""
-    num_states = successor.shape[0]
-    row = jnp.arange(num_states)[:, None, None]
-    return jnp.zeros((num_states, num_states), weight.dtype).at[row, successor].add(weight)
-
-
-def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array) -> MDP:
-    """A Markov chain, an MDP with one action, from successors ``int32[S, K]``."""
-    num_states = successor.shape[0]
-    return MDP(
-        successor=successor[:, None, :],
-        probability=probability[:, None, :],
-        available=jnp.ones((num_states, 1), bool),
-        initial=initial,
-        label=jnp.zeros((num_states, 0), bool),
-    )
+@flat_transitions.register
+def _(model: DenseMDP) -> tuple[jax.Array, jax.Array]:
+    successor = jnp.arange(model.num_states, dtype=jnp.int32)
+    return jnp.broadcast_to(successor, model.transition.shape), model.successor_probability
 
 
 @combined.register
 def _(model: DenseMDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
-    return kernels.tree(combine, term(model.successor_probability, value), -1)
-
-
-@expectation.register
-def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return jnp.einsum("sat,t->sa", model.successor_probability, value, precision="highest")
+    weight = model.successor_probability
+    if term is jnp.multiply and combine is jnp.add:
+        return jnp.einsum("sat,t...->s...a", weight, value, precision="highest")
+    if value.ndim > 1:
+        return jax.vmap(lambda v: combined(model, v, term, combine), 1, 1)(value)
+    return kernels.reduced(combine, term(weight, value), -1)
 
 
 @induced_chain.register
@@ -316,21 +319,6 @@ def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
     return jnp.einsum("sa,sat->st", policy, model.successor_probability, precision="highest")
 
 
-@exists_successor.register
-def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.any(is_positive(model.successor_probability) & region, axis=-1)
-
-
-@forall_successor.register
-def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.all(~is_positive(model.successor_probability) | region, axis=-1)
-
-
-@least_successor.register
-def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return where_positive(model.successor_probability, value).min(-1)
-
-
 @sample_successor.register
 def _(model: DenseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
     return _sample(key, model.successor_probability[state, action]).astype(jnp.int32)
@@ -340,23 +328,9 @@ def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
     return jax.random.categorical(key, jnp.log(probability))
 
 
-@expectation.register
-def _(model: SparseMDP, value: jax.Array) -> jax.Array:
-    return row_entries(model).expectation(value)
-
-
-@exists_successor.register
-def _(model: SparseMDP, region: jax.Array) -> jax.Array:
-    of = row_entries(model)
-    inside = kernels.positive_hits(of.probability, kernels.gather(region, of.successor))
-    return of.over_entries(jax.ops.segment_max, inside.astype(jnp.int32)) > 0
-
-
-@least_successor.register
-def _(model: SparseMDP, value: jax.Array) -> jax.Array:
-    of = row_entries(model)
-    reached = where_positive(of.probability, kernels.gather(value, of.successor))
-    return of.over_entries(jax.ops.segment_min, reached)
+@combined.register
+def _(model: SparseMDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+    return row_entries(model).combined(value, term, combine)
 
 
 @sample_successor.register
@@ -454,12 +428,11 @@ def require_policy(model: Model, policy: Array, where: Array = True) -> None:
         known = (table >= 0) & (table < shape[-1])
         place = np.where(known, table, 0)[..., None]
         bad = ~(known & np.take_along_axis(available, place, -1)[..., 0]) & where
-        if bad.any():
-            state = np.argwhere(bad)[0]
-            name = state[0] if len(state) == 1 else tuple(state.tolist())
-            actions = np.flatnonzero(available[tuple(state)]).tolist()
+        for state in map(tuple, np.argwhere(bad)[:1].tolist()):
+            name = state[0] if len(state) == 1 else state
+            actions = np.flatnonzero(available[state]).tolist()
             raise ValueError(
-                f"the policy takes action {table[tuple(state)]} in state {name}, "
+                f"the policy takes action {table[state]} in state {name}, "
                 f"which is not available; choose one of {actions}."
             )
         return
@@ -467,9 +440,8 @@ def require_policy(model: Model, policy: Array, where: Array = True) -> None:
         policy_distribution(model, table)
     given = np.where(available | (table == 0), table, np.nan)
     good = (np.abs(given.sum(-1) - 1) <= row_tolerance(table.dtype)) & (given >= 0).all(-1)
-    if not (good | ~np.asarray(where)).all():
-        state = np.argwhere(~good & where)[0]
-        raise ValueError(f"{describe_row(given[tuple(state)], tuple(state))}.")
+    for state in map(tuple, np.argwhere(~good & where)[:1].tolist()):
+        raise ValueError(f"{describe_row(given[state], state)}.")
     if (small := underflows(table, model.dtype)) is not None:
         *state, action = np.argwhere(small)[0].tolist()
         raise ValueError(
@@ -488,8 +460,7 @@ def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndar
                 f"row for each state, or ({host.num_rows},) weights of rows."
             )
         wrong = ((policy < host.row_start[:-1]) | (policy >= host.row_start[1:])) & where
-        if wrong.any():
-            s = int(np.flatnonzero(wrong)[0])
+        for s in first_true(wrong):
             raise ValueError(
                 f"the policy takes row {policy[s]} in state {s}, whose rows are "
                 f"{host.row_start[s]} to {host.row_start[s + 1] - 1}."
@@ -519,7 +490,6 @@ def require_weights(
     total = host.over_choices(np.add, weight)
     off = ~((np.abs(total - 1) <= tolerance) & (host.over_choices(np.minimum, weight) >= 0))
     off &= where
-    if off.any():
-        s = int(np.flatnonzero(off)[0])
+    for s in first_true(off):
         row = weight[host.row_start[s] : host.row_start[s + 1]]
         raise ValueError(f"{describe_row(row, (s,))}.")

@@ -154,22 +154,9 @@ def successor_table(model: Model) -> SuccessorTable | None:
     num_pairs = int(np.prod(world.probability.shape[-2:]))
     if num_pairs > kernels.WRITTEN_OUT:
         return None
-    weight = world.successor_probability
-    if not isinstance(model, Product):
-        return SuccessorTable(_columns(world.successor), _columns(weight))
-    if model.num_states * num_pairs > _LARGEST:
+    if isinstance(model, Product) and model.num_states * num_pairs > _LARGEST:
         return None
-    num_memory, memory = model.num_memory, model.next_memory
-    shape = (*model.state_shape, *world.successor.shape[1:])
-    if model.label_on == "exit":
-        after = jnp.broadcast_to(memory[:, :, None, None], shape)
-    else:
-        after = jnp.swapaxes(memory[world.successor], 1, -1)  # [S, Q, K, A]
-        after = jnp.swapaxes(after, 2, 3)
-    flat = world.successor[:, None] * num_memory + after
-    probability = jnp.broadcast_to(weight[:, None], shape)
-    rows = (model.num_states, *shape[2:])
-    return SuccessorTable(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
+    return SuccessorTable(*map(_columns, operators.flat_transitions(model)))
 
 
 def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
+from jaxltl.core.validation import first_true
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
@@ -64,8 +65,7 @@ class ParametricMDP:
         """The model at a point, ``float[D]`` or a number for each name; ValueError outside of the box."""
         point = _point("values", values, self.parameters)
         outside = (point < self.low) | (point > self.high)
-        if outside.any():
-            d = int(np.flatnonzero(outside)[0])
+        for d in first_true(outside):
             raise ValueError(
                 f"{self.parameters[d]} = {point[d]:.9g} is outside of its interval "
                 f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
@@ -81,8 +81,7 @@ class ParametricMDP:
                 f"for each of {', '.join(names)}."
             )
         out = ~((found >= self.low) & (found <= self.high))
-        if out.any():
-            n, d = (int(i) for i in np.argwhere(out)[0])
+        for n, d in first_true(out):
             raise ValueError(
                 f"{name} {n} has {names[d]} = {found[n, d]:.9g}; its interval is "
                 f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
@@ -98,8 +97,7 @@ class ParametricMDP:
         """The model on a smaller box; ValueError if it is not contained in this one."""
         low, high = box_of(low, high, self.parameters)
         out = (low < self.low) | (high > self.high)
-        if out.any():
-            d = int(np.flatnonzero(out)[0])
+        for d in first_true(out):
             raise ValueError(
                 f"the interval [{low[d]:.9g}, {high[d]:.9g}] of {self.parameters[d]} is not within "
                 f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
@@ -207,8 +205,7 @@ def _evaluated(
     probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), found)
     host = model.host
     wrong = ~(probability > 0)  # NaN too
-    if wrong.any():
-        e = int(np.flatnonzero(wrong)[0])
+    for e in first_true(wrong):
         raise ValueError(
             f"the probability from state {host.state[host.row[e]]} to state {host.successor[e]} "
             f"is {probability[e]:.6g}; it must be positive."
@@ -249,8 +246,7 @@ def box_of(low: Ends, high: Ends, names: Sequence[str]) -> tuple[np.ndarray, np.
     """The validated bounds of a box, ``float64[D]`` both."""
     ends = [_point(of, x, names) for of, x in (("low", low), ("high", high))]
     crossed = ~(ends[0] < ends[1])
-    if crossed.any():
-        d = int(np.flatnonzero(crossed)[0])
+    for d in first_true(crossed):
         raise ValueError(
             f"the interval of {names[d]} is [{ends[0][d]:.9g}, {ends[1][d]:.9g}]; "
             "low must be below high."

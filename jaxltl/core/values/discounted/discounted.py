@@ -446,7 +446,7 @@ def _newton_steps(
     else:
         weight = cast(SuccessorModel, model).successor_probability
         earned = dw.times(weight, dw.double_word(jnp.where(weight > 0, reward, 0)))
-        gain = dw.product(rows.scale, kernels.tree(dw.plus, earned, -1))
+        gain = dw.product(rows.scale, kernels.reduced(dw.plus, earned, -1))
 
     def backup(value: jax.Array) -> tuple[jax.Array, ...]:
         """The value, its image, the greedy actions, and the image less the value, rounded once."""
