@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,18 +30,25 @@ _ROWS = 2**16  # handled at once, which bounds the memory
 UNPROVEN, ITERATED, ALMOST_SURE, SURE = range(4)  # how the lower bound of a state was found
 
 
-@brief
+Report = Callable[[str], None]
+
+
 @dataclass(frozen=True)
-class Control:
-    """The choices in a cell: none for a policy, or a grid of actions.
+class Limits:
+    """When refinement stops; see :class:`~jaxltl.core.continuous.certificate.ProofOptions`."""
 
-    Attributes:
-      step: the next state of state, row of `actions` and noise.
-      actions: ``float[A, m]``; one row of any numbers for the step of a policy.
-    """
+    tolerance: float = 1e-3
+    threshold: float | None = None
+    max_cells: int = 2**20
+    max_sweeps: int = 1000
+    upper: bool = True
+    report: Report = lambda text: None
 
-    step: Step
-    actions: Floats
+    def decides(self, lower: Floats, upper: Floats) -> bool:
+        """True if bounds of initial states are all above the threshold, or one is below."""
+        if self.threshold is None:
+            return False
+        return bool((lower >= self.threshold).all() or (upper < self.threshold).any())
 
 
 @brief
@@ -55,7 +63,6 @@ class Bounds:
       action: ``int[Q, C]``, which attains the lower bound.
       initial: ``bool[C]``, cells that meet the initial states.
       needed: ``bool[C]``, cells on whose bounds those of the initial cells may depend.
-      seconds: wall time by stage.
     """
 
     grid: Grid
@@ -66,7 +73,6 @@ class Bounds:
     action: Integers
     initial: Booleans
     needed: Booleans
-    seconds: dict[str, float] = field(default_factory=dict)
 
     def initial_bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds ``float[C]`` of beginning in each cell.
@@ -76,27 +82,17 @@ class Bounds:
         upper: Floats = 1 - self.task.initial(1 - self.upper)
         return self.task.initial(self.lower), upper
 
+    @property
+    def open(self) -> Booleans:
+        """``bool[Q, C]``: product states without tight bounds."""
+        undecided = (self.task.decided < 0)[:, None]
+        return (self.lower < 1) & (self.upper > 0) & (self.lower < self.upper) & undecided
 
-@dataclass(frozen=True)
-class Limits:
-    """When refinement stops.
-
-    Attributes:
-      tolerance: the width of the bounds of initial states.
-      threshold: stop when all initial states are proven above, or one below; or None.
-      max_cells: of the finest grid.
-      max_sweeps: of value iteration on one grid.
-      upper: False to compute lower bounds alone.
-    """
-
-    tolerance: float = 1e-3
-    threshold: float | None = None
-    max_cells: int = 2**20
-    max_sweeps: int = 1000
-    upper: bool = True
-
-
-Report = Callable[[str], None]
+    def complement(self) -> Bounds:
+        """The bounds of the negated formula."""
+        how = np.where(self.upper <= 0, SURE, UNPROVEN).astype(np.int8)
+        lower, upper, task = 1 - self.upper, 1 - self.lower, self.task.complement()
+        return replace(self, task=task, lower=lower, upper=upper, how=how)
 
 
 def noise_box(dynamics: Dynamics) -> NoiseBox:
@@ -112,14 +108,9 @@ def noise_box(dynamics: Dynamics) -> NoiseBox:
     if dynamics.disturbance is not None:
         low.extend(dynamics.disturbance[0])
         high.extend(dynamics.disturbance[1])
-    missing = len(low) - len(random)
-    return NoiseBox(
-        np.array(low),
-        np.array(high),
-        np.array(random + [False] * missing, bool),
-        np.array(symmetric + [False] * missing, bool),
-        lost,
-    )
+    missing = [False] * (len(low) - len(random))
+    marks = np.array([random + missing, symmetric + missing], bool)
+    return NoiseBox(np.array(low), np.array(high), marks[0], marks[1], lost)
 
 
 def _finite_support(noise: Distribution) -> tuple[float, float, float]:
@@ -141,37 +132,144 @@ def _finite_support(noise: Distribution) -> tuple[float, float, float]:
     return ends[0], ends[1], lost
 
 
-def bound_satisfaction(
-    dynamics: Dynamics,
-    control: Control,
-    formula: str | Formula,
-    grid: Grid,
-    limits: Limits,
-    report: Report = lambda text: None,
-) -> Bounds:
-    """Bounds of the satisfaction probability of every cell, refined for the initial states.
+@dataclass(frozen=True, eq=False)
+class Abstraction:
+    """Bounds of the satisfaction probability of the cells of a grid, refined for the initial states.
 
-    The policy of the lower bound maximises over the actions of `control`. An interrupt ends refinement;
-    the bounds of the last finished grid are returned.
+    Attributes:
+      dynamics, formula: the world and its task.
+      step: the next state of state, row of `actions` and noise.
+      actions: ``float[A, m]``, over which lower bounds are maximised; one row of any numbers for the
+        step of a policy.
+      limits: when refinement stops.
+      seconds: wall time by stage.
     """
-    seconds: dict[str, float] = {}
-    bounds = _first(dynamics, formula, grid)
-    refined = bounds
-    while True:
-        try:
-            bounds = _improve(dynamics, control, refined, limits, report, seconds)
-        except KeyboardInterrupt:
-            report("interrupted: the bounds proven so far are kept")
-            return replace(bounds, seconds=seconds)
-        lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
-        report(
-            f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "
-            f"{lower.min():.6g}, at most {upper.min():.6g}"
+
+    dynamics: Dynamics
+    formula: str | Formula
+    step: Step
+    actions: Floats
+    limits: Limits
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def bounds(self, grid: Grid) -> Bounds:
+        """Bounds after refinement; an interrupt leaves those of the last finished grid."""
+        bounds = refined = self._first(grid)
+        limits = self.limits
+        while True:
+            try:
+                bounds = self._improved(refined)
+            except KeyboardInterrupt:
+                limits.report("interrupted: the bounds proven so far are kept")
+                return bounds
+            lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
+            limits.report(
+                f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "
+                f"{lower.min():.6g}, at most {upper.min():.6g}"
+            )
+            narrow = limits.threshold is None and (upper - lower).max() <= limits.tolerance
+            finer = _finer(bounds.grid, bounds.needed, limits)
+            if narrow or limits.decides(lower, upper) or finer is None:
+                return bounds
+            refined = self._refined(bounds, *finer)
+
+    def safe_actions(self, bounds: Bounds) -> Booleans:
+        """Actions ``bool[Q, C, A]`` that lead only to states of lower bound 1.
+
+        In states that are satisfied surely or with probability 1, at least the policy's action is one.
+        """
+        won, task = bounds.lower >= 1, bounds.task
+        found = np.zeros((*won.shape, len(self.actions)), bool)
+        cells = np.flatnonzero((won & (task.decided < 0)[:, None]).any(0))
+        if len(cells):
+            rows = self._rows(bounds.grid, cells, noise_box(self.dynamics))[1]
+            for q in np.flatnonzero(task.decided < 0):
+                inside = contained(task, rows, won, int(q)).reshape(len(cells), -1)
+                found[q, cells] = inside & won[q, cells, None]
+        found[task.decided == 1] = True
+        return found
+
+    def _first(self, grid: Grid) -> Bounds:
+        """Bounds 0 and 1."""
+        dynamics, names = self.dynamics, self.dynamics.propositions
+        low, high = grid.boxes()
+        certain, possible = np.zeros((2, grid.num_cells, len(names)), bool)
+        for i, name in enumerate(names):
+            if name in dynamics.labels:
+                certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
+        outside = None if dynamics.outside in ("violates", "clip") else dynamics.outside
+        task = task_product(self.formula, names, certain, possible, outside)
+        # The initial boxes are closed: a cell that only touches the upper edge of one is initial too.
+        closed = replace(dynamics.initial, high=np.nextafter(dynamics.initial.high, np.inf))
+        shape = (task.num_memory, grid.num_cells)
+        decided = np.broadcast_to(task.decided[:, None], shape)
+        return Bounds(
+            grid,
+            task,
+            (decided == 1).astype(np.float64),
+            (decided != 0).astype(np.float64),
+            np.where(decided == 1, SURE, UNPROVEN).astype(np.int8),
+            np.zeros(shape, np.int32),
+            closed.membership(low, high)[1],
+            np.ones(grid.num_cells, bool),
         )
-        finer = _finer(bounds.grid, bounds.needed, limits)
-        if _finished(lower, upper, limits) or finer is None:
-            return replace(bounds, seconds=seconds)
-        refined = _refined(dynamics, formula, bounds, *finer)
+
+    def _refined(self, bounds: Bounds, grid: Grid, parents: tuple[Integers, ...]) -> Bounds:
+        """The same bounds on a finer grid with the parents of its intervals."""
+        fresh = self._first(grid)
+        if not fresh.task.same_memory(
+            bounds.task
+        ):  # fewer labels are uncertain: other memory states
+            return fresh
+        cell = np.ravel_multi_index(np.ix_(*parents), bounds.grid.shape).reshape(-1)
+        arrays = {x: getattr(bounds, x)[:, cell] for x in ("lower", "upper", "how", "action")}
+        return replace(fresh, needed=bounds.needed[cell], **arrays)
+
+    def _rows(self, grid: Grid, cells: Integers, box: NoiseBox) -> tuple[Images, Successors]:
+        """The images of cells under each action, and the cells that they may meet."""
+        images = image_boxes(self.step, grid, cells, self.actions, box)
+        j, noise = np.array(images.noise_of), self.dynamics.noise
+        least, most = np.append(box.low, 0.0)[j], np.append(box.high, 0.0)[j]
+        unbounded = np.array([i >= 0 and not np.isfinite(noise[i].support).all() for i in j])
+        start = np.empty(images.low.shape, np.int32)
+        stop, outside = np.empty_like(start), np.empty(len(start), bool)
+        for begin in range(0, len(start), _ROWS):
+            part = slice(begin, begin + _ROWS)
+            gain = images.gain[part]
+            low, high = images.low[part] + gain * least, images.high[part] + gain * most
+            random = (unbounded & (gain > 0)) | (box.lost > 0)
+            low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
+            if self.dynamics.outside == "clip":
+                low, high = (np.clip(x, *self.dynamics.domain) for x in (low, high))
+            start[part], stop[part], outside[part] = grid.ranges(low, high)
+        count = len(self.actions)
+        return images, Successors(images.cells, count, start, stop, outside, None, grid.shape)
+
+    def _improved(self, bounds: Bounds) -> Bounds:
+        """Better bounds on the same grid: lower ones, then upper ones as those of the negation."""
+        grid, limits = bounds.grid, self.limits
+        cells = np.flatnonzero(bounds.open.any(0) & bounds.needed)
+        if not len(cells):
+            return replace(bounds, needed=np.zeros(grid.num_cells, bool))
+        limits.report(f"{grid.num_cells:,} cells: images of {len(cells):,} cells")
+        box = noise_box(self.dynamics)
+        with self.stage("images"):
+            problem = _Problem(self, *self._rows(grid, cells, box), box)
+        bounds = problem.improved(bounds, True)
+        upper = bounds.upper
+        goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
+        if limits.upper and (bounds.task.initial(bounds.lower)[bounds.initial] < goal).any():
+            upper = np.minimum(upper, 1 - problem.improved(bounds.complement(), False).lower)
+        # Each bound is sound; where rounding makes them cross, the probability is between both.
+        bounds = replace(bounds, upper=np.maximum(upper, bounds.lower))
+        return replace(bounds, needed=problem.needed(bounds, problem.active(bounds)))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the wall time of a block to a stage."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
 def _finer(
@@ -182,187 +280,26 @@ def _finer(
     return (finer, parents) if grid.num_cells < finer.num_cells <= limits.max_cells else None
 
 
-def _finished(lower: Floats, upper: Floats, limits: Limits) -> bool:
-    if limits.threshold is not None:
-        return bool((lower >= limits.threshold).all() or (upper < limits.threshold).any())
-    return bool((upper - lower).max() <= limits.tolerance)
-
-
-def _product(
-    dynamics: Dynamics, formula: str | Formula, grid: Grid
-) -> tuple[TaskProduct, Booleans]:
-    low, high = grid.boxes()
-    names = dynamics.propositions
-    certain, possible = np.zeros((2, grid.num_cells, len(names)), bool)
-    for i, name in enumerate(names):
-        if name in dynamics.labels:
-            certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
-    outside = None if dynamics.outside in ("violates", "clip") else dynamics.outside
-    task = task_product(formula, names, certain, possible, outside)
-    # The initial boxes are closed: a cell that only touches the upper edge of one is initial too.
-    closed = replace(dynamics.initial, high=np.nextafter(dynamics.initial.high, np.inf))
-    return task, closed.membership(low, high)[1]
-
-
-def _first(dynamics: Dynamics, formula: str | Formula, grid: Grid) -> Bounds:
-    """Bounds 0 and 1."""
-    task, initial = _product(dynamics, formula, grid)
-    shape = (task.num_memory, grid.num_cells)
-    decided = np.broadcast_to(task.decided[:, None], shape)
-    return Bounds(
-        grid,
-        task,
-        (decided == 1).astype(np.float64),
-        (decided != 0).astype(np.float64),
-        np.where(decided == 1, SURE, UNPROVEN).astype(np.int8),
-        np.zeros(shape, np.int32),
-        initial,
-        np.ones(grid.num_cells, bool),
-    )
-
-
-def _refined(
-    dynamics: Dynamics,
-    formula: str | Formula,
-    bounds: Bounds,
-    grid: Grid,
-    parents: tuple[Integers, ...],
-) -> Bounds:
-    """The same bounds on a finer grid with the parents of its intervals."""
-    task, initial = _product(dynamics, formula, grid)
-    cell = np.ravel_multi_index(np.ix_(*parents), bounds.grid.shape).reshape(-1)
-    if not _same_memory(task, bounds.task):  # fewer labels are uncertain: other memory states occur
-        fresh = _first(dynamics, formula, grid)
-        return replace(fresh, seconds=bounds.seconds)
-    return Bounds(
-        grid,
-        task,
-        bounds.lower[:, cell],
-        bounds.upper[:, cell],
-        bounds.how[:, cell],
-        bounds.action[:, cell],
-        initial,
-        bounds.needed[cell],
-    )
-
-
-def _same_memory(x: TaskProduct, y: TaskProduct) -> bool:
-    same = x.states == y.states and x.automaton.delta.shape == y.automaton.delta.shape
-    return same and bool((x.automaton.delta == y.automaton.delta).all())
-
-
-def _improve(
-    dynamics: Dynamics,
-    control: Control,
-    bounds: Bounds,
-    limits: Limits,
-    report: Report,
-    seconds: dict[str, float],
-) -> Bounds:
-    """Better bounds on the same grid: lower ones, then upper ones as those of the negation."""
-    clock = _Clock(seconds)
-    box = noise_box(dynamics)
-    open_cells = _open(bounds.lower, bounds.upper, bounds.task)
-    cells = np.flatnonzero(open_cells.any(0) & bounds.needed)
-    if not len(cells):
-        return replace(bounds, needed=np.zeros(bounds.grid.num_cells, bool))
-    report(f"{bounds.grid.num_cells:,} cells: images of {len(cells):,} cells")
-    images = image_boxes(control.step, bounds.grid, cells, control.actions, box)
-    rows = _successors(dynamics, bounds.grid, images, control, box)
-    clock.stage("images")
-    problem = _Problem(dynamics, bounds.grid, images, rows, box, limits, bounds.initial)
-    before = _Lower(bounds.lower, bounds.how, bounds.action)
-    lower = problem.lower_bounds(bounds.task, before, bounds.upper, True, clock)
-    upper = bounds.upper
-    goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
-    if limits.upper and (bounds.task.initial(lower.value)[bounds.initial] < goal).any():
-        how = np.where(upper <= 0, SURE, UNPROVEN).astype(np.int8)
-        start = _Lower(1 - upper, how, lower.action)
-        negated = bounds.task.complement()
-        found = problem.lower_bounds(negated, start, 1 - lower.value, False, clock)
-        upper = np.minimum(upper, 1 - found.value)
-    # Each bound is sound; where rounding makes them cross, the probability is between both.
-    upper = np.maximum(upper, lower.value)
-    needed = problem.needed(problem.active(bounds.task, lower.value, upper))
-    return replace(
-        bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action, needed=needed
-    )
-
-
-def _open(lower: Floats, upper: Floats, task: TaskProduct) -> Booleans:
-    """Product states without tight bounds."""
-    return (lower < 1) & (upper > 0) & (lower < upper) & (task.decided < 0)[:, None]
-
-
-def _successors(
-    dynamics: Dynamics, grid: Grid, images: Images, control: Control, box: NoiseBox
-) -> Successors:
-    """The cells that each row may meet."""
-    j = np.array(images.noise_of)
-    least = np.append(box.low, 0.0)[j]
-    most = np.append(box.high, 0.0)[j]
-    unbounded = np.array([i >= 0 and not np.isfinite(dynamics.noise[i].support).all() for i in j])
-    start = np.empty(images.low.shape, np.int32)
-    stop, outside = np.empty_like(start), np.empty(len(start), bool)
-    for begin in range(0, len(start), _ROWS):
-        part = slice(begin, begin + _ROWS)
-        gain = images.gain[part]
-        low, high = images.low[part] + gain * least, images.high[part] + gain * most
-        random = (unbounded & (gain > 0)) | (box.lost > 0)
-        low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
-        if dynamics.outside == "clip":
-            low, high = np.clip(low, *dynamics.domain), np.clip(high, *dynamics.domain)
-        start[part], stop[part], outside[part] = grid.ranges(low, high)
-    return Successors(images.cells, len(control.actions), start, stop, outside, None, grid.shape)
-
-
-class _Clock:
-    """Wall time by stage."""
-
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self.seconds, self.last = seconds, time.perf_counter()
-
-    def stage(self, name: str) -> None:
-        """Ends a stage."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
-        self.last = now
-
-
-@dataclass(frozen=True)
-class _Lower:
-    value: Floats
-    how: Integers
-    action: Integers
-
-
 @dataclass(frozen=True)
 class _Problem:
-    """One grid with its rows."""
+    """The rows of one grid."""
 
-    dynamics: Dynamics
-    grid: Grid
+    abstraction: Abstraction
     images: Images
     rows: Successors
     box: NoiseBox
-    limits: Limits
-    initial: Booleans
 
-    def refinable(self, active: Integers) -> bool:
-        """True if the grid refined at rows' positions has few enough cells."""
-        return _finer(self.grid, self.needed(active), self.limits) is not None
-
-    def needed(self, active: Integers) -> Booleans:
+    def needed(self, bounds: Bounds, active: Integers) -> Booleans:
         """Cells ``bool[C]`` at rows' positions."""
-        found = np.zeros(self.grid.num_cells, bool)
+        found = np.zeros(bounds.grid.num_cells, bool)
         found[self.rows.cells[active]] = True
         return found
 
-    def lower_bounds(
-        self, task: TaskProduct, before: _Lower, upper: Floats, maximize: bool, clock: _Clock
-    ) -> _Lower:
-        """Better lower bounds of a task, by sets and by value iteration."""
-        value, how, action = before.value.copy(), before.how.copy(), before.action.copy()
+    def improved(self, bounds: Bounds, maximize: bool) -> Bounds:
+        """Better lower bounds, by sets and by value iteration."""
+        task, stage, limits = bounds.task, self.abstraction.stage, self.abstraction.limits
+        value, how, action = bounds.lower.copy(), bounds.how.copy(), bounds.action.copy()
+        bounds = replace(bounds, lower=value, how=how, action=action)
 
         def prove(rows: Successors, kind: int) -> None:
             known = (value >= 1) & (how >= kind)  # "surely" rests on sure states alone
@@ -370,59 +307,42 @@ class _Problem:
             new = won & (value < 1)
             value[new], how[new], action[new] = 1.0, kind, choice[new]
 
-        if not self.rows.outside.all() or task.outside.any():
-            prove(self.rows, SURE)
-        clock.stage("sets")
-        active = self.active(task, value, upper)
+        with stage("sets"):
+            if not self.rows.outside.all() or task.outside.any():
+                prove(self.rows, SURE)
+            active = self.active(bounds)
         if not len(active) or not any(j >= 0 for j in self.images.noise_of):
-            return _Lower(value, how, action)
-        rows, bounds = self._part(active)
-        prove(replace(rows, certain=bounds.certain()), ALMOST_SURE)
-        clock.stage("sets")
-        active = self.active(task, value, upper)
-        coarse = bounds.certain_share() < CERTAIN_SHARE and self.refinable(active)
-        if len(active) and not coarse:
+            return bounds
+        with stage("sets"):
+            rows, probabilities = self._part(bounds.grid, active)
+            prove(replace(rows, certain=probabilities.certain()), ALMOST_SURE)
+        with stage("value iteration"):
+            active = self.active(bounds)
+            share, finer = probabilities.certain_share(), self.needed(bounds, active)
+            if not len(active) or (
+                share < CERTAIN_SHARE and _finer(bounds.grid, finer, limits) is not None
+            ):
+                return bounds
             if len(active) < len(rows.cells):
-                rows, bounds = self._part(active)
-            before_sweeps = value
-            sweeps = self.limits.max_sweeps
-            value, action = iterate(task, bounds, rows, (value, action), sweeps, maximize)
-            how[value > before_sweeps] = ITERATED
-        clock.stage("value iteration")
-        return _Lower(value, how, action)
+                rows, probabilities = self._part(bounds.grid, active)
+            start = value, action
+            found, best = iterate(task, probabilities, rows, start, limits.max_sweeps, maximize)
+            how[found > value] = ITERATED
+        return replace(bounds, lower=found, action=best)
 
-    def active(self, task: TaskProduct, value: Floats, upper: Floats) -> Integers:
+    def active(self, bounds: Bounds) -> Integers:
         """Rows' positions of cells that matter for initial states and are not decided."""
-        finished = (value >= 1) | (upper <= 0)
-        met = reachable(task, self.rows, self.initial, finished)
-        needed = met & ~finished & (task.decided < 0)[:, None]
+        finished = (bounds.lower >= 1) | (bounds.upper <= 0)
+        met = reachable(bounds.task, self.rows, bounds.initial, finished)
+        needed = met & ~finished & (bounds.task.decided < 0)[:, None]
         return np.flatnonzero(np.logical_or.reduce(needed, axis=0)[self.rows.cells])
 
-    def _part(self, active: Integers) -> tuple[Successors, TransitionBounds]:
+    def _part(self, grid: Grid, active: Integers) -> tuple[Successors, TransitionBounds]:
         """The rows of some cells, with their transition probabilities."""
-        clipped, rows, index = self.dynamics.outside == "clip", self.rows, None
+        dynamics, rows, index = self.abstraction.dynamics, self.rows, None
         if len(active) < len(rows.cells):
             index = (active[:, None] * rows.num_actions + np.arange(rows.num_actions)).reshape(-1)
             arrays = {x: getattr(rows, x)[index] for x in ("start", "stop", "outside")}
             rows = replace(rows, cells=rows.cells[active], **arrays)
-        noise = self.dynamics.noise
-        return rows, transition_bounds(self.images, self.grid, noise, self.box, clipped, index)
-
-
-def safe_actions(dynamics: Dynamics, control: Control, bounds: Bounds) -> Booleans:
-    """Actions ``bool[Q, C, A]`` that lead only to states of lower bound 1.
-
-    In states that are satisfied surely or with probability 1, at least the policy's action is one.
-    """
-    won = bounds.lower >= 1
-    found = np.zeros((*won.shape, len(control.actions)), bool)
-    cells = np.flatnonzero((won & (bounds.task.decided < 0)[:, None]).any(0))
-    if len(cells):
-        box = noise_box(dynamics)
-        images = image_boxes(control.step, bounds.grid, cells, control.actions, box)
-        rows = _successors(dynamics, bounds.grid, images, control, box)
-        for q in np.flatnonzero(bounds.task.decided < 0):
-            inside = contained(bounds.task, rows, won, int(q)).reshape(len(cells), -1)
-            found[q, cells] = inside & won[q, cells, None]
-    found[bounds.task.decided == 1] = True
-    return found
+        clipped = dynamics.outside == "clip"
+        return rows, transition_bounds(self.images, grid, dynamics.noise, self.box, clipped, index)

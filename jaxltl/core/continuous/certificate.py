@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
 
 import jax
@@ -18,12 +18,11 @@ from jaxltl.core.continuous.abstraction import (
     ALMOST_SURE,
     ITERATED,
     SURE,
+    Abstraction,
     Bounds,
-    Control,
     Limits,
-    bound_satisfaction,
 )
-from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.dynamics import Dynamics, Step
 from jaxltl.core.continuous.grid import Grid, make_grid
 from jaxltl.core.continuous.learned_policy import Policy, StatePolicy, learned_policy
 from jaxltl.core.environments.environment import traced
@@ -181,12 +180,31 @@ def certify_policy(
     validation.keywords("certify_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     step = closed_loop(dynamics, learned_policy(policy, dynamics, formula))
-    grid = first_grid(dynamics, options.get("cells"), options.get("max_cells", 2**20))
-    limits = proof_limits(options)
-    control = Control(step, np.zeros((1, 1)))
-    report = options.get("report", _silent)
-    bounds = bound_satisfaction(dynamics, control, formula, grid, limits, report)
-    return make_certificate(bounds, str(formula), limits)
+    return prove(dynamics, formula, step, np.zeros((1, 1)), options)[0]
+
+
+def prove(
+    dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
+) -> tuple[Certificate, Abstraction, Bounds]:
+    """The certificate of a step under the best actions of a grid, and what it was made of."""
+    given = dict(options)
+    limits = replace(Limits(), **{k: x for k, x in given.items() if k != "cells"})
+    for name in ("tolerance", "threshold"):
+        if getattr(limits, name) is not None:
+            number = validation.finite_number(name, getattr(limits, name))
+            limits = replace(limits, **{name: number})
+    grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
+    limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
+    abstraction = Abstraction(dynamics, formula, step, actions, limits)
+    bounds = abstraction.bounds(grid)
+    lower, upper = bounds.initial_bounds()
+    how = bounds.task.initial(bounds.how.astype(np.float64)).astype(np.int8)
+    ends = lower[bounds.initial], upper[bounds.initial]
+    decided = (ends[1] - ends[0]).max() <= limits.tolerance or limits.decides(*ends)
+    status = Status.CONVERGED if decided else Status.MAX_STEPS
+    seconds, text = abstraction.seconds, str(formula)
+    made = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
+    return made, abstraction, bounds
 
 
 def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Array]:
@@ -202,14 +220,11 @@ def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Ar
             f"policy returns an array of shape {list(getattr(found, 'shape', ()))} for a state of {n} "
             f"coordinates; return float[{m}], an action."
         )
-    low, high = dynamics.actions if isinstance(dynamics.actions, tuple) else (-np.inf, np.inf)
 
     def step(state: jax.Array, _: jax.Array, noise: jax.Array) -> jax.Array:
         action = policy(state)
         if isinstance(dynamics.actions, tuple):
-            action = jnp.clip(
-                action, jnp.asarray(low, action.dtype), jnp.asarray(high, action.dtype)
-            )
+            action = jnp.clip(action, *(jnp.asarray(x, action.dtype) for x in dynamics.actions))
         return dynamics.step(state, action, noise)
 
     return step
@@ -220,10 +235,8 @@ def first_grid(
 ) -> Grid:
     """The first grid, whose edges include those of the labels and of the initial boxes."""
     n = dynamics.num_states
-    low, high = dynamics.domain
     if cells is None:
-        side = max(int(FIRST_CELLS ** (1 / n)), 2)
-        cells = (side,) * n
+        cells = (max(int(FIRST_CELLS ** (1 / n)), 2),) * n
     breakpoints = []
     for axis in range(n):
         edges = np.concatenate([[], *(r.breakpoints(axis) for r in dynamics.labels.values())])
@@ -241,35 +254,4 @@ def first_grid(
             f"{count * num_actions * _BYTES / 2**30:.3g} GiB with {num_actions:,} actions; give at most "
             f"{most:,}, {remedy}."
         )
-    return make_grid(low, high, shape, breakpoints)
-
-
-def proof_limits(options: ProofOptions) -> Limits:
-    """The limits that options ask for."""
-    threshold = options.get("threshold")
-    if threshold is not None:
-        threshold = validation.finite_number("threshold", threshold)
-    return Limits(
-        tolerance=validation.finite_number("tolerance", options.get("tolerance", 1e-3)),
-        threshold=threshold,
-        max_cells=options.get("max_cells", 2**20),
-        max_sweeps=options.get("max_sweeps", 1000),
-        upper=options.get("upper", True),
-    )
-
-
-def make_certificate(bounds: Bounds, formula: str, limits: Limits) -> Certificate:
-    """The certificate of bounds by memory state."""
-    lower, upper = bounds.initial_bounds()
-    how = bounds.task.initial(bounds.how.astype(np.float64)).astype(np.int8)
-    inside = bounds.initial
-    decided = bool((upper - lower)[inside].max() <= limits.tolerance)
-    if limits.threshold is not None:
-        reached = (lower[inside] >= limits.threshold).all()
-        decided = decided or bool(reached or (upper[inside] < limits.threshold).any())
-    status = Status.CONVERGED if decided else Status.MAX_STEPS
-    return Certificate(bounds.grid, lower, upper, how, inside, status, bounds.seconds, formula)
-
-
-def _silent(_: str) -> None:
-    """No progress."""
+    return make_grid(*dynamics.domain, shape, breakpoints)

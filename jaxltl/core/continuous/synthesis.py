@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Unpack
 
 import jax
@@ -14,15 +13,7 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array, Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.continuous.abstraction import Control, bound_satisfaction, safe_actions
-from jaxltl.core.continuous.certificate import (
-    PAIRS,
-    Certificate,
-    ProofOptions,
-    first_grid,
-    make_certificate,
-    proof_limits,
-)
+from jaxltl.core.continuous.certificate import Certificate, ProofOptions, prove
 from jaxltl.core.continuous.dynamics import Dynamics, make_dynamics  # noqa: F401 - of the examples
 from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.logic.ltl import Formula
@@ -144,20 +135,14 @@ def synthesize_policy(
     """
     validation.keywords("synthesize_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
-    grid_of_actions = _actions(dynamics, actions)
-    max_cells = options.get("max_cells", 2**20)
-    grid = first_grid(dynamics, options.get("cells"), max_cells, len(grid_of_actions))
-    limits = replace(proof_limits(options), max_cells=min(max_cells, PAIRS // len(grid_of_actions)))
-    control = Control(dynamics.step, grid_of_actions)
-    report: Callable[[str], None] = options.get("report", lambda _: None)
-    bounds = bound_satisfaction(dynamics, control, formula, grid, limits, report)
-    certificate = make_certificate(bounds, str(formula), limits)
-    allowed = safe_actions(dynamics, control, bounds)
+    grid = _actions(dynamics, actions)
+    certificate, abstraction, bounds = prove(dynamics, formula, dynamics.step, grid, options)
+    task, allowed = bounds.task, abstraction.safe_actions(bounds)
+    states = np.array([q for q, _ in task.states])
+    table = _memory_table(task)
     return CellPolicy(
-        certificate, grid_of_actions, bounds.action, allowed, dynamics,
-        bounds.task.automaton, np.array([q for q, _ in bounds.task.states]),
-        _memory_table(bounds.task),
-    )  # fmt: skip
+        certificate, grid, bounds.action, allowed, dynamics, task.automaton, states, table
+    )
 
 
 def _memory_table(task: TaskProduct) -> Integers:

@@ -52,6 +52,11 @@ class TaskProduct:
         """Q, the number of memory states."""
         return len(self.priority)
 
+    def same_memory(self, other: TaskProduct) -> bool:
+        """True if memory states mean the same in both products."""
+        one, two = self.automaton.delta, other.automaton.delta
+        return self.states == other.states and np.array_equal(one, two)
+
     def complement(self) -> TaskProduct:
         """The product of the negated formula."""
         decided = np.where(self.decided < 0, -1, 1 - self.decided)
