@@ -9,7 +9,6 @@ coordinate of the state; the rest of the noise is treated as chosen by an advers
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -25,7 +24,7 @@ from jaxltl.core.enclosures.linear_bounds import AffineForm, propagate
 from jaxltl.core.enclosures.program import Program
 from jaxltl.core.pretty_print import brief
 
-LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as long
+_LENGTHS = (16, 4, 1)  # of blocks, in cells along an axis
 # A block's form is used if its error is below these shares of the half-width of a cell's image and
 # of the noise: less trades more evaluations for narrower images.
 CELL_SHARE, NOISE_SHARE = 0.15, 0.02
@@ -98,13 +97,13 @@ def image_boxes(
     with jax.enable_x64(True):
         program = gain_program(step, [jax.ShapeDtypeStruct((k,), np.float64) for k in sizes])
     num_actions, n = len(actions), grid.num_axes
-    low = np.empty((len(cells), num_actions, n))
-    high, gain, varying = np.empty_like(low), np.empty_like(low), np.empty_like(low)
+    found = [np.empty((len(cells), num_actions, n)) for _ in range(4)]
     todo = np.ones(len(cells), bool)
     order, noise_of = tuple(range(n)), (-1,) * n
     index = np.stack(np.unravel_index(cells, grid.shape), -1)
     usual: Floats | None = None
-    for size in _block_sizes(grid.shape):
+    for length in _LENGTHS:
+        size = tuple(min(length, k) for k in grid.shape)
         rows = np.flatnonzero(todo)
         start, of_block = _blocks(index[rows], grid.shape, size)
         # The largest blocks are few, and decide the order of the coordinates for all cells.
@@ -118,20 +117,25 @@ def image_boxes(
             mine = np.flatnonzero((of_block >= first) & (of_block < first + many))
             for part in np.array_split(mine, -(-len(mine) * num_actions // _ROWS)):
                 here = rows[part]
-                image = _cell_images(form, random, grid, cells[here], of_block[part] - first)
-                accepted = image.accepted | (max(size) == 1)
-                for array, new in ((low, image.low), (high, image.high), (gain, image.gain),
-                                   (varying, image.varying)):  # fmt: skip
+                image, accepted = _cell_images(
+                    form, random, grid, cells[here], of_block[part] - first
+                )
+                accepted |= max(size) == 1
+                for array, new in zip(found, image, strict=True):
                     array[here[accepted]] = new[accepted]
                 todo[here[accepted]] = False
         if not todo.any():
             break
-    unbounded = ~np.isfinite(high - low).all((1, 2))
+    unbounded = ~np.isfinite(found[1] - found[0]).all((1, 2))
     if unbounded.any():
-        raise ValueError(_unbounded(grid, cells[[unbounded.argmax()]]))
-    shape = (len(cells) * num_actions, n)
-    gain, varying = (_compact(x.reshape(shape)) for x in (gain, varying))
-    return Images(cells, low.reshape(shape), high.reshape(shape), gain, noise_of, varying, order)
+        low, high = (x[0].round(6).tolist() for x in grid.boxes(cells[[unbounded.argmax()]]))
+        raise ValueError(
+            f"the step or the policy is unbounded, as far as intervals show, on the cell {low} to "
+            f"{high}; bound it by jnp.clip or jnp.where, give more cells, or a domain without such "
+            "states."
+        )
+    low, high, gain, varying = (x.reshape(-1, n) for x in found)
+    return Images(cells, low, high, _compact(gain), noise_of, _compact(varying), order)
 
 
 def _blocks(
@@ -145,38 +149,23 @@ def _blocks(
     return start, of_block.reshape(-1)
 
 
-def _unbounded(grid: Grid, cell: Integers) -> str:
-    low, high = (x[0].round(6).tolist() for x in grid.boxes(cell))
-    return (
-        f"the step or the policy is unbounded, as far as intervals show, on the cell {low} to {high}; "
-        "bound it by jnp.clip or jnp.where, give more cells, or a domain without such states."
-    )
-
-
 def _compact(rows: Floats) -> Floats:
     """Equal rows as one row in memory."""
     return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
-
-
-def _block_sizes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    size = LARGEST_BLOCK
-    while size >= 1:
-        yield tuple(min(size, k) for k in shape)
-        size //= 4
 
 
 @dataclass(frozen=True)
 class _Forms:
     """Affine forms of blocks (N) and actions (A): `middle + slope e + gains (w - w_mid) +- error`."""
 
-    middle: Floats  # [N, A, n]
-    slope: Floats  # [N, A, n, n], of the block's e in [-1, 1]^n: state coordinate, then output
-    gains: Floats  # [N, A, k, n]
-    gain_low: Floats  # [N, A, k, n], bounds of the derivatives in the noise
-    gain_high: Floats
-    error: Floats  # [N, A, n]
     low: Floats  # [N, A, n], of the whole block and all noise
     high: Floats
+    middle: Floats  # [N, A, n]
+    error: Floats  # [N, A, n]
+    gain_low: Floats  # [N, A, k, n], bounds of the derivatives in the noise
+    gain_high: Floats
+    slope: Floats  # [N, A, n, n], of the block's e in [-1, 1]^n: state coordinate, then output
+    gains: Floats  # [N, A, k, n]
     centre: Floats  # [N, n], of the blocks
     radius: Floats
 
@@ -192,14 +181,15 @@ def _forms(
     """Forms over blocks, evaluated in chunks on two threads or more."""
     n, k, num_actions = grid.num_axes, len(noise.low), len(actions)
     stop = np.minimum(start + np.array(size), np.array(grid.shape))
-    first = np.stack([e[i] for e, i in zip(grid.edges, start.T, strict=True)], -1)
-    last = np.stack([e[i] for e, i in zip(grid.edges, stop.T, strict=True)], -1)
-    total = len(start) * num_actions
+    first, last = (
+        np.stack([e[i] for e, i in zip(grid.edges, at.T, strict=True)], -1) for at in (start, stop)
+    )
+    total, width = len(start) * num_actions, n + actions.shape[1] + k
 
-    def evaluate(begin: int) -> tuple[Floats, ...]:
+    def evaluate(begin: int) -> list[Floats]:
         row = np.arange(begin, min(begin + _CHUNK, total))
         block, action = row // num_actions, actions[row % num_actions]
-        wide = np.broadcast_to(noise.low, (len(row), k)), np.broadcast_to(noise.high, (len(row), k))
+        wide = (np.broadcast_to(x, (len(row), k)) for x in (noise.low, noise.high))
         boxes = [Interval(first[block], last[block]), Interval(action, action), Interval(*wide)]
         known = propagate(program, boxes)
         y = program.outputs[0]
@@ -207,28 +197,19 @@ def _forms(
         if form is None:  # the output does not depend on the inputs
             form = AffineForm(np.zeros((1, 0, n)), bounds.middle, bounds.radius)
         gains = gain_bounds(known, (len(row), k, n))
-        found = (bounds.low, bounds.high, form.middle, form.slope, form.error, *gains)
-        return tuple(np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found)
+        slope = np.zeros((len(row), width, n))
+        slope[:, : form.slope.shape[1]] = form.slope
+        found = (bounds.low, bounds.high, form.middle, form.error, *gains, slope)
+        return [np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(evaluate, range(0, total, _CHUNK)))
-    low, high, middle, some, error, *gains = (np.concatenate(x) for x in zip(*parts, strict=True))
-    m = actions.shape[1]
-    slope = np.zeros((total, n + m + k, n))
-    slope[:, : some.shape[1]] = some
-    grouped = (len(start), num_actions)
-    return _Forms(
-        middle.reshape(*grouped, n),
-        slope[:, :n].reshape(*grouped, n, n),
-        slope[:, n + m :].reshape(*grouped, k, n),
-        gains[0].reshape(*grouped, k, n),
-        gains[1].reshape(*grouped, k, n),
-        error.reshape(*grouped, n),
-        low.reshape(*grouped, n),
-        high.reshape(*grouped, n),
-        (first + last) / 2,
-        (last - first) / 2,
+    *arrays, slope = (
+        np.concatenate(x).reshape(len(start), num_actions, *x[0].shape[1:])
+        for x in zip(*parts, strict=True)
     )
+    state, gains = slope[:, :, :n], slope[:, :, width - k :]
+    return _Forms(*arrays, state, gains, (first + last) / 2, (last - first) / 2)
 
 
 def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -247,19 +228,13 @@ def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int
     return conditioning_order(found, depends, own / np.maximum(size.sum(0), 1e-300))
 
 
-@dataclass(frozen=True)
-class _CellImages:
-    low: Floats  # [M, A, n]
-    high: Floats
-    gain: Floats
-    varying: Floats
-    accepted: Booleans  # [M]
-
-
 def _cell_images(
     form: _Forms, random: _Random, grid: Grid, cells: Integers, of_block: Integers
-) -> _CellImages:
-    """Images of cells by the forms of their blocks."""
+) -> tuple[list[Floats], Booleans]:
+    """Low, high, gain and variation ``[M, A, n]`` of cells by the forms of their blocks.
+
+    The second result marks the cells ``bool[M]`` for which the forms are accurate.
+    """
     low, high = grid.boxes(cells)
     radius = np.where(form.radius > 0, form.radius, 1)[of_block]
     offset = ((low + high) / 2 - form.centre[of_block]) / radius
@@ -268,23 +243,21 @@ def _cell_images(
     size = np.abs(slope)
     middle = form.middle[of_block] + np.einsum("ca,cuai->cui", offset, slope)
     spread = np.einsum("ca,cuai->cui", share, size)
-    error = form.error[of_block]
     fuzzy = np.abs(form.middle[of_block]) + size.sum(-2) + np.abs(form.gains[of_block]).sum(-2)
     own, reach, varying = (x[of_block] for x in (random.gain, random.reach, random.varying))
     least, most = random.least, random.most
-    error = error + fuzzy * _ROUNDING
+    error = form.error[of_block] + fuzzy * _ROUNDING
     allowed = CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
     small = (error <= allowed) & (varying <= allowed)
     half = (spread + error + reach) * (1 + _ROUNDING)
     middle = middle - own * (least + most) / 2  # forms are centred at the middle of the noise
-    found_low, found_high = middle - half, middle + half
-    # Then the interval with all of the noise.
-    unknown = ~(np.isfinite(found_low) & np.isfinite(found_high))
-    found_low = np.where(unknown, form.low[of_block] - own * most, found_low)
-    found_high = np.where(unknown, form.high[of_block] - own * least, found_high)
-    found_low = np.where(np.isnan(found_low), -np.inf, found_low)
-    found_high = np.where(np.isnan(found_high), np.inf, found_high)
-    return _CellImages(found_low, found_high, own, varying, (small & ~unknown).all((1, 2)))
+    low, high = middle - half, middle + half
+    # Where these are infinite, the interval with all of the noise.
+    unknown = ~(np.isfinite(low) & np.isfinite(high))
+    low = np.where(unknown, form.low[of_block] - own * most, low)
+    high = np.where(unknown, form.high[of_block] - own * least, high)
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    return [low, high, own, varying], (small & ~unknown).all((1, 2))
 
 
 @dataclass(frozen=True)

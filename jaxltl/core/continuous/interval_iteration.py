@@ -48,8 +48,7 @@ def _expected(
     task: TaskProduct, bounds: TransitionBounds, value: Floats, memory: int, shape: tuple[int, ...]
 ) -> Floats:
     """Least expected values ``[R]`` of the rows from a memory state."""
-    entered = task.entered(value, memory).reshape(shape)
-    return bounds.least(entered, float(task.outside[memory]))
+    return bounds.least(task.entered(value, memory).reshape(shape), float(task.outside[memory]))
 
 
 def _raise(value: Floats, memory: int, cells: Integers, new: Floats) -> float:

@@ -10,29 +10,20 @@ a column for each cell.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.continuous.images import Images, NoiseBox
+from jaxltl.core.continuous.noise import Distribution
 from jaxltl.core.pretty_print import brief
 
 _CHUNK = 2**14  # probabilities handled at once by a thread
 _UNIT = float(np.finfo(np.float64).eps)
-
-
-class Noise(Protocol):
-    """A distribution of one coordinate of the noise."""
-
-    def probability_bounds(
-        self, a: Floats, b: Floats, low: Floats, high: Floats, scale: Floats
-    ) -> tuple[Floats, Floats]:
-        """Bounds of `P(a <= m + scale w < b)` over all shifts m in [low, high]."""
 
 
 @brief
@@ -128,7 +119,7 @@ class TransitionBounds:
 def transition_bounds(
     images: Images,
     grid: Grid,
-    noise: Sequence[Noise],
+    noise: Sequence[Distribution],
     box: NoiseBox,
     clipped: bool,
     only: Integers | None = None,
@@ -138,15 +129,12 @@ def transition_bounds(
     order = images.order or tuple(range(grid.num_axes))
     for axis in order:
         j = images.noise_of[axis]
+        one, least, most = (noise[j], box.low[j], box.high[j]) if j >= 0 else (None, 0.0, 0.0)
         rows, number = _distinct(images.columns(axis, only))
-        ids.append(number)
         low, high, gain, _ = rows.T
-        ends = (low, high)
-        if j >= 0:
-            ends = low + gain * box.low[j], high + gain * box.high[j]
-        factors.append(
-            _factors(rows, ends, grid.edges[axis], noise[j] if j >= 0 else None, clipped)
-        )
+        ends = low + gain * least, high + gain * most
+        ids.append(number)
+        factors.append(_factors(rows, ends, grid.edges[axis], one, clipped))
     shape = tuple(grid.shape[axis] for axis in order)
     stages = _stages(factors, ids, shape)
     return TransitionBounds(tuple(factors), tuple(ids), stages, shape, order, box.lost)
@@ -169,7 +157,11 @@ def _distinct(columns: Sequence[Floats]) -> tuple[Floats, Integers]:
 
 
 def _factors(
-    rows: Floats, ends: tuple[Floats, Floats], edges: Floats, noise: Noise | None, clipped: bool
+    rows: Floats,
+    ends: tuple[Floats, Floats],
+    edges: Floats,
+    noise: Distribution | None,
+    clipped: bool,
 ) -> Factors:
     """Probabilities of intervals for images ``[U, 4]`` of low, high, gain and variation."""
     count = len(edges) - 1
@@ -186,7 +178,6 @@ def _factors(
         return np.where(at == 0, bottom, np.where(at == count, top, edges[at]))
 
     def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-        a, b = np.broadcast_arrays(a, b)
         many = max(_CHUNK // a.shape[1], 1)
         parts = [slice(i, i + many) for i in range(0, len(rows), many)]
         found = [_bounds(noise, (a[part], b[part]), rows[part]) for part in parts]
@@ -194,12 +185,12 @@ def _factors(
 
     lower, upper = bounds(side(index), side(index + 1))
     first, last = side(start)[:, None], side(start + width)[:, None]
-    ends_of_grid = np.full_like(first, bottom), np.full_like(first, top)
-    below, above = bounds(ends_of_grid[0], first)[1], bounds(last, ends_of_grid[1])[1]
+    bottoms, tops = np.full_like(first, bottom), np.full_like(first, top)
+    below, above = bounds(bottoms, first)[1], bounds(last, tops)[1]
     rest = np.where(first > bottom, below, 0) + np.where(last < top, above, 0)
     outside = np.zeros((len(rows), 2))
     if not clipped:
-        least, most = bounds(*ends_of_grid)
+        least, most = bounds(bottoms, tops)
         outside = np.concatenate([1 - most - _UNIT, most - least + 4 * _UNIT], -1)
         outside = np.where(np.concatenate([most, least], -1) == 1, 0, np.maximum(outside, 0))
     gap = np.where(upper > lower, upper - lower + _UNIT, 0)
@@ -207,10 +198,10 @@ def _factors(
 
 
 def _bounds(
-    noise: Noise | None, ends: tuple[Floats, Floats], rows: Floats
+    noise: Distribution | None, ends: tuple[Floats, Floats], rows: Floats
 ) -> tuple[Floats, Floats]:
     """Bounds of the probability of [a, b); without noise, 0 or 1 where the image decides it."""
-    a, b = np.broadcast_arrays(*ends)
+    a, b = ends
     low, high, gain, varying = (x[:, None] for x in rows.T)
     certain = ((low >= a) & (high < b)).astype(np.float64)
     possible = ((high >= a) & (low < b)).astype(np.float64)
@@ -290,17 +281,12 @@ def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -
         found[part] = _least(flat[index], factors, factor, outside)
 
     begins = range(0, len(stage.factor), chunk)
-    _parallel(compute, begins)
+    if len(begins) < 3:
+        list(map(compute, begins))
+    else:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(compute, begins))
     return found
-
-
-def _parallel(function: Callable[[int], None], items: Sequence[int]) -> None:
-    if len(items) < 3:
-        for item in items:
-            function(item)
-        return
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(function, items))
 
 
 def _least(value: Floats, factors: Factors, factor: Integers, outside: float) -> Floats:
