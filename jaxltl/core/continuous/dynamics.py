@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack, cast
 
 import chex
 import jax
@@ -131,17 +131,16 @@ class Dynamics:
     def sample_noise(self, key: chex.PRNGKey, disturbance: ArrayLike | None = None) -> jax.Array:
         """``float[k]``: a sample of the noise, with a given or a uniform disturbance; differentiable
         in the disturbance."""
-        keys = jax.random.split(key, len(self.noise) + 1)
-        drawn = [one.sample(each) for one, each in zip(self.noise, keys[1:], strict=True)]
+        first, *keys = jax.random.split(key, len(self.noise) + 1)
+        drawn = [one.sample(each) for one, each in zip(self.noise, keys, strict=True)]
         random = jnp.stack(drawn) if drawn else jnp.zeros(0)
         if self.disturbance is None:
             return random
         low, high = (jnp.asarray(x, random.dtype) for x in self.disturbance)
-        chosen = (
-            jax.random.uniform(keys[0], low.shape, random.dtype, low, high)
-            if disturbance is None
-            else jnp.clip(jnp.asarray(disturbance, random.dtype), low, high)
-        )
+        if disturbance is None:
+            chosen = jax.random.uniform(first, low.shape, random.dtype, low, high)
+        else:
+            chosen = jnp.clip(jnp.asarray(disturbance, random.dtype), low, high)
         return jnp.concatenate([random, chosen])
 
     def next_state(
@@ -287,16 +286,14 @@ def to_environment(dynamics: Dynamics) -> Environment:
     """
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     dtype = jnp.result_type(float)
-    choices: Bounds | Floats | None = None
-    actions: Finite | Box = Finite(1)
-    if isinstance(dynamics.actions, np.ndarray):
-        choices, actions = dynamics.actions.astype(dtype), Finite(len(dynamics.actions))
-    elif dynamics.actions is not None:
-        actions = make_box(*dynamics.actions, dtype=dtype)
+    choices, actions = dynamics.actions, cast(Finite | Box, Finite(1))
+    if isinstance(choices, np.ndarray):
+        choices, actions = choices.astype(dtype), Finite(len(choices))
+    elif choices is not None:
+        actions = make_box(*choices, dtype=dtype)
         choices = (actions.low, actions.high)
-    low, high = dynamics.domain
-    if dynamics.outside != "clip":
-        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
+    domain = dynamics.domain if dynamics.outside == "clip" else np.array([-np.inf, np.inf])
+    low, high = (np.broadcast_to(x, dynamics.num_states) for x in domain)
     return make_environment(
         dynamics.sample_initial,
         Partial(_environment_step, Partial(dynamics.next_state), Partial(dynamics.inside), choices),
@@ -346,8 +343,9 @@ def _bounds(name: str, given: tuple[ArrayLike, ArrayLike]) -> Bounds:
             f"{name}: low and high have shapes {list(low.shape)} and {list(high.shape)}; give two "
             "vectors of one length."
         )
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-        place = int(np.argmax(~(np.isfinite(low) & np.isfinite(high) & (low < high))))
+    valid = np.isfinite(low) & np.isfinite(high) & (low < high)
+    if not valid.all():
+        place = int(np.argmin(valid))
         raise ValueError(
             f"{name}: low={low[place]:g} and high={high[place]:g} in coordinate {place}; give finite "
             "bounds with low < high."
@@ -395,11 +393,11 @@ def _check_step(made: Dynamics) -> None:
         given = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, m, k)]
         try:
             found = traced("step", made.step, *given)
-        except ValueError as error:
-            raise ValueError(_line(f"{error} Its arguments are {shapes}.")) from error
         except Exception as error:
-            message = f"step fails with {shapes}: {error}"
-            raise ValueError(_line(f"{message}; accept arrays of these shapes.")) from error
+            message = f"step fails with {shapes}: {error}; accept arrays of these shapes."
+            if isinstance(error, ValueError):
+                message = f"{error} Its arguments are {shapes}."
+            raise ValueError(" ".join(message.split())) from error
         if getattr(found, "shape", None) != (n,) or not jnp.issubdtype(found.dtype, jnp.floating):
             array = hasattr(found, "dtype")
             kind = f"{found.dtype}{list(found.shape)}" if array else type(found).__name__
@@ -416,24 +414,18 @@ def _check_functions(region: Region, num_states: int) -> None:
             raise ValueError(f"its function returns shape {shape}; return a number.")
 
 
-def _line(text: str) -> str:
-    """A message in one line."""
-    return " ".join(text.split())
-
-
 def _check_finite(made: Dynamics, num_samples: int = 64) -> None:
     """Raises ValueError if a successor of a random state of the domain is not a number."""
     low, high = made.domain
     draw = np.random.default_rng(0)
     state = draw.uniform(low, high, (num_samples, len(low)))
-    action = np.zeros((num_samples, 0))
-    if isinstance(made.actions, tuple):
-        action = draw.uniform(*made.actions, (num_samples, made.num_actions))
-    elif made.actions is not None:
-        action = made.actions[draw.integers(len(made.actions), size=num_samples)]
+    actions = ((), ()) if made.actions is None else made.actions
+    if isinstance(actions, tuple):
+        action = draw.uniform(*actions, (num_samples, made.num_actions))
+    else:
+        action = actions[draw.integers(len(actions), size=num_samples)]
     keys = jax.random.split(jax.random.key(0), num_samples)
-    dtype = jnp.result_type(float)
-    given = jnp.asarray(state, dtype), jnp.asarray(action, dtype)
+    given = (jnp.asarray(x, jnp.result_type(float)) for x in (state, action))
     found = np.asarray(jax.vmap(made.next_state)(keys, *given))
     if np.isnan(found).any():
         i = int(np.argmax(np.isnan(found).any(axis=1)))

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from jaxltl.core import validation
 from jaxltl.core.enclosures.enclose import enclose
@@ -64,8 +64,7 @@ class Distribution:
         """``float64[...]``: F(x), with an absolute error of at most `CDF_ERROR` (not for ``"cdf"``)."""
         x = np.asarray(x, np.float64)
         if self.function is not None:
-            low, high = self._user_bounds(x)
-            return np.asarray(0.5 * (low + high))
+            return np.asarray(np.mean(self._user_bounds(x), axis=0))
         return self._distribution(x)
 
     def sample(self, key: chex.PRNGKey, shape: Sequence[int] = ()) -> jax.Array:
@@ -129,13 +128,12 @@ class Distribution:
             lower = between(low, high, -1)
         else:
             lower = np.minimum(between(low, low, -1), between(high, high, -1))
+        best = high, low
         if self.symmetric:
             with np.errstate(invalid="ignore"):  # -inf + inf: every shift has probability 1
                 middle = 0.5 * a + 0.5 * b - spread
-            best = np.clip(np.where(np.isnan(middle), low, middle), low, high)
-            upper = between(best, best, 1)
-        else:
-            upper = between(high, low, 1)
+            best = (np.clip(np.where(np.isnan(middle), low, middle), low, high),) * 2
+        upper = between(*best, 1)
         return np.clip(lower, 0, 1), np.clip(upper, 0, 1)
 
     # --- distribution functions -------------------------------------------------------------------
@@ -149,8 +147,6 @@ class Distribution:
 
     def _distribution(self, x: Floats) -> Floats:
         """F(x); of small relative error at or below the mean, except for truncated Gaussians."""
-        from scipy.special import ndtr
-
         low, high = self.support
         if self.kind == "gaussian":
             return np.asarray(ndtr((x - self.mean) / self.scale))
@@ -162,10 +158,10 @@ class Distribution:
             return np.where(share <= 0.5, 2 * share * share, 1 - 2 * rest * rest)
         flip = -1.0 if low + high > 2 * self.mean else 1.0  # towards the accurate lower tail
         ends, z = (flip * (np.asarray(y) - self.mean) / self.scale for y in ((low, high), x))
-        first, last = ndtr(ends) if flip > 0 else ndtr(ends[::-1])
+        first, last = np.sort(ndtr(ends))
         part = np.clip((ndtr(z) - first) / (last - first), 0, 1)
-        part = np.where(x <= low, 0.0, np.where(x >= high, 1.0, part if flip > 0 else 1 - part))
-        return np.asarray(part)
+        part = part if flip > 0 else 1 - part
+        return np.where(x <= low, 0.0, np.where(x >= high, 1.0, part))
 
     def _mass(self, start: Floats, end: Floats, outward: int) -> Floats:
         """Lower (-1) or upper (1) bound of F(end) - F(start), also if start > end."""
@@ -207,21 +203,16 @@ class Distribution:
 
     def _user_bounds(self, x: Floats) -> tuple[Floats, Floats]:
         """Enclosure of the user's distribution function, evaluated by interval arithmetic."""
+        assert self.function is not None
         low, high = self.support
         inside = (x > low) & (x < high)
-        if np.isfinite(low):
-            start = low
-        else:
-            start = high - 1.0 if np.isfinite(high) else 0.0
-        safe = np.where(inside, x, np.nextafter(start, np.inf)).reshape(-1)
-        assert self.function is not None
+        some = low if np.isfinite(low) else high - 1.0 if np.isfinite(high) else 0.0
+        safe = np.where(inside, x, np.nextafter(some, np.inf)).reshape(-1)
         with jax.enable_x64(True):  # constants of the function in double precision
-            below, above = enclose(self.function, "interval")(safe, safe)
-        sides = []
-        for side in (below, above):
-            found = np.clip(np.asarray(side, np.float64).reshape(x.shape), 0, 1)
-            sides.append(np.where(inside, found, np.where(x >= high, 1.0, 0.0)))
-        return sides[0], sides[1]
+            sides = enclose(self.function, "interval")(safe, safe)
+        lower, upper = (np.clip(np.asarray(y, np.float64).reshape(x.shape), 0, 1) for y in sides)
+        outside = np.where(x >= high, 1.0, 0.0)
+        return np.where(inside, lower, outside), np.where(inside, upper, outside)
 
     def _inverse(self, level: jax.Array) -> jax.Array:
         """Quantiles by bisection, in a bounded coordinate t of the support."""
@@ -261,8 +252,7 @@ def uniform(low: float, high: float) -> Distribution:
       >>> uniform(0.0, 2.0).cdf(0.5).item()
       0.25
     """
-    low, high = _ordered(low, high)
-    return Distribution("uniform", (low, high), 0.5 * low + 0.5 * high, 0.5 * (high - low), True)
+    return _on_interval("uniform", low, high)
 
 
 def triangular(low: float = -1.0, high: float = 1.0) -> Distribution:
@@ -278,8 +268,7 @@ def triangular(low: float = -1.0, high: float = 1.0) -> Distribution:
       >>> triangular().cdf(-0.5).item()
       0.125
     """
-    low, high = _ordered(low, high)
-    return Distribution("triangular", (low, high), 0.5 * low + 0.5 * high, 0.5 * (high - low), True)
+    return _on_interval("triangular", low, high)
 
 
 def gaussian(scale: float, mean: float = 0.0) -> Distribution:
@@ -316,8 +305,6 @@ def truncated_gaussian(scale: float, low: float, high: float, mean: float = 0.0)
       >>> truncated_gaussian(1.0, -2.0, 2.0).cdf(0.0).item()
       0.5
     """
-    from scipy.special import ndtr
-
     low, high = _ordered(low, high)
     scale, mean = _positive("scale", scale), validation.finite_number("mean", mean)
     first, last = (np.array([low, high]) - mean) / scale
@@ -372,6 +359,11 @@ def from_cdf(cdf: Function, low: float, high: float) -> Distribution:
             "with a cdf of 0 at low and 1 at high."
         )
     return made
+
+
+def _on_interval(kind: str, low: float, high: float) -> Distribution:
+    low, high = _ordered(low, high)
+    return Distribution(kind, (low, high), 0.5 * low + 0.5 * high, 0.5 * (high - low), True)
 
 
 def _positive(name: str, value: float) -> float:

@@ -130,11 +130,10 @@ class Region:
         return np.unique(edges[np.isfinite(edges)])
 
 
-def _region(**parts: Any) -> Region:
-    n = max((x.shape[-1] for name, x in parts.items() if name in ("low", "normal")), default=0)
-    empty = {"low": np.zeros((0, n)), "high": np.zeros((0, n))}
-    empty |= {"normal": np.zeros((0, n)), "offset": np.zeros(0)}
-    return Region(**(empty | parts))
+def _region(n: int, **parts: Any) -> Region:
+    """A region of `n` coordinates of some parts; others are empty."""
+    empty: dict[str, Any] = {name: np.zeros((0, n)) for name in ("low", "high", "normal")}
+    return Region(**(empty | {"offset": np.zeros(0)} | parts))
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Region:
@@ -164,7 +163,7 @@ def box(low: ArrayLike, high: ArrayLike) -> Region:
             f"box: low={first[tuple(place)]:g} and high={last[tuple(place)]:g} at {place.tolist()}; "
             "low must be below high."
         )
-    return _region(low=first, high=last)
+    return _region(first.shape[1], low=first, high=last)
 
 
 def half_space(normal: ArrayLike, offset: float) -> Region:
@@ -194,7 +193,7 @@ def half_space(normal: ArrayLike, offset: float) -> Region:
         low, high = np.full((2, len(normal)), [[-np.inf], [np.inf]])
         (high if normal[axes[0]] > 0 else low)[axes[0]] = offset / normal[axes[0]]
         return box(low, high)
-    return _region(normal=normal[None], offset=np.array([offset]))
+    return _region(len(normal), normal=normal[None], offset=np.array([offset]))
 
 
 def where_positive(function: Function) -> Region:
@@ -216,7 +215,7 @@ def where_positive(function: Function) -> Region:
       >>> certain.tolist(), possible.tolist()
       ([True, False], [True, False])
     """
-    return _region(functions=(validation.function("where_positive", function),))
+    return _region(0, functions=(validation.function("where_positive", function),))
 
 
 def union(*regions: Region) -> Region:
@@ -241,20 +240,15 @@ def union(*regions: Region) -> Region:
     if len(sizes) > 1 or not regions:
         found = f"of {sizes} coordinates" if regions else "missing"
         raise ValueError(f"union: the regions are {found}; give regions of one space.")
-    n = sizes[0] if sizes else 0
-
-    def joined(name: str) -> Floats:
-        return np.concatenate([getattr(r, name).reshape(-1, n) for r in regions if r.num_states])
-
-    if not sizes:
-        return _region(functions=sum((r.functions for r in regions), ()))
-    return Region(
-        joined("low"),
-        joined("high"),
-        joined("normal"),
-        np.concatenate([r.offset for r in regions]),
-        sum((r.functions for r in regions), ()),
+    shape = (-1, sizes[0]) if sizes else (0, 0)
+    parts = (
+        np.concatenate(
+            [getattr(r, name).reshape(shape) for r in regions if r.num_states or not sizes]
+        )
+        for name in ("low", "high", "normal")
     )
+    offset = np.concatenate([r.offset for r in regions])
+    return Region(*parts, offset, sum((r.functions for r in regions), ()))
 
 
 def as_region(name: str, given: Region | Sequence[ArrayLike], num_states: int) -> Region:
@@ -277,10 +271,8 @@ def as_region(name: str, given: Region | Sequence[ArrayLike], num_states: int) -
 
 def extended(region: Region, low: Floats, high: Floats) -> Region:
     """A region with box edges at or beyond the edges of a domain moved to infinity."""
-    return replace(
-        region,
-        low=np.where(region.low <= low, -np.inf, region.low) if len(region.low) else region.low,
-        high=np.where(region.high >= high, np.inf, region.high)
-        if len(region.high)
-        else region.high,
-    )
+    if not len(region.low):
+        return region
+    first = np.where(region.low <= low, -np.inf, region.low)
+    last = np.where(region.high >= high, np.inf, region.high)
+    return replace(region, low=first, high=last)

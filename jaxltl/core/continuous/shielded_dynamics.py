@@ -11,12 +11,7 @@ from jax.tree_util import Partial
 from jaxltl.core import validation
 from jaxltl.core.continuous.dynamics import to_environment
 from jaxltl.core.continuous.synthesis import CellPolicy
-from jaxltl.core.environments.environment import (
-    Environment,
-    Finite,
-    Timestep,
-    make_environment,
-)
+from jaxltl.core.environments.environment import Environment, Finite, Timestep, make_environment
 from jaxltl.core.games.shielded_environment import ShieldedWorld
 
 
@@ -52,15 +47,13 @@ def shield_dynamics(policy: CellPolicy) -> Environment:
       [True, False]
     """
     validation.instance("policy", policy, CellPolicy, "that of synthesize_policy")
-    inner = to_environment(policy.dynamics)
+    inner, own = to_environment(policy.dynamics), policy.dynamics.actions
     finite = isinstance(inner.actions, Finite)
-    if finite:
-        own = policy.dynamics.actions
-        if own is not None and not np.array_equal(np.asarray(own), policy.actions):
-            raise ValueError(
-                f"the policy chooses among {len(policy.actions)} actions that are not the grid of the "
-                "dynamics; leave out actions= of synthesize_policy."
-            )
+    if finite and own is not None and not np.array_equal(np.asarray(own), policy.actions):
+        raise ValueError(
+            f"the policy chooses among {len(policy.actions)} actions that are not the grid of the "
+            "dynamics; leave out actions= of synthesize_policy."
+        )
 
     def allowed(shielded: ShieldedWorld) -> jax.Array:
         """The permissive strategy's actions ``bool[A]``, or the policy's one if there are none."""
@@ -69,14 +62,10 @@ def shield_dynamics(policy: CellPolicy) -> Environment:
         only = jnp.arange(len(policy.actions)) == jnp.asarray(policy.action)[memory, cell]
         return jnp.where(mask.any(), mask, only)
 
+    nearest = None if finite else Partial(policy.nearest_allowed)
     return make_environment(
         Partial(_reset, inner.reset, Partial(policy.start)),
-        Partial(
-            _step,
-            inner.step,
-            Partial(policy.update),
-            None if finite else Partial(policy.nearest_allowed),
-        ),
+        Partial(_step, inner.step, Partial(policy.update), nearest),
         Partial(_of_world, inner.observe),
         actions=inner.actions,
         labels=Partial(_of_world, inner.labels),

@@ -155,14 +155,11 @@ def _memory(
     while len(moves) < len(number):
         q = list(number)[len(moves)][0]
         moves.append([{visit(q, x) for x in letters} for letters in of_class])
-    found = np.zeros((len(number), len(of_class), len(number)), bool)
-    first = np.zeros((len(of_class), len(number)), bool)
-    for d, targets in enumerate(start):
-        first[d, list(targets)] = True
-    for q, row in enumerate(moves):
-        for d, targets in enumerate(row):
-            found[q, d, list(targets)] = True
-    return list(number), found, first
+    rows = np.zeros((1 + len(number), len(of_class), len(number)), bool)
+    for row, targets in zip(rows, [start, *moves], strict=True):
+        for marks, entered in zip(row, targets, strict=True):
+            marks[list(entered)] = True
+    return list(number), rows[1:], rows[0]
 
 
 def _decided(automaton: Automaton, q: int) -> int:
