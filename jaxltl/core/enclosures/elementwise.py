@@ -16,6 +16,7 @@ from jaxltl.core.enclosures.interval import ULPS, Interval, eps, module_of, mono
 from jaxltl.core.enclosures.program import Elementwise, narrows
 
 Function = Callable[[Array], Array]
+Rule = Callable[[Elementwise, list[Interval]], Interval]
 
 
 def _logistic(x: Array) -> Array:
@@ -113,19 +114,14 @@ def _power(operation: Elementwise, inputs: list[Interval]) -> Interval:
     return outward(xp.minimum(*sides), xp.maximum(*sides), ULPS["pow"])
 
 
-def _boolean(operation: Elementwise, inputs: list[Interval]) -> Interval:
-    x = inputs[0]
-    if operation.name == "not":
-        return Interval(~x.high, ~x.low)
-    y = inputs[1]
-    both = operation.name == "and"
-    return Interval(*((a & b) if both else (a | b) for a, b in ((x.low, y.low), (x.high, y.high))))
+def _by_sides(name: str) -> Rule:
+    """A function that is increasing in all arguments, without rounding."""
 
+    def rule(_: Elementwise, inputs: list[Interval]) -> Interval:
+        function = getattr(module_of(inputs[0].low), name)
+        return Interval(function(*(x.low for x in inputs)), function(*(x.high for x in inputs)))
 
-def _extreme(operation: Elementwise, inputs: list[Interval]) -> Interval:
-    x, y = inputs
-    choose = getattr(module_of(x.low), "maximum" if operation.name == "max" else "minimum")
-    return Interval(choose(x.low, y.low), choose(x.high, y.high))
+    return rule
 
 
 def _multiply(operation: Elementwise, inputs: list[Interval]) -> Interval:
@@ -134,11 +130,11 @@ def _multiply(operation: Elementwise, inputs: list[Interval]) -> Interval:
     return arithmetic.multiply(*inputs)
 
 
-def _decreasing(function: Function) -> Callable[[Elementwise, list[Interval]], Interval]:
+def _decreasing(function: Function) -> Rule:
     return lambda o, x: outward(function(x[0].high), function(x[0].low), ULPS[o.name])
 
 
-_RULES: dict[str, Callable[[Elementwise, list[Interval]], Interval]] = {
+_RULES: dict[str, Rule] = {
     "add": lambda _, x: arithmetic.add(*x),
     "sub": lambda _, x: arithmetic.subtract(*x),
     "mul": _multiply,
@@ -148,13 +144,13 @@ _RULES: dict[str, Callable[[Elementwise, list[Interval]], Interval]] = {
     "square": lambda _, x: arithmetic.power(x[0], 2),
     "integer_pow": lambda o, x: arithmetic.power(x[0], o.params["y"]),
     "pow": _power,
-    "max": _extreme,
-    "min": _extreme,
+    "max": _by_sides("maximum"),
+    "min": _by_sides("minimum"),
     "select_n": _select,
     "convert_element_type": _convert,
-    "and": _boolean,
-    "or": _boolean,
-    "not": _boolean,
+    "and": _by_sides("bitwise_and"),
+    "or": _by_sides("bitwise_or"),
+    "not": lambda _, x: Interval(~x[0].high, ~x[0].low),
     "sin": lambda _, x: arithmetic.sine(x[0]),
     "cos": lambda _, x: arithmetic.sine(x[0], np.pi / 2),
     "tan": lambda _, x: arithmetic.tangent(x[0]),
@@ -192,14 +188,11 @@ def relax(
     name = operation.name
     if name in ("max", "min"):
         return _relax_extreme(name, inputs[0], inputs[1], parallel)
-    if name in ("mul", "square") and (
-        name == "square" or operation.inputs[0] == operation.inputs[1]
-    ):
-        found = _smooth(operation, inputs[0], output, lambda x: Interval(2 * x.low, 2 * x.high))
-        zeros = (found.lower_slope[0] * 0,) * (len(inputs) - 1)
-        return Relaxation(
-            found.lower_slope + zeros, found.lower, found.upper_slope + zeros, found.upper
-        )
+    if name == "mul" and operation.inputs[0] == operation.inputs[1]:
+        found = _smooth(operation, inputs[0], output, _DERIVATIVES["square"])
+        zero = found.lower_slope[0] * 0
+        slopes = (*found.lower_slope, zero)
+        return Relaxation(slopes, found.lower, slopes, found.upper)
     if name == "mul":
         return _relax_product(*inputs)
     if name == "div":
@@ -245,7 +238,9 @@ def _smooth(
     usable = positive & xp.isfinite(first) & xp.isfinite(last) & xp.isfinite(secant)
     slope = xp.where(usable, xp.clip(secant, first, last), 0)
     spread = xp.where(usable & (last > first), last - first, 1)
-    gap = xp.where(usable, times_three(slope - first, last - slope, width) / spread, 0)
+    gap = xp.where(
+        usable, arithmetic.times(arithmetic.times(slope - first, last - slope), width) / spread, 0
+    )
     gap = gap * (1 + 16 * eps(gap)) + arithmetic.tiny(gap)
     ends = [
         arithmetic.subtract(value, arithmetic.multiply(point(side), point(slope)))
@@ -256,11 +251,6 @@ def _smooth(
     )
     found = arithmetic.where(usable, padded, output)
     return Relaxation((slope,), found.low, (slope,), found.high)
-
-
-def times_three(a: Array, b: Array, c: Array) -> Array:
-    """Product of three numbers, 0 if one of them is."""
-    return arithmetic.times(arithmetic.times(a, b), c)
 
 
 def _at(operation: Elementwise, points: list[Array]) -> Interval:
@@ -391,6 +381,7 @@ def _derivative_sqrt(x: Interval) -> Interval:
 
 
 _DERIVATIVES: dict[str, Callable[[Interval], Interval]] = {
+    "square": lambda x: Interval(2 * x.low, 2 * x.high),
     "tanh": _derivative_tanh,
     "logistic": _derivative_logistic,
     "erf": _derivative_erf,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import jax.numpy as jnp
@@ -130,15 +131,14 @@ def subtract(x: Interval, y: Interval) -> Interval:
 
 def multiply(x: Interval, y: Interval) -> Interval:
     """Product of independent arrays; `0 * inf` is 0, since bounds are limits of numbers."""
-    xp = module_of(x.low)
-    if y.low is y.high:
-        products = [times(x.low, y.low), times(x.high, y.low)]
-    else:
-        products = [times(a, b) for a in (x.low, x.high) for b in (y.low, y.high)]
-    low, high = products[0], products[0]
-    for other in products[1:]:
-        low, high = xp.minimum(low, other), xp.maximum(high, other)
-    return outward(low, high)
+    ends = [y.low] if y.low is y.high else [y.low, y.high]
+    return outward(*_hull([times(a, b) for a in (x.low, x.high) for b in ends]))
+
+
+def _hull(values: list[Array]) -> tuple[Array, Array]:
+    """The least and the largest value, elementwise."""
+    xp = module_of(values[0])
+    return reduce(xp.minimum, values), reduce(xp.maximum, values)
 
 
 def times(a: Array, b: Array) -> Array:
@@ -194,9 +194,7 @@ def sine(x: Interval, phase: float = 0.0) -> Interval:
     function = xp.cos if phase else xp.sin
     at_low, at_high = function(x.low), function(x.high)
     bounds = outward(xp.minimum(at_low, at_high), xp.maximum(at_low, at_high), ULPS["sin"])
-    far = ~(x.magnitude <= LARGEST_ANGLE)
-    # The error of a reduced argument is absolute: near zeros of the function it is not relative.
-    reduction = 8 * eps(x.low) * (1 + xp.minimum(x.magnitude, LARGEST_ANGLE))
+    far, reduction = _angle_reduction(x)
     top = _contains_multiple(x, phase - math.pi / 2, 2 * math.pi) | far
     bottom = _contains_multiple(x, phase + math.pi / 2, 2 * math.pi) | far
     return Interval(
@@ -207,27 +205,30 @@ def sine(x: Interval, phase: float = 0.0) -> Interval:
 
 def tangent(x: Interval) -> Interval:
     """Tangent: increasing between two poles; unbounded where a pole may lie inside."""
-    xp = module_of(x.low)
-    pole = _contains_multiple(x, -math.pi / 2, math.pi) | ~(x.magnitude <= LARGEST_ANGLE)
+    xp, (far, error) = module_of(x.low), _angle_reduction(x)
+    pole = _contains_multiple(x, -math.pi / 2, math.pi) | far
     bounds = monotone(xp.tan, x, ULPS["tan"])
     low, high = (xp.where(pole, 0.0, side) for side in (bounds.low, bounds.high))
-    # The argument's reduction has an absolute error, which the derivative 1 + tan^2 multiplies.
-    error = 8 * eps(x.low) * (1 + xp.minimum(x.magnitude, LARGEST_ANGLE))
+    # The derivative 1 + tan^2 multiplies the error.
     return Interval(
         xp.where(pole, -xp.inf, low - error * (1 + low * low)),
         xp.where(pole, xp.inf, high + error * (1 + high * high)),
     )
 
 
+def _angle_reduction(x: Interval) -> tuple[Array, Array]:
+    """Arguments too large to be reduced, and the error of a reduced one, which is absolute."""
+    size = module_of(x.low).minimum(x.magnitude, LARGEST_ANGLE)
+    return ~(x.magnitude <= LARGEST_ANGLE), 8 * eps(x.low) * (1 + size)
+
+
 def angle(y: Interval, x: Interval) -> Interval:
     """`atan2(y, x)` over a box: extrema at corners, or all angles where the negative axis is met."""
     xp = module_of(x.low)
     corners = [xp.arctan2(b, a) for a in (x.low, x.high) for b in (y.low, y.high)]
-    low = xp.minimum(xp.minimum(*corners[:2]), xp.minimum(*corners[2:]))
-    high = xp.maximum(xp.maximum(*corners[:2]), xp.maximum(*corners[2:]))
-    bounds = outward(low, high, ULPS["atan2"])
+    bounds = outward(*_hull(corners), ULPS["atan2"])
     cut = (x.low <= 0) & (y.low <= 0) & (y.high >= 0)
-    pi = math.pi * (1 + 4 * eps(low))
+    pi = math.pi * (1 + 4 * eps(x.low))
     return Interval(xp.where(cut, -pi, bounds.low), xp.where(cut, pi, bounds.high))
 
 

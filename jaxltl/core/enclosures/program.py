@@ -231,26 +231,31 @@ class _Builder:
 
     def _select(self, name: str, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """Selection of entries: the primitive's own result on the entries' numbers."""
-        data = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2}.get(name, len(inputs))
-        if any(x not in self.known for x in inputs[data:]):
+        count = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2}.get(name, len(inputs))
+        data, indices = inputs[:count], inputs[count:]
+        if any(x not in self.known for x in indices):
             raise ValueError(
                 f"{self._place(equation)}: an index depends on the argument; index by constants, or use "
                 "jnp.where."
             )
-        sizes = [math.prod(self.shapes[x].shape) for x in inputs[:data]]
-        starts = np.cumsum([0, *sizes[:-1]])
-        numbers = [
-            np.arange(start, start + size, dtype=np.int32).reshape(self.shapes[x].shape)
-            for x, start, size in zip(inputs, starts, sizes, strict=False)
-        ]
-        indices = [self.known[x].reshape(self.shapes[x].shape) for x in inputs[data:]]
-        outputs = []
-        for i, index in enumerate(_selection(name, equation, numbers, indices)):
-            output = self.new(_spec(equation.outvars[i]))
-            selected = Select(tuple(inputs[:data]), output, np.asarray(index).reshape(-1))
-            self.operations.append(selected)
-            outputs.append(output)
-        return outputs
+        numbers, start = [], 0
+        for x in data:
+            numbers.append(self._numbers(x) + start)
+            start += numbers[-1].size
+        known = [self.known[x].reshape(self.shapes[x].shape) for x in indices]
+        found = zip(_selection(name, equation, numbers, known), equation.outvars, strict=True)
+        return [self._selected(data, index, _spec(variable)) for index, variable in found]
+
+    def _numbers(self, x: int) -> np.ndarray:
+        """The numbers of the entries of a variable, in its shape."""
+        shape = self.shapes[x].shape
+        return np.arange(math.prod(shape), dtype=np.int32).reshape(shape)
+
+    def _selected(self, inputs: Sequence[int], index: Array, output: jax.ShapeDtypeStruct) -> int:
+        """A new variable of some entries of the inputs."""
+        found = self.new(output)
+        self.operations.append(Select(tuple(inputs), found, np.asarray(index).reshape(-1)))
+        return found
 
     def _elementwise(
         self, name: str, equation: core.JaxprEqn, inputs: list[int], output: jax.ShapeDtypeStruct
@@ -270,22 +275,19 @@ class _Builder:
         if x in self.known:
             known = self.known[x].reshape(spec.shape)
             return self.constant(module_of(known).broadcast_to(known, shape))
-        numbers = np.arange(math.prod(spec.shape), dtype=np.int32).reshape(spec.shape)
-        index = self.new(jax.ShapeDtypeStruct(shape, spec.dtype))
-        self.operations.append(Select((x,), index, np.broadcast_to(numbers, shape).reshape(-1)))
-        return index
+        index = np.broadcast_to(self._numbers(x), shape)
+        return self._selected([x], index, jax.ShapeDtypeStruct(shape, spec.dtype))
 
     def _reduce(self, name: str, equation: core.JaxprEqn, x: int) -> int:
         """A reduction as a chain of elementwise operations."""
-        axes, shape = equation.params["axes"], self.shapes[x].shape
-        output = _spec(equation.outvars[0])
-        numbers = np.arange(math.prod(shape), dtype=np.int32).reshape(shape)
-        parts = np.moveaxis(numbers, axes, range(len(axes))).reshape(-1, math.prod(output.shape))
-        found = -1
-        for part in parts:
-            here = self.new(jax.ShapeDtypeStruct(output.shape, self.shapes[x].dtype))
-            self.operations.append(Select((x,), here, part))
-            found = here if found < 0 else self._elementwise(name, equation, [found, here], output)
+        axes, output = equation.params["axes"], _spec(equation.outvars[0])
+        here = jax.ShapeDtypeStruct(output.shape, self.shapes[x].dtype)
+        parts = np.moveaxis(self._numbers(x), axes, range(len(axes)))
+        first, *others = parts.reshape(-1, math.prod(output.shape))
+        found = self._selected([x], first, here)
+        for part in others:
+            inputs = [found, self._selected([x], part, here)]
+            found = self._elementwise(name, equation, inputs, output)
         return found
 
     def _linear(self, equation: core.JaxprEqn, inputs: list[int], index: int) -> int:
@@ -309,29 +311,21 @@ class _Builder:
         for index in (0, 1):
             if inputs[1 - index] in self.known:
                 return self._linear(equation, inputs, index)
-        left, right, _, summed = _letters(equation)
+        left, right, out, summed = _letters(equation)
         sizes = dict(zip(left + right, _shape(equation, 0) + _shape(equation, 1), strict=True))
-        order = "".join(dict.fromkeys(_letters(equation)[2] + summed))
-        full = jax.ShapeDtypeStruct(
-            tuple(sizes[c] for c in order), _spec(equation.outvars[0]).dtype
-        )
+        output, order = _spec(equation.outvars[0]), out + summed
+        full = jax.ShapeDtypeStruct(tuple(sizes[c] for c in order), output.dtype)
         factors = []
         for x, letters in zip(inputs, (left, right), strict=True):
-            numbers = np.arange(math.prod(self.shapes[x].shape), dtype=np.int32)
-            numbers = numbers.reshape(self.shapes[x].shape)
-            ones = [np.ones(n, np.int32) for c, n in sizes.items() if c not in letters]
-            others = "".join(c for c in sizes if c not in letters)
-            index = np.einsum(
-                f"{letters}{''.join(',' + c for c in others)}->{order}", numbers, *ones
-            )
-            factor = self.new(full)
-            self.operations.append(Select((x,), factor, index.reshape(-1)))
-            factors.append(factor)
+            # Axes in the order of the full product, of length 1 where the factor has none.
+            present = "".join(c for c in order if c in letters)
+            index = np.einsum(f"{letters}->{present}", self._numbers(x))
+            index = index.reshape([sizes[c] if c in letters else 1 for c in order])
+            factors.append(self._selected([x], np.broadcast_to(index, full.shape), full))
         products = self._elementwise("mul", equation, factors, full)
-        rows = math.prod(_spec(equation.outvars[0]).shape)
-        terms = math.prod(full.shape) // rows
-        found = self.new(_spec(equation.outvars[0]))
-        matrix = np.repeat(np.eye(rows, dtype=full.dtype), terms, axis=1)
+        rows = math.prod(output.shape)
+        matrix = np.repeat(np.eye(rows, dtype=full.dtype), math.prod(full.shape) // rows, axis=1)
+        found = self.new(output)
         self.operations.append(MatrixProduct(products, found, matrix))
         return found
 
@@ -415,22 +409,20 @@ def _matrix(equation: core.JaxprEqn, known: list[Array | None], index: int) -> A
     """Matrix of a primitive that is linear in one input: its values at unit vectors."""
     shape, output = _shape(equation, index), _spec(equation.outvars[0])
     units = np.eye(math.prod(shape), dtype=output.dtype).reshape(-1, *shape)
+    columns: Array
     if str(equation.primitive) == "reduce_sum":
-        columns: Array = units.sum(tuple(a + 1 for a in equation.params["axes"]))
+        columns = units.sum(tuple(a + 1 for a in equation.params["axes"]))
     elif str(equation.primitive) == "cumsum":
-        axis = equation.params["axis"] + 1
-        reverse = equation.params["reverse"]
-        columns = np.flip(np.cumsum(np.flip(units, axis), axis), axis) if reverse else np.cumsum(
-            units, axis)  # fmt: skip
+        axis, step = equation.params["axis"] + 1, -1 if equation.params["reverse"] else 1
+        ordered = np.moveaxis(units, axis, 0)[::step]
+        columns = np.moveaxis(np.cumsum(ordered, 0)[::step], 0, axis)
     else:
-        left, right, out, _ = _letters(equation)
+        *letters, out, _ = _letters(equation)
         other = known[1 - index]
         assert other is not None
         other = other.reshape(_shape(equation, 1 - index)).astype(output.dtype)
-        letters = (left, right)[index]
-        columns = module_of(other).einsum(
-            f"Z{letters},{(left, right)[1 - index]}->Z{out}", units, other
-        )
+        subscripts = f"Z{letters[index]},{letters[1 - index]}->Z{out}"
+        columns = module_of(other).einsum(subscripts, units, other)
     return columns.reshape(len(units), -1).T
 
 
@@ -455,9 +447,7 @@ def _letters(equation: core.JaxprEqn) -> tuple[str, str, str, str]:
         right[b] = left[a]
     batch = [left[a] for a in left_batch]
     summed = [left[a] for a in left_sum]
-    free = [c for c in left if c not in batch + summed] + [
-        c for c in right if c not in batch + summed
-    ]
+    free = [c for c in left + right if c not in batch + summed]
     return "".join(left), "".join(right), "".join(batch + free), "".join(summed)
 
 
