@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -187,12 +187,11 @@ def prove(
     dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
 ) -> tuple[Certificate, Abstraction, Bounds]:
     """The certificate of a step under the best actions of a grid, and what it was made of."""
-    given = dict(options)
-    limits = replace(Limits(), **{k: x for k, x in given.items() if k != "cells"})
-    for name in ("tolerance", "threshold"):
-        if getattr(limits, name) is not None:
-            number = validation.finite_number(name, getattr(limits, name))
-            limits = replace(limits, **{name: number})
+    given: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
+    given["tolerance"] = validation.finite_number("tolerance", given.get("tolerance", 1e-3))
+    if given.get("threshold") is not None:
+        given["threshold"] = validation.finite_number("threshold", given["threshold"])
+    limits = Limits(**given)
     grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
     abstraction = Abstraction(dynamics, formula, step, actions, limits)

@@ -419,7 +419,7 @@ def _check_finite(made: Dynamics, num_samples: int = 64) -> None:
     low, high = made.domain
     draw = np.random.default_rng(0)
     state = draw.uniform(low, high, (num_samples, len(low)))
-    actions = ((), ()) if made.actions is None else made.actions
+    actions = (np.zeros(0), np.zeros(0)) if made.actions is None else made.actions
     if isinstance(actions, tuple):
         action = draw.uniform(*actions, (num_samples, made.num_actions))
     else:

@@ -209,7 +209,9 @@ def _forms(
         for x in zip(*parts, strict=True)
     )
     state, gains = slope[:, :, :n], slope[:, :, width - k :]
-    return _Forms(*arrays, state, gains, (first + last) / 2, (last - first) / 2)
+    low, high, middle, error, least, most = arrays
+    centre, radius = (first + last) / 2, (last - first) / 2
+    return _Forms(low, high, middle, error, least, most, state, gains, centre, radius)
 
 
 def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int, ...]]:

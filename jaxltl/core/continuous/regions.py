@@ -241,14 +241,14 @@ def union(*regions: Region) -> Region:
         found = f"of {sizes} coordinates" if regions else "missing"
         raise ValueError(f"union: the regions are {found}; give regions of one space.")
     shape = (-1, sizes[0]) if sizes else (0, 0)
-    parts = (
-        np.concatenate(
-            [getattr(r, name).reshape(shape) for r in regions if r.num_states or not sizes]
-        )
-        for name in ("low", "high", "normal")
-    )
+
+    def joined(name: str) -> Floats:
+        given = [getattr(r, name) for r in regions if r.num_states or not sizes]
+        return np.concatenate([x.reshape(shape) for x in given])
+
     offset = np.concatenate([r.offset for r in regions])
-    return Region(*parts, offset, sum((r.functions for r in regions), ()))
+    functions = sum((r.functions for r in regions), ())
+    return Region(joined("low"), joined("high"), joined("normal"), offset, functions)
 
 
 def as_region(name: str, given: Region | Sequence[ArrayLike], num_states: int) -> Region:

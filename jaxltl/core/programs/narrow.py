@@ -74,8 +74,8 @@ def search_narrow(
     level = keys
     while 0 < len(level) < most and len(found.known) <= max_states:
         size = len(found.known)
-        lists: tuple[list[Any], ...]
-        lists = (found.row_count, found.column, found.entry_count, found.successor, found.weight)
+        lists: list[list[Any]] = [found.row_count, found.column, found.entry_count]
+        lists += [found.successor, found.weight]
         marks = [len(x) for x in lists]
         try:
             for key in level:

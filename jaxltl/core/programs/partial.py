@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -148,15 +148,16 @@ def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | No
 def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
     narrow = bool((upper - lower <= tolerance).all())
     status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
-    solution = Solution(
-        value=(lower + upper) / 2,
-        policy=np.zeros(0, np.int32),
-        lower=lower,
-        upper=upper,
-        residual=np.float64(0),
-        num_steps=np.int32(part.num_expanded),
-        status=np.int32(Status.CONVERGED if narrow else status),
-    )
+    arrays: dict[str, Any] = {
+        "value": (lower + upper) / 2,
+        "policy": np.zeros(0, np.int32),
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(0),
+        "num_steps": np.int32(part.num_expanded),
+        "status": np.int32(Status.CONVERGED if narrow else status),
+    }
+    solution = Solution(**arrays)
     if part.event.complement:
         solution = complement_event(solution)
     method = f"partial exploration of {part.num_states} states, {part.num_expanded} expanded"
