@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Integers
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
-from jaxltl.core.models.mdp import support
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text, write_bytes
@@ -262,27 +262,17 @@ def objective_of(game: Game) -> Parity:
 
 def edges_of(game: Game, place: str) -> tuple[Integers, Integers]:
     """Row offsets ``int[S + 1]`` and successors ``int[R]`` of a deterministic game."""
-    model = game.mdp
-    if isinstance(model, SparseMDP):
-        row_start, width = np.asarray(model.row_start), np.diff(np.asarray(model.entry_start))
-        state = model.host.state
-        successor = np.asarray(model.successor)[np.asarray(model.entry_start)[:-1]]
-    else:
-        used = support(model)
-        state, action = np.nonzero(np.asarray(model.available))
-        width, rank = used.sum(-1)[state, action], used.argmax(-1)[state, action]
-        successor = rank
-        if hasattr(model, "successor"):
-            successor = np.asarray(model.successor)[state, action, rank]
-        row_start = np.searchsorted(state, np.arange(game.num_states + 1))
+    model = to_sparse(game.mdp)
+    entry_start = np.asarray(model.entry_start)
+    width = np.diff(entry_start)
     if (width > 1).any():
-        s = state[np.argmax(width > 1)]
+        s = model.host.state[np.argmax(width > 1)]
         raise ValueError(
             f"{place}: state {s} has a move that leads to several states; the format "
             "has no random moves. Solve the game with chance='adversarial', or make the "
             "environment choose."
         )
-    return row_start, successor
+    return np.asarray(model.row_start), np.asarray(model.successor)[entry_start[:-1]]
 
 
 def max_even(

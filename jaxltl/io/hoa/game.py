@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,18 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformu
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
-from jaxltl.io.hoa.header import Header, decisive_sets, edge_priority, read_header
-from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.table import by_number, guarded_edges, label_reader, marks_of, nondeterminism
+from jaxltl.io.hoa.header import Header, decisive_sets, edge_priority
+from jaxltl.io.hoa.grammar import Edge, State, error_at
+from jaxltl.io.hoa.table import (
+    guarded_edges,
+    label_reader,
+    marks_of,
+    nondeterminism,
+    only_text,
+    parsed,
+)
 from jaxltl.io.hoa.hoa import header_lines, parity_text
 from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of
-
-if TYPE_CHECKING:
-    from lark import Token
 
 MAX_MOVES = 2**22
 _MAX_NODES = 2**20  # of the diagrams of all guards
@@ -85,29 +89,17 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
     else:
         place, text = str(source), read_text(source, "a game in the Hanoi format")
     try:
-        automata = split_texts(text)
-        if len(automata) != 1:
-            raise ValueError(f"the text holds {len(automata)} automata, expected exactly one.")
-        return _read(automata[0])
+        return parsed(
+            only_text(text),
+            lambda header, states: _Reader(header, _controllable(header)).game(states),
+        )
     except ValueError as error:
         raise ValueError(f"{place}: {str(error).removeprefix('read_hoa: ')}") from None
 
 
-def _read(tokens: list[Token]) -> HoaGame:
-    try:
-        (version, items), states = parse_tokens(tokens)
-        header = read_header(version, items)
-        return _Reader(header, _controllable(items, header)).game(by_number(header, states))
-    except RecursionError:  # evaluation recurses into guards
-        raise error_at(
-            tokens[0].line, "a label or the acceptance formula nests hundreds of levels deep, or "
-            "there are hundreds of propositions. Write it flatter."
-        ) from None  # fmt: skip
-
-
-def _controllable(items: list[Item], header: Header) -> list[int]:
+def _controllable(header: Header) -> list[int]:
     """Indices of the propositions that the system controls."""
-    headers = [values for values in items if values[0] == "controllable-AP:"]
+    headers = [values for values in header.others if values[0] == "controllable-AP:"]
     if len(headers) != 1:
         raise error_at(
             headers[1][0].line if headers else header.line,

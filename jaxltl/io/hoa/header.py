@@ -34,6 +34,7 @@ class Header:
     properties: frozenset[str]
     tool: str
     acceptance_name: str
+    others: list[Item]  # that the format does not define
     line: int
 
 
@@ -44,14 +45,16 @@ def read_header(version: Token, items: list[Item]) -> Header:
     headers: dict[str, Item] = {}
     properties: list[str] = []
     aliases: list[tuple[Token, Tree]] = []
+    others: list[Item] = []
     for key, *values in items:
+        if key.type == "HEADERNAME" and key[0].isupper():  # capital: may change the semantics
+            raise error_at(
+                key.line,
+                f"the header {key} is unknown and, by its capital, changes what the automaton "
+                "means. Write the automaton without it.",
+            )
         if key.type == "HEADERNAME":
-            if key[0].isupper():  # capital: may change the semantics
-                raise error_at(
-                    key.line,
-                    f"the header {key} is unknown and, by its capital, changes what the automaton "
-                    "means. Write the automaton without it.",
-                )
+            others.append([key, *values])
         elif key.type == "PROPERTIES":
             properties += values
         elif key.type == "ALIAS":
@@ -66,15 +69,6 @@ def read_header(version: Token, items: list[Item]) -> Header:
             raise error_at(key.line, f"the header {key} is given twice. Keep one of them.")
         else:
             headers[key.type] = [key, *values]
-    return _checked_header(version, headers, aliases, frozenset(properties))
-
-
-def _checked_header(
-    version: Token,
-    headers: dict[str, Item],
-    aliases: list[tuple[Token, Tree]],
-    properties: frozenset[str],
-) -> Header:
     for missing, fix in (("Acceptance:", "Acceptance: 0 t"), ("Start:", "Start: 0")):
         if KNOWN_HEADERS[missing] not in headers:
             raise error_at(
@@ -88,9 +82,10 @@ def _checked_header(
         aliases=aliases,
         sets=int(sets),
         condition=_condition(condition, int(sets)),
-        properties=properties,
+        properties=frozenset(properties),
         tool=unquoted(headers["TOOL"][1]) if "TOOL" in headers else "",
         acceptance_name=str(headers["ACC_NAME"][1]) if "ACC_NAME" in headers else "",
+        others=others,
         line=version.line or 1,
     )
 

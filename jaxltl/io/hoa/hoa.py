@@ -24,10 +24,9 @@ from jaxltl.io.hoa.header import (
     colors_of,
     decisive_sets,
     edge_priority,
-    read_header,
 )
-from jaxltl.io.hoa.grammar import error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.table import Table, by_number, read_table
+from jaxltl.io.hoa.grammar import State, split_texts
+from jaxltl.io.hoa.table import Table, only_text, parsed, read_table
 
 if TYPE_CHECKING:
     from lark import Token
@@ -61,13 +60,7 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
       >>> infinitely_often_a.acceptance, infinitely_often_a.priority.tolist()
       ('buchi', [[1, 0]])
     """
-    automata = split_texts(text)
-    if len(automata) != 1:
-        raise ValueError(
-            f"read_hoa: the text holds {len(automata)} automata, expected exactly one. "
-            "Read several with read_hoa_stream."
-        )
-    return _read(automata[0], letters)
+    return _read(only_text(text, " Read several with read_hoa_stream."), letters)
 
 
 def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[Automaton]:
@@ -210,20 +203,14 @@ def quoted(text: str) -> str:
 
 
 def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
-    try:
-        (version, items), states = parse_tokens(tokens)
-        header = read_header(version, items)
+    def make(header: Header, states: list[State]) -> Automaton:
         names = tuple(sorted(header.propositions))
         alphabet = make_alphabet(names, letters, f"read_hoa: line {header.line}")
         # Columns of the sorted alphabet in the order of AP.
         columns = alphabet[:, [names.index(name) for name in header.propositions]]
-        table = read_table(header, by_number(header, states), columns)
-        return _automaton(header, table, alphabet, names)
-    except RecursionError:  # evaluation recurses into labels and conditions
-        raise error_at(
-            tokens[0].line,
-            "a label or the acceptance formula nests hundreds of levels deep. Write it flatter.",
-        ) from None
+        return _automaton(header, read_table(header, states, columns), alphabet, names)
+
+    return parsed(tokens, make)
 
 
 def _automaton(

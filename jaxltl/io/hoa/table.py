@@ -5,20 +5,48 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import letter_text
-from jaxltl.io.hoa.grammar import Edge, State, Tree, error_at
-from jaxltl.io.hoa.header import Header, only_target, set_number
+from jaxltl.io.hoa.grammar import Edge, State, Tree, error_at, parse_tokens, split_texts
+from jaxltl.io.hoa.header import Header, only_target, read_header, set_number
+
+if TYPE_CHECKING:
+    from lark import Token
 
 LetterSet = TypeVar("LetterSet")
+Made = TypeVar("Made")
 
 
-def by_number(header: Header, states: list[State]) -> list[State]:
+def only_text(text: str, hint: str = "") -> list[Token]:
+    """The tokens of the one automaton of a text."""
+    automata = split_texts(text)
+    if len(automata) != 1:
+        raise ValueError(
+            f"read_hoa: the text holds {len(automata)} automata, expected exactly one.{hint}"
+        )
+    return automata[0]
+
+
+def parsed(tokens: list[Token], make: Callable[[Header, list[State]], Made]) -> Made:
+    """What is made of the header and the states of an automaton."""
+    try:
+        (version, items), states = parse_tokens(tokens)
+        header = read_header(version, items)
+        return make(header, _by_number(header, states))
+    except RecursionError:  # evaluation recurses into labels and conditions
+        raise error_at(
+            tokens[0].line,
+            "a label or the acceptance formula nests hundreds of levels deep, or there are "
+            "hundreds of propositions. Write it flatter.",
+        ) from None
+
+
+def _by_number(header: Header, states: list[State]) -> list[State]:
     """States sorted by number; validates unique definitions, the initial state and all targets."""
     defined: dict[int, State] = {}
     for state in states:
