@@ -8,15 +8,14 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from jaxltl.core.language.parser import SIMPLE
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
-from jaxltl.core.logic.property_tokens import ExpressionStream
-from jaxltl.core.logic.property_tokens import Token
+from jaxltl.core.logic.property_tokens import ExpressionStream, Token
 from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
@@ -163,6 +162,7 @@ _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
 # --- grammar ----------------------------------------------------------------------------------
 
 _Path = Formula | Bounded
+_Content = TypeVar("_Content")
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
@@ -189,8 +189,7 @@ class _Parser(ExpressionStream):
                 if not self.accept(":"):  # it is a label
                     name, self.place = None, before
             found.append(self.outermost(name))
-        if not found:
-            raise self.error('a property, such as Pmax=? [ F "goal" ]')
+        self.require(bool(found), 'a property, such as Pmax=? [ F "goal" ]')
         return tuple(found)
 
     def outermost(self, name: str | None) -> Property:
@@ -204,19 +203,35 @@ class _Parser(ExpressionStream):
             self.place = before
         return self.state_property(name)
 
+    def written(self, start: Token) -> str:
+        """The text from a token up to here."""
+        return self.text[start.start : self.last.end]
+
+    def scoped(
+        self, read: Callable[[], _Content]
+    ) -> tuple[_Content, tuple[tuple[str, Comparison | Property], ...]]:
+        """What a method reads, and the definitions that it makes."""
+        outer, self.definitions = self.definitions, {}
+        found = read()
+        defined, self.definitions = tuple(self.definitions.items()), outer
+        return found, defined
+
     def state_property(self, name: str | None = None) -> Property:
         """A state formula as a property: with probability one, which is 0 or 1."""
-        start, self.definitions = self.token, {}
-        path = self.state_content()
-        text = self.text[start.start : self.last.end]
-        defined, self.definitions = tuple(self.definitions.items()), {}
-        sure = Fraction(1)
+        start = self.token
+        path, defined = self.scoped(self.state_content)
         return Property(
-            text, "P", relation=">=", threshold=sure, path=path, name=name, definitions=defined
+            self.written(start),
+            "P",
+            relation=">=",
+            threshold=Fraction(1),
+            path=path,
+            name=name,
+            definitions=defined,
         )
 
     def property_(self, name: str | None = None) -> Property:
-        start, outer = self.token, self.definitions
+        start = self.token
         if self.accept("multi"):
             return self.multi(start, name)
         if self.accept("filter"):
@@ -225,93 +240,85 @@ class _Parser(ExpressionStream):
         if match is None:
             raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA or multi(...)")
         self.take()
-        operator, objective = ("LRA" if match[1] == "S" else match[1]), match[2]
-        nature = match[3]
-        reward = None
-        if operator == "R":
-            reward = self.known.rewards[0] if self.known.rewards else None
+        fields: dict[str, Any] = {"operator": "LRA" if match[1] == "S" else match[1]}
+        if match[1] == "R":
+            fields["reward"] = self.known.rewards[0] if self.known.rewards else None
             if self.accept("{"):
-                reward = self.reward_name()
+                fields["reward"] = self.reward_name()
                 self.expect("}")
-        if objective is None:  # R{"name"}max, with max after the name
-            both = self.accept(*_DIRECTIONS) or ""
-            objective, nature = both[:3] or None, both[3:] or None
-        relation, threshold = self.comparison(operator)
+        # R{"name"}max has max after the name.
+        both = start.text[len(match[1]) :] or self.accept(*_DIRECTIONS) or ""
+        fields |= {"objective": both[:3] or None, "nature": both[3:] or None}
+        fields["relation"], fields["threshold"] = self.comparison(match[1])
         self.expect("[")
-        self.definitions = {}
-        path = _CONTENT[operator](self)
-        defined, self.definitions = tuple(self.definitions.items()), outer
+        content = _CONTENT[fields["operator"]]
+        fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
         self.expect("]", " or an operator")
-        text = self.text[start.start : self.last.end]
-        fields: dict[str, Any] = {"operator": operator, "objective": objective}
-        fields |= {"relation": relation, "threshold": threshold, "reward": reward, "path": path}
-        fields |= {"nature": nature, "definitions": defined}
-        return Property(text, **fields, name=name)
+        return Property(self.written(start), **fields, name=name)
 
     def multi(self, start: Token, name: str | None) -> Property:
         self.expect("(")
-        parts = []
-        while True:
+        parts: list[Property] = []
+        while not parts or self.accept(","):
             first = self.token
-            parts.append(self.property_())
-            if parts[-1].operator == "multi":
-                raise self.error("a property with P or R; multi stands outermost", first)
-            if parts[-1].nature is not None:
-                raise self.error(
-                    "one direction, max or min: several objectives are solved for "
-                    "without intervals",
-                    first,
-                )
-            if not self.accept(","):
-                break
+            part = self.property_()
+            self.require(
+                part.operator != "multi", "a property with P or R; multi stands outermost", first
+            )
+            self.require(
+                part.nature is None,
+                "one direction, max or min: several objectives are solved for without intervals",
+                first,
+            )
+            parts.append(part)
         self.expect(")", " or ','")
-        text = self.text[start.start : self.last.end]
         defined = tuple(one for part in parts for one in part.definitions)
+        text = self.written(start)
         return Property(text, "multi", parts=tuple(parts), name=name, definitions=defined)
 
     def filter(self, start: Token, name: str | None) -> Property:
         self.expect("(")
         place, kind = self.token, self.take().text
-        if kind not in FILTERS:
-            raise self.error(f"the kind of the filter: {', '.join(FILTERS)}", place)
+        self.require(kind in FILTERS, f"the kind of the filter: {', '.join(FILTERS)}", place)
         self.expect(",")
-        first, self.definitions = self.token, {}
-        asked, before = None, self.place
+        first, before, asked = self.token, self.place, None
         if first.kind == "word" and _OPERATOR.fullmatch(first.text):
             asked = self.property_()
         if asked is None or self.token.text not in (",", ")"):  # it begins a state formula
             self.place = before
             asked = self.state_property()
-        if FILTERS[kind] not in (None, asked.relation is not None):
-            wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
-            raise self.error(f"{wanted} in a filter of this kind", first)
-        among = self.state_content() if self.accept(",") else TRUE
+        wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
+        self.require(
+            FILTERS[kind] in (None, asked.relation is not None),
+            f"{wanted} in a filter of this kind",
+            first,
+        )
+        among, defined = self.scoped(self.state_content) if self.accept(",") else (TRUE, ())
         self.expect(")", " or ','")
-        text = self.text[start.start : self.last.end]
-        defined, self.definitions = (*asked.definitions, *self.definitions.items()), {}
-        asked = replace(asked, text=text, name=name, definitions=defined)
-        return replace(asked, aggregate=kind, among=among)
+        return replace(
+            asked,
+            text=self.written(start),
+            name=name,
+            definitions=(*asked.definitions, *defined),
+            aggregate=kind,
+            among=among,
+        )
 
     def comparison(self, operator: str) -> tuple[str | None, Fraction | None]:
         if self.accept("="):
             self.expect("?", " after '='; to compare, use >= > <= or <")
             return None, None
-        relation = self.accept("<=", ">=", "<", ">")
-        if relation is None:
-            raise self.error("=? or a threshold, such as >=0.9")
+        relation = self.one_of(("<=", ">=", "<", ">"), "=? or a threshold, such as >=0.9")
         start = self.token
         threshold = self.number(signed=operator == "R")
-        if operator in ("P", "LRA") and not 0 <= threshold <= 1:
-            raise self.error("a probability between 0 and 1", start)
+        possible = operator in ("R", "T") or 0 <= threshold <= 1
+        self.require(possible, "a probability between 0 and 1", start)
         return relation, threshold
 
     # --- paths, from loosest to tightest ---
 
     def path(self) -> _Path:
-        return self.chain(("||",), "|", self.path_conjunction)
-
-    def path_conjunction(self) -> _Path:
-        return self.chain(("&&",), "&", self.until)
+        return self.chain("||", "|", lambda: self.chain("&&", "&", self.until))
 
     def until(self) -> _Path:
         left = self.prefixed()
@@ -320,10 +327,9 @@ class _Parser(ExpressionStream):
             return left
         bound = self.bound()
         right = self.prefixed()
-        if self.token.text in ("U", "W", "R") and self.token.kind == "word":
-            raise self.error("parentheses around one of two U, W or R in a row")
-        plain = self.plain(left), self.plain(right)
-        return Formula(operator, plain) if bound is None else self.bounded(operator, plain, bound)
+        again = self.token.text in ("U", "W", "R") and self.token.kind == "word"
+        self.require(not again, "parentheses around one of two U, W or R in a row")
+        return self.bounded(operator, (self.plain(left), self.plain(right)), bound)
 
     def prefixed(self) -> _Path:
         operator = self.accept("X", "F", "G")
@@ -331,34 +337,29 @@ class _Parser(ExpressionStream):
             return self.implication()
         start = self.token
         bound = self.bound()
-        if bound is not None and operator == "X":
-            raise self.error("a formula; X takes no bound", start)
-        operand = self.plain(self.prefixed())
-        if bound is None:
-            return Formula(operator, (operand,))
-        return self.bounded(operator, (operand,), bound)
+        self.require(bound is None or operator != "X", "a formula; X takes no bound", start)
+        return self.bounded(operator, (self.plain(self.prefixed()),), bound)
 
     def implication(self) -> _Path:
-        left = self.chain(("<=>",), "<->", self.disjunction)
+        left = self.equivalence()
         if not self.accept("=>"):
             return left
-        right = self.chain(("<=>",), "<->", self.disjunction)
-        if self.token.text == "=>":
-            raise self.error("parentheses around one of two => in a row")
+        right = self.equivalence()
+        self.require(self.token.text != "=>", "parentheses around one of two => in a row")
         return Formula("->", (self.plain(left), self.plain(right)))
 
+    def equivalence(self) -> _Path:
+        return self.chain("<=>", "<->", self.disjunction)
+
     def disjunction(self) -> _Path:
-        return self.chain(("|",), "|", self.conjunction)
+        return self.chain("|", "|", lambda: self.chain("&", "&", self.atom))
 
-    def conjunction(self) -> _Path:
-        return self.chain(("&",), "&", self.atom)
-
-    def chain(self, signs: tuple[str, ...], operator: str, operand: Callable[[], _Path]) -> _Path:
+    def chain(self, sign: str, operator: str, operand: Callable[[], _Path]) -> _Path:
         first = operand()
-        if self.token.text not in signs or self.token.kind != "sign":
+        if self.token.text != sign or self.token.kind != "sign":
             return first
         operands = [self.plain(first)]
-        while self.accept(*signs):
+        while self.accept(sign):
             operands.append(self.plain(operand()))
         if operator == "<->":
             return functools.reduce(lambda f, g: Formula("<->", (f, g)), operands)
@@ -372,25 +373,26 @@ class _Parser(ExpressionStream):
             return self.parentheses()
         if token.kind == "quoted":
             name = self.quoted()
-            if not name:
-                raise self.error("a label's name between the quotes", token)
+            self.require(bool(name), "a label's name between the quotes", token)
             if name in self.labels:
                 return self.defined(self.labels[name])
             return Formula("ap", proposition=name)
         if constant := self.accept("true", "false"):
             return Formula(constant)
-        if token.kind == "word" and token.text in self.known.known | self.names.keys():
-            return self.comparison_of_variables()
-        if token.kind == "word" and token.text in "XFG":
-            return self.prefixed()
-        if token.kind == "word" and _OPERATOR.fullmatch(token.text):
-            nested = self.property_()
-            if nested.relation is None:
-                raise self.error("a nested property with a threshold, such as P>=0.5", token)
-            return self.defined(nested)
-        if token.kind in ("word", "number") or token.text == "-":
-            return self.comparison_of_variables()
-        raise self.error("a label in quotes, true, false, '(', '!' or one of X F G")
+        if token.kind == "word" and token.text not in self.known.known | self.names.keys():
+            if token.text in "XFG":
+                return self.prefixed()
+            if _OPERATOR.fullmatch(token.text):
+                nested = self.property_()
+                self.require(
+                    nested.relation is not None,
+                    "a nested property with a threshold, such as P>=0.5",
+                    token,
+                )
+                return self.defined(nested)
+        begins = token.kind in ("word", "number") or token.text == "-"
+        self.require(begins, "a label in quotes, true, false, '(', '!' or one of X F G")
+        return self.comparison_of_variables()
 
     def defined(self, meaning: Comparison | Property) -> Formula:
         """A proposition that stands for a comparison or a nested property."""
@@ -405,8 +407,7 @@ class _Parser(ExpressionStream):
             self.expect("(")
             found = self.path()
             self.expect(")", " or an operator")
-            if self.token.text in _AFTER_OPERAND:
-                raise self.error("a Boolean operator")
+            self.require(self.token.text not in _AFTER_OPERAND, "a Boolean operator")
             return found
         except ValueError:
             after, self.place, self.definitions = self.place, place, known
@@ -420,15 +421,15 @@ class _Parser(ExpressionStream):
         found = self.expression(SIMPLE)
         if found.is_literal and isinstance(found.value, bool):
             return TRUE if found.value else FALSE
-        if found.operator == "name" and found.value not in self.known.variables:
-            raise self.error(
-                f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
-                f"such as {start.text}=1",
-                start,
-            )
-        if found.operator in _NUMBERS or found.is_literal:
-            raise self.error("a comparison, such as x+1<=3")
-        return self.defined(Comparison(self.text[start.start : self.last.end], found))
+        self.require(
+            found.operator != "name" or found.value in self.known.variables,
+            f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
+            f"such as {start.text}=1",
+            start,
+        )
+        is_number = found.operator in _NUMBERS or found.is_literal
+        self.require(not is_number, "a comparison, such as x+1<=3")
+        return self.defined(Comparison(self.written(start), found))
 
     # --- bounds ---
 
@@ -453,47 +454,42 @@ class _Parser(ExpressionStream):
             start = self.token
             upper = self.steps()
             self.expect("]")
-            if upper < lower:
-                raise self.error(f"a number from {lower} up", start)
+            self.require(upper >= lower, f"a number from {lower} up", start)
             return replace(empty, lower=lower, upper=upper)
         relation = self.accept("<=", "<", ">=", ">", "=")
         if relation is None:
             return None
         start = self.token
-        steps = self.steps()
-        if relation == "<" and steps == 0:
-            raise self.error("a bound that some number of steps meets", start)
+        steps = self.steps() + {"<": -1, ">": 1}.get(relation, 0)
+        self.require(steps >= 0, "a bound that some number of steps meets", start)
         return replace(
             empty,
-            lower=steps + (relation == ">") if relation in (">", ">=", "=") else 0,
-            upper={"<=": steps, "<": steps - 1, "=": steps}.get(relation),
+            lower=0 if "<" in relation else steps,
+            upper=None if ">" in relation else steps,
         )
 
     def reward_bound(self) -> Bounded:
         reward = self.reward_name()
         self.expect("}")
-        relation = self.accept("<=", "<")
-        if relation is None:
-            raise self.error("<= or <; only upper bounds on rewards are solved for")
+        relation = self.one_of(("<=", "<"), "<= or <; only upper bounds on rewards are solved for")
         start = self.token
         limit = self.number()
-        if relation == "<" and not limit:
-            raise self.error("a bound that some reward meets", start)
-        if self.token.text == ",":
-            raise self.error("a formula; one bound on a reward is solved for, not several")
+        self.require(relation == "<=" or limit > 0, "a bound that some reward meets", start)
+        self.require(
+            self.token.text != ",",
+            "a formula; one bound on a reward is solved for, not several",
+        )
         return Bounded("U", TRUE, TRUE, reward=reward, limit=limit, strict=relation == "<")
 
-    def bounded(self, operator: str, operands: tuple[Formula, ...], bound: Bounded) -> _Path:
-        """An operator under a bound; unfolded where it is not on state formulas."""
-        right = operands[-1]
-        if operator in "FU":
-            left = operands[0] if operator == "U" else TRUE
-            found = replace(bound, operator="U", left=left, right=right)
-        elif operator in "GR":
-            left = operands[0] if operator == "R" else FALSE
-            found = replace(bound, operator="R", left=left, right=right)
-        else:  # a W b is b R (a | b)
-            found = replace(bound, operator="R", left=right, right=operands[0] | right)
+    def bounded(self, operator: str, operands: tuple[Formula, ...], bound: Bounded | None) -> _Path:
+        """An operator, perhaps under a bound; unfolded where it is not on state formulas."""
+        if bound is None:
+            return Formula(operator, operands)
+        first, right = operands[0], operands[-1]
+        kind: Literal["U", "R"] = "U" if operator in "FU" else "R"
+        left = {"F": TRUE, "G": FALSE, "W": right}.get(operator, first)
+        right = first | right if operator == "W" else right  # a W b is b R (a | b)
+        found = replace(bound, operator=kind, left=left, right=right)
         boolean = is_boolean(found.left) and is_boolean(found.right)
         return found if boolean else self.plain(found)
 
@@ -501,20 +497,20 @@ class _Parser(ExpressionStream):
         """A formula without bounds."""
         if isinstance(path, Formula):
             return path
-        if path.reward is not None:
-            raise self.error("a bound on a reward outermost and on state formulas only", self.last)
-        if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
-            raise self.error(
-                f"a bound of at most {MAX_UNFOLDED_STEPS} steps inside of a formula; outermost and "
-                "on state formulas it may be any",
-                self.last,
-            )
+        self.require(
+            path.reward is None,
+            "a bound on a reward outermost and on state formulas only",
+            self.last,
+        )
+        self.require(
+            max(path.lower, path.upper or 0) <= MAX_UNFOLDED_STEPS,
+            f"a bound of at most {MAX_UNFOLDED_STEPS} steps inside of a formula; outermost and "
+            "on state formulas it may be any",
+            self.last,
+        )
         return unfolded(path)
 
     # --- what stands in brackets ---
-
-    def path_content(self) -> _Path:
-        return self.path()
 
     def state_content(self) -> Formula:
         start = self.token
@@ -524,31 +520,27 @@ class _Parser(ExpressionStream):
         return found
 
     def reward_content(self) -> Formula | Earned:
-        start = self.token
         if self.accept("S", "LRA"):
             return Earned("average")
         if self.accept("I"):
             self.expect("=", " and a number of steps after I")
             return Earned("instantaneous", self.steps())
-        if self.accept("C"):
-            relation = self.accept("<=", "<")
-            if relation is None:
-                if self.token.text == "{":
-                    raise self.error(
-                        "<= and a number of steps after C; the steps are bounded, not a reward"
-                    )
-                return Earned("total")
-            place = self.token
-            steps = self.steps() - (relation == "<")
-            if steps < 0:
-                raise self.error("a bound that some number of steps meets", place)
-            return Earned("cumulative", steps)
-        return self.reach_content(start, "F and a state formula, C, C<=k, I=k, S or LRA")
+        if not self.accept("C"):
+            return self.reach_content("F and a state formula, C, C<=k, I=k, S or LRA")
+        relation = self.accept("<=", "<")
+        if relation is None:
+            self.require(
+                self.token.text != "{",
+                "<= and a number of steps after C; the steps are bounded, not a reward",
+            )
+            return Earned("total")
+        place = self.token
+        steps = self.steps() - (relation == "<")
+        self.require(steps >= 0, "a bound that some number of steps meets", place)
+        return Earned("cumulative", steps)
 
-    def steps_content(self) -> Formula:
-        return self.reach_content(self.token, "F and a state formula")
-
-    def reach_content(self, start: Token, wanted: str) -> Formula:
+    def reach_content(self, wanted: str = "F and a state formula") -> Formula:
+        start = self.token
         found = self.path()
         if isinstance(found, Bounded) or found.operator != "F" or not is_boolean(found.operands[0]):
             raise self.error(wanted, start)
@@ -560,8 +552,8 @@ _NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {
-    "P": _Parser.path_content,
+    "P": _Parser.path,
     "R": _Parser.reward_content,
-    "T": _Parser.steps_content,
+    "T": _Parser.reach_content,
     "LRA": _Parser.state_content,
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import re
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -42,24 +43,17 @@ def _tokens(text: str) -> list[Token]:
         match = _TOKEN.match(text, place)
         if match is None:
             hint = ". The quote is never closed" if text[place] == '"' else ""
-            raise ValueError(
-                pointed(
-                    "property",
-                    text,
-                    place,
-                    repr(text[place]),
-                    f"a property's signs and names{hint}",
-                )
-            )
+            wanted = f"a property's signs and names{hint}"
+            raise ValueError(pointed("property", text, place, repr(text[place]), wanted))
         kind = str(match.lastgroup)
-        if kind == "word" and re.fullmatch("[XFG]{2,}", match[0]):  # GF"a"
-            found += [
-                Token("word", letter, place + i, place + i + 1) for i, letter in enumerate(match[0])
-            ]
-        elif kind != "space":
-            found.append(Token(kind, match[0], place, match.end()))
+        # GF"a" is G F "a".
+        pieces = match[0] if re.fullmatch("[XFG]{2,}", match[0]) else [match[0]]
+        for piece in pieces if kind != "space" else ():
+            found.append(Token(kind, piece, place, place + len(piece)))
+            place += len(piece)
         place = match.end()
-    return [*found, Token("end", "", len(text.rstrip()), len(text.rstrip()))]
+    end = len(text.rstrip())
+    return [*found, Token("end", "", end, end)]
 
 
 class TokenStream:
@@ -79,6 +73,10 @@ class TokenStream:
         found = "the end" if token.kind == "end" else repr(token.text)
         return ValueError(pointed("property", self.text, token.start, found, wanted))
 
+    def require(self, holds: bool, wanted: str, token: Token | None = None) -> None:
+        if not holds:
+            raise self.error(wanted, token)
+
     def take(self) -> Token:
         token = self.token
         self.place += token.kind != "end"
@@ -91,8 +89,13 @@ class TokenStream:
         return None
 
     def expect(self, sign: str, after: str = "") -> None:
-        if not self.accept(sign):
-            raise self.error(f"{sign!r}{after}")
+        self.one_of((sign,), f"{sign!r}{after}")
+
+    def one_of(self, texts: Sequence[str], wanted: str) -> str:
+        found = self.accept(*texts)
+        if found is None:
+            raise self.error(wanted)
+        return found
 
     @property
     def last(self) -> Token:
@@ -101,8 +104,7 @@ class TokenStream:
     # --- numbers and names ---
 
     def quoted(self) -> str:
-        if self.token.kind != "quoted":
-            raise self.error("a name in double quotes")
+        self.require(self.token.kind == "quoted", "a name in double quotes")
         return re.sub(r'\\(["\\])', r"\1", self.take().text[1:-1])
 
     def number(self, signed: bool = False) -> Fraction:
@@ -111,25 +113,22 @@ class TokenStream:
         if self.accept("/"):
             start = self.token
             divisor = self.plain_number()
-            if not divisor:
-                raise self.error("a divisor other than 0", start)
+            self.require(divisor != 0, "a divisor other than 0", start)
             value /= divisor
         return sign * value
 
     def plain_number(self) -> Fraction:
         text = self.token.text
-        if self.token.kind != "number":
-            raise self.error("a number")
+        self.require(self.token.kind == "number", "a number")
         exponent = re.split("[eE]", text)[1:] or ["0"]
-        if len(text) > _MAX_DIGITS or abs(int(exponent[0])) > _MAX_DIGITS:
-            raise self.error(f"a number of at most {_MAX_DIGITS} digits")
+        short = len(text) <= _MAX_DIGITS and abs(int(exponent[0])) <= _MAX_DIGITS
+        self.require(short, f"a number of at most {_MAX_DIGITS} digits")
         return Fraction(self.take().text)
 
     def steps(self) -> int:
         start = self.token
         value = self.number()
-        if value.denominator != 1:
-            raise self.error("a whole number of steps", start)
+        self.require(value.denominator == 1, "a whole number of steps", start)
         return int(value)
 
 
@@ -145,23 +144,22 @@ class ExpressionStream(TokenStream):
 
     def declaration(self) -> None:
         """A constant, a formula or a label."""
-        kind, type_ = self.take().text, None
-        if kind == "const":
-            type_ = self.accept("int", "double", "bool") or "int"
+        kind = self.take().text
+        type_ = (self.accept("int", "double", "bool") or "int") if kind == "const" else None
         start = self.token
         name = self.quoted() if kind == "label" else self.take().text
-        if start.kind not in ("quoted", "word") or name in self.names:
-            raise self.error("a name that is not declared yet", start)
+        fresh = start.kind in ("quoted", "word") and name not in self.names
+        self.require(fresh, "a name that is not declared yet", start)
         if kind == "const" and not self.accept("="):
-            if name not in self.known.given:
-                raise self.error(f"a value of {name}, here or as --const {name}=...", start)
+            wanted = f"a value of {name}, here or as --const {name}=..."
+            self.require(name in self.known.given, wanted, start)
             value = literal(self.known.given[name])
         else:
             if kind != "const":
                 self.expect("=")
             value = self.expression(0)
-            if kind == "const" and not value.is_literal:
-                raise self.error("an expression of constants", start)
+            constant = kind != "const" or value.is_literal
+            self.require(constant, "an expression of constants", start)
         if kind == "label":
             self.labels[name] = Comparison(f'"{name}"', value)
         else:
@@ -202,11 +200,9 @@ class ExpressionStream(TokenStream):
         start = self.token
         if start.kind != "number" or not self.known.rewards:
             return self.quoted()
-        number = self.steps()
-        if not 1 <= number <= len(self.known.rewards):
-            raise self.error(
-                f"the number of a reward structure, 1 to {len(self.known.rewards)}", start
-            )
+        number, count = self.steps(), len(self.known.rewards)
+        wanted = f"the number of a reward structure, 1 to {count}"
+        self.require(1 <= number <= count, wanted, start)
         return self.known.rewards[number - 1]
 
 
