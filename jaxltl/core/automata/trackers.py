@@ -21,9 +21,10 @@ from jaxltl.core.automata.emerson_lei import (
     Condition,
     polarities,
     residual,
+    to_parity,
     ZielonkaTree,
 )
-from jaxltl.core.automata.table import explore
+from jaxltl.core.automata.table import Table, explore
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.normal_form import Combination, Part, is_pure, limit_parts
@@ -180,8 +181,8 @@ def _condition(parts: Combination, number: dict[_Followed, int]) -> Condition:
     return (operator, *(_condition(part, number) for part in parts[1:]))
 
 
-def track_together(run: Trackers, max_states: int) -> tuple[Integers, Integers]:
-    """All trackers as one automaton with an Emerson-Lei condition: its transitions and colors."""
+def track_together(run: Trackers, max_states: int) -> Table:
+    """A parity automaton of all trackers, whose product has an Emerson-Lei condition."""
     decided: dict[Condition, States] = {}
     every = (1 << len(run.start)) - 1
 
@@ -198,15 +199,18 @@ def track_together(run: Trackers, max_states: int) -> tuple[Integers, Integers]:
         return [(canonical(end), colors) for end, colors in run.successors(states, every)]
 
     _, rows, marks = explore(canonical(run.start), step, max_states)
-    return np.stack(rows), np.stack(marks)
+    delta, priority, initial, _ = to_parity(
+        np.stack(rows), np.stack(marks), 0, run.condition, max_states
+    )
+    return Table(delta, priority, initial)
 
 
 # Of the trackers; the condition that remains; the leaf of its Zielonka tree.
 _Node: TypeAlias = tuple[States, Condition, int]
 
 
-def track_on_demand(run: Trackers, max_states: int) -> tuple[Integers, Integers]:
-    """A parity automaton of trackers: its transitions and priorities `[Q, L]`.
+def track_on_demand(run: Trackers, max_states: int) -> Table:
+    """A parity automaton of trackers.
 
     Trackers follow a formula only where the Zielonka tree of their condition needs its marks: a
     leaf of the tree waits for colors outside of its label, so that marks inside of it need not be
@@ -249,4 +253,4 @@ def track_on_demand(run: Trackers, max_states: int) -> tuple[Integers, Integers]
     delta, priority = (
         np.stack([row[place] for row, place in zip(rows, places, strict=True)]) for rows in tables
     )
-    return delta, priority
+    return Table(delta, priority, 0)

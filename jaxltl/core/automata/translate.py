@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, make_alphabet
-from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.parity import is_weak, reduce_table
 from jaxltl.core.automata.products import EVEN, ODD
 from jaxltl.core.automata.runs import find_lasso, live_states, universal_states
@@ -178,30 +178,9 @@ def _names(
 def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> Automaton:
     """The smallest automaton that the ways to combine trackers give."""
     plain = simplify(formula)
-    ways = _combinations(plain)
-    best: tuple[Table, NDArray[np.intp]] | None = None
-    # The way that tracks least may explode where another does not, so all start with little.
-    for work in (MAX_NODES // 30, MAX_NODES // 5, MAX_NODES):
-        for parts, cost in ways:
-            if best is not None and cost > WORTHWHILE * ways[0][1]:
-                break
-            limit = max_states if work == MAX_NODES else min(max_states, work // 10)
-            try:
-                best = _tracked(parts, (alphabet, formula.propositions), limit, work, best)
-            except ValueError:
-                if best is None and work == MAX_NODES and parts is ways[-1][0]:
-                    raise
-                continue
-            # A weak automaton is minimal, and a large one takes too long to do again.
-            if is_weak(best[0]) or _size(best[0])[0] <= GOOD_ENOUGH:
-                break
-            if best[0].delta.size > LARGE:
-                break
-        if best is not None:
-            break
-    assert best is not None
-    small, kind, _ = reduce_table(best[0])
-    table, _ = reachable(Table(small.delta[:, best[1]], small.priority[:, best[1]], 0))
+    table, letter = _smallest(_combinations(plain), (alphabet, formula.propositions), max_states)
+    small, kind, _ = reduce_table(table)
+    table, _ = reachable(Table(small.delta[:, letter], small.priority[:, letter], 0))
     automaton = _automaton(table, alphabet, formula.propositions, kind)
     return replace(automaton, state_names=_residual_names(plain, automaton))
 
@@ -209,19 +188,59 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
 def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
     """The different combinations of a formula, with how much they track, least first."""
     found: list[tuple[Combination, int]] = []
+    errors = []
     for steps in (MAX_STEPS // 20, MAX_STEPS):
-        for grouped, dual in ((True, False), (True, True), (False, False), (False, True)):
+        for grouped, dual in product((True, False), repeat=2):
             try:
                 parts = combination(formula, grouped, dual, steps)
-            except ValueError:
-                if steps == MAX_STEPS and not found and grouped < dual:
-                    raise
+            except ValueError as error:
+                errors.append(error)
                 continue
             if all(parts != other for other, _ in found):
                 found.append((parts, extent(parts)))
         if found:
+            return sorted(found, key=lambda entry: entry[1])
+    raise errors[-1]
+
+
+def _smallest(
+    ways: list[tuple[Combination, int]], alphabet: Alphabet, max_states: int
+) -> tuple[Table, Integers]:
+    """The smallest table of trackers over classes of letters, and the class of each letter."""
+    best: tuple[Table, Integers] | None = None
+    errors, spent = [], 0
+    # The way that tracks least may explode where another does not, so all start with little.
+    for work, (parts, cost) in product((MAX_NODES // 30, MAX_NODES // 5, MAX_NODES), ways):
+        if best is not None and (
+            work > spent or cost > WORTHWHILE * ways[0][1] or _is_enough(best[0])
+        ):
             break
-    return sorted(found, key=lambda entry: entry[1])
+        try:
+            run = Trackers(parts, alphabet, work)
+        except ValueError as error:
+            errors.append(error)
+            continue
+        for construct in (track_on_demand, track_together):
+            limit = max_states if work == MAX_NODES else min(max_states, work // 10)
+            if best is not None:
+                limit = min(limit, LEEWAY * len(best[0].delta) + 100)
+            try:
+                table, _, _ = reduce_table(construct(run, limit), thorough=False)
+            except ValueError as error:
+                errors.append(error)
+                continue
+            if best is None or _size(table) < _size(best[0]):
+                best, spent = (table, run.class_of), work
+            if is_weak(best[0]):
+                break
+    if best is None:
+        raise errors[-1]
+    return best
+
+
+def _is_enough(table: Table) -> bool:
+    """True if a table is minimal, as a weak one is, or tiny, or takes too long to do again."""
+    return is_weak(table) or _size(table)[0] <= GOOD_ENOUGH or table.delta.size > LARGE
 
 
 def _size(table: Table) -> tuple[int, int]:
@@ -229,44 +248,6 @@ def _size(table: Table) -> tuple[int, int]:
     still = (table.delta == np.arange(len(table.delta))[:, None]).all(axis=1)
     sink = still & (table.priority % 2 == 1).all(axis=1)
     return len(table.delta) - int(sink.any()), len(np.unique(table.priority))
-
-
-_Found = tuple[Table, NDArray[np.intp]]
-
-
-def _tracked(
-    parts: Combination, alphabet: Alphabet, max_states: int, max_nodes: int, best: _Found | None
-) -> _Found:
-    """The smaller of the best automaton so far and those of trackers, over classes of letters."""
-    run = Trackers(parts, alphabet, max_nodes)
-    error: ValueError | None = None
-    for construct in (_on_demand, _together):
-        limit = max_states
-        if best is not None:
-            limit = min(limit, LEEWAY * len(best[0].delta) + 100)
-        try:
-            table = reduce_table(construct(run, limit), thorough=False)[0]
-        except ValueError as caught:
-            error = caught
-            continue
-        if best is None or _size(table) < _size(best[0]):
-            best = table, run.class_of
-        if is_weak(best[0]):
-            break
-    if best is None:
-        assert error is not None
-        raise error
-    return best
-
-
-def _on_demand(run: Trackers, max_states: int) -> Table:
-    delta, priority = track_on_demand(run, max_states)
-    return Table(delta, priority, 0)
-
-
-def _together(run: Trackers, max_states: int) -> Table:
-    delta, colors = track_together(run, max_states)
-    return Table(*to_parity(delta, colors, 0, run.condition, max_states)[:3])
 
 
 def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:

@@ -22,13 +22,15 @@ from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.construct.restrict import restrict
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import Game, as_game, as_padded_game
-from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import Model, PyTree
+from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 
 def _facts(value: Winning) -> Iterator[str]:
@@ -213,34 +215,27 @@ def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> PyT
 
 def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     """The deterministic game in which the environment chooses random successors, on the host."""
-    everywhere = np.full(game.num_states, 1 / game.num_states)
-    explicit = restrict(game, everywhere).model
-    successor, used = np.asarray(explicit.mdp.successor), support(explicit.mdp)
-    num_states, num_actions, width = used.shape
-    random = used.sum(-1) > 1
-    s, a = np.nonzero(random)
-    size, moves = num_states + s.size, max(num_actions, width)
-    target = np.zeros((size, moves, 1), np.int32)
-    available = np.zeros((size, moves), bool)
-    only = np.take_along_axis(successor, used.argmax(-1)[..., None], -1)[..., 0]
-    target[:num_states, :num_actions, 0] = only
-    target[s, a, 0] = np.arange(num_states, size)
-    available[:num_states, :num_actions] = np.asarray(explicit.available)
-    target[num_states:, :width, 0] = successor[s, a]
-    available[num_states:, :width] = used[s, a]
-    origin = np.concatenate([np.arange(num_states), s])
-    label = np.asarray(explicit.label)[origin]
-    initial = np.concatenate([np.asarray(game.initial).ravel(), np.zeros(s.size)])
-    mdp = make_mdp(
-        target,
-        available[:, :, None].astype(float),
-        available=available,
-        initial=initial,
-        label=label,
-        propositions=explicit.propositions,
+    model = to_sparse(game.mdp)
+    host, width = model.host, np.diff(model.host.entry_start)
+    random = np.flatnonzero(width > 1)
+    choices, _ = row_entries(host.entry_start, random)
+    target = host.successor[host.entry_start[:-1]]
+    target[random] = host.num_states + np.arange(random.size)
+    origin = np.concatenate([np.arange(host.num_states), host.state[random]])
+    count = np.concatenate([np.diff(host.row_start), width[random]])
+    action = host.rank if model.action is None else np.asarray(model.action)
+    split = make_sparse(
+        offsets_from_counts(count),
+        np.arange(count.sum() + 1),
+        np.concatenate([target, host.successor[choices]]),
+        np.ones(count.sum()),
+        initial=np.append(np.asarray(model.initial), np.zeros(random.size)),
+        label=np.asarray(model.label)[origin],
+        propositions=model.propositions,
+        action=np.concatenate([action, concatenated_ranges(np.zeros_like(random), width[random])]),
     )
-    system = np.concatenate([np.asarray(game.system).ravel(), np.zeros(s.size, bool)])
-    return Game(mdp, to_jax(system)), to_jax(origin.astype(np.int32))
+    system = np.append(np.asarray(game.system).ravel(), np.zeros(random.size, bool))
+    return Game(to_padded(split), to_jax(system)), to_jax(origin.astype(np.int32))
 
 
 # --- parity -----------------------------------------------------------------------------------
