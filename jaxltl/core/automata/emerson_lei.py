@@ -99,9 +99,7 @@ def members(colors: int) -> list[int]:
     return [color for color in range(colors.bit_length()) if colors >> color & 1]
 
 
-# ---------------------------------------------------------------------------------------------
-# Trees of sets that can recur
-# ---------------------------------------------------------------------------------------------
+# --- Trees of sets that can recur ------------------------------------------------------------
 
 
 class CycleTree:

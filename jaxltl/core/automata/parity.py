@@ -96,9 +96,7 @@ def _acceptance(table: Table) -> str:
     return "buchi" if priority.max() <= 1 else "parity"
 
 
-# ---------------------------------------------------------------------------------------------
-# Steps that keep the language: the new table, and an old state of each new one
-# ---------------------------------------------------------------------------------------------
+# --- Steps that keep the language: the new table, and an old state of each new one -----------
 
 
 def _fewest_priorities(table: Table) -> tuple[Table, Integers]:

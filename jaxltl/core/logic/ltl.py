@@ -146,9 +146,7 @@ def subformulas(formula: Formula) -> tuple[Formula, ...]:
     return tuple(done)
 
 
-# ---------------------------------------------------------------------------------------------
-# Syntax
-# ---------------------------------------------------------------------------------------------
+# --- Syntax ----------------------------------------------------------------------------------
 
 _NAME = r"(?!(?:[URVWM]|xor|[tT][rR][uU][eE]|[fF][aA][lL][sS][eE])(?![\w.]))" \
         r"(?:[A-EH-WYZa-z_.]|[FGX](?=[0-9]))[A-Za-z0-9_.]*"  # fmt: skip
@@ -335,9 +333,7 @@ def render(formula: Formula, operand_texts: Sequence[str]) -> str:
     return "".join(x if isinstance(x, str) else texts[x] for x in _pieces(formula))
 
 
-# ---------------------------------------------------------------------------------------------
-# Normal form and fragments
-# ---------------------------------------------------------------------------------------------
+# --- Normal form and fragments ---------------------------------------------------------------
 
 _DUALITIES = ("X X", "true false", "& |", "F G", "U R", "W M")
 _DUAL = dict(pair.split() for pair in _DUALITIES)
@@ -383,9 +379,7 @@ def is_syntactically_safe(formula: Formula) -> bool:
     return offending_subformula(formula, "safety") is None
 
 
-# ---------------------------------------------------------------------------------------------
-# Truth
-# ---------------------------------------------------------------------------------------------
+# --- Truth -----------------------------------------------------------------------------------
 
 Letter = Collection[str]
 

@@ -35,9 +35,7 @@ from jaxltl.core.logic.simplify import (
 MAX_PARTS = 400  # leaves of a combination beyond which the rewriting is given up
 
 
-# ---------------------------------------------------------------------------------------------
-# Classes
-# ---------------------------------------------------------------------------------------------
+# --- Classes ---------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1 << 14)
@@ -63,9 +61,7 @@ def is_pi2(formula: Formula) -> bool:
     return all(is_pure(node, GREATEST) for node in subformulas(formula) if node.operator in LEAST)
 
 
-# ---------------------------------------------------------------------------------------------
-# Normalisation
-# ---------------------------------------------------------------------------------------------
+# --- Normalisation ---------------------------------------------------------------------------
 
 
 def _outermost(formula: Formula, chosen: Callable[[Formula], bool]) -> Formula | None:
@@ -80,6 +76,10 @@ def _outermost(formula: Formula, chosen: Callable[[Formula], bool]) -> Formula |
             return node
         waiting.extend(node.operands)
     return None
+
+
+def _choice(both: list[Formula], other: Formula) -> Formula:
+    return disjunction([conjunction(both), other])
 
 
 class Rewriter:
@@ -107,29 +107,24 @@ class Rewriter:
             return self._split(fixed, operand, self.limit_often)
         least = _outermost(operand, lambda f: f.operator == "F")
         if least is not None:
-            often = self.limit_often(least.operands[0])
-            return disjunction(
+            return _choice(
                 [
-                    conjunction([often, self.limit_often(replace_all(operand, least, TRUE))]),
-                    self.limit_often(replace_all(operand, least, FALSE)),
-                ]
+                    self.limit_often(least.operands[0]),
+                    self.limit_often(replace_all(operand, least, TRUE)),
+                ],
+                self.limit_often(replace_all(operand, least, FALSE)),
             )
         greatest = _outermost(operand, lambda f: f.operator in GREATEST)
         if greatest is None:
             return whole
-        if greatest.operator == "G":
-            kept, strong = greatest.operands[0], FALSE
-        elif greatest.operator == "W":
-            kept, strong = greatest.operands[0], binary("U", *greatest.operands)
-        else:
+        kept, strong = greatest.operands[0], FALSE
+        if greatest.operator == "W":
+            strong = binary("U", *greatest.operands)
+        elif greatest.operator == "R":
             kept, strong = greatest.operands[1], binary("M", *greatest.operands)
-        return disjunction(
-            [
-                self.limit_often(replace_all(operand, greatest, strong)),
-                conjunction(
-                    [self.limit_ever(kept), self.limit_often(replace_all(operand, greatest, TRUE))]
-                ),
-            ]
+        return _choice(
+            [self.limit_ever(kept), self.limit_often(replace_all(operand, greatest, TRUE))],
+            self.limit_often(replace_all(operand, greatest, strong)),
         )
 
     def limit_ever(self, operand: Formula) -> Formula:
@@ -152,11 +147,9 @@ class Rewriter:
     ) -> Formula:
         """`f[L] = (L & f[true]) | f[false]` for a limit L below an operator."""
         self._spend(operand)
-        return disjunction(
-            [
-                conjunction([self.map_limits(fixed), rebuild(replace_all(operand, fixed, TRUE))]),
-                rebuild(replace_all(operand, fixed, FALSE)),
-            ]
+        return _choice(
+            [self.map_limits(fixed), rebuild(replace_all(operand, fixed, TRUE))],
+            rebuild(replace_all(operand, fixed, FALSE)),
         )
 
     def to_sigma2(self, formula: Formula) -> Formula:
@@ -210,17 +203,13 @@ class Rewriter:
         often = self.limit_often(goal)
         without = always(replace_all(left, least, FALSE))
         weaker = binary("W", replace_all(left, least, weak), right)
-        return disjunction(
-            [
-                conjunction([often, self.to_sigma2(weaker)]),
-                self.to_sigma2(binary("U", left, disjunction([right, without]))),
-            ]
+        return _choice(
+            [often, self.to_sigma2(weaker)],
+            self.to_sigma2(binary("U", left, disjunction([right, without]))),
         )
 
 
-# ---------------------------------------------------------------------------------------------
-# The combination
-# ---------------------------------------------------------------------------------------------
+# --- The combination -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -244,7 +233,7 @@ def combination(
 ) -> Combination:
     """A positive combination of Sigma-2 and Pi-2 formulas and limits."""
     parts = _combine(formula, grouped, dual, Rewriter(steps))
-    if _size(parts) > MAX_PARTS:
+    if len(leaves(parts)) > MAX_PARTS:
         raise ValueError(
             f"to_automaton: the formula falls into more than {MAX_PARTS} parts. Split it into "
             "formulas that are tracked side by side."
@@ -252,23 +241,14 @@ def combination(
     return parts
 
 
-def _size(parts: Combination) -> int:
-    return 1 if isinstance(parts, Part) else sum(_size(part) for part in parts[1:])
+def leaves(parts: Combination) -> list[Part]:
+    """The parts of a combination."""
+    return [parts] if isinstance(parts, Part) else [x for part in parts[1:] for x in leaves(part)]
 
 
 def extent(parts: Combination) -> int:
     """The number of subformulas that a combination tracks, counted for each part."""
-    seen: dict[Formula, int] = {}
-
-    def collect(parts: Combination) -> None:
-        if isinstance(parts, Part):
-            seen[parts.formula] = len(subformulas(parts.formula))
-        else:
-            for part in parts[1:]:
-                collect(part)
-
-    collect(parts)
-    return sum(seen.values())
+    return sum(len(subformulas(formula)) for formula in {part.formula for part in leaves(parts)})
 
 
 def _combine(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Combination:

@@ -5,7 +5,7 @@ Limits, `G F f` and `F G f`, are true now iff they are true later, so they are p
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, negation_normal_form, subformulas
@@ -124,9 +124,7 @@ def _opposite(formula: Formula) -> Formula | None:
     return formula.operands[0] if formula.operator == "!" else None
 
 
-# ---------------------------------------------------------------------------------------------
-# Simplification
-# ---------------------------------------------------------------------------------------------
+# --- Simplification --------------------------------------------------------------------------
 
 
 def is_limit(formula: Formula) -> bool:
@@ -145,13 +143,30 @@ def is_invariant(formula: Formula) -> bool:
 
 def simplify(formula: Formula) -> Formula:
     """An equivalent formula in negation normal form, with limits pulled outwards."""
-    form: dict[Formula, Formula] = {}
-    for node in subformulas(negation_normal_form(formula)):
-        if node.operator in ("true", "false", "ap", "!"):
-            form[node] = node
+    return _rebuilt(negation_normal_form(formula), {}, lambda node: False)
+
+
+def replace_all(formula: Formula, old: Formula, new: Formula) -> Formula:
+    """The formula with every occurrence of a subformula replaced, where that occurs simplified."""
+    occurs = {old}
+    for node in subformulas(formula):
+        if occurs.intersection(node.operands):
+            occurs.add(node)
+    return _rebuilt(formula, {old: new}, lambda node: node not in occurs)
+
+
+def _rebuilt(
+    formula: Formula, form: dict[Formula, Formula], is_kept: Callable[[Formula], bool]
+) -> Formula:
+    """The formula with the forms of some subformulas, simplified above those that are not kept."""
+    for node in subformulas(formula):
+        if node in form:
             continue
-        form[node] = rebuild(node.operator, [form[f] for f in node.operands])
-    return form[subformulas(negation_normal_form(formula))[-1]]
+        if node.operator in ("true", "false", "ap", "!") or is_kept(node):
+            form[node] = node
+        else:
+            form[node] = rebuild(node.operator, [form[f] for f in node.operands])
+    return form[formula]
 
 
 def rebuild(operator: str, operands: list[Formula]) -> Formula:
@@ -252,18 +267,3 @@ def binary(operator: str, left: Formula, right: Formula) -> Formula:
     if right.operator == operator and right.operands[0] == left:
         return right
     return Formula(operator, (left, right))
-
-
-def replace_all(formula: Formula, old: Formula, new: Formula) -> Formula:
-    """The formula with every occurrence of a subformula replaced, simplified."""
-    form: dict[Formula, Formula] = {}
-    for node in subformulas(formula):
-        if node == old:
-            form[node] = new
-        elif node.operator in ("true", "false", "ap", "!"):
-            form[node] = node
-        else:
-            operands = [form[f] for f in node.operands]
-            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-            form[node] = node if same else rebuild(node.operator, operands)
-    return form[formula]

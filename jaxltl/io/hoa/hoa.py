@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import CONDITIONS, Automaton, make_alphabet, make_automaton
+from jaxltl.core.automata.automaton import Automaton, make_alphabet
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.logic.diagram import Cube
@@ -231,16 +231,12 @@ def _automaton(
         delta, priority, initial, base = to_parity(delta, colors, initial, compact)
     # The added sink rejects, even if the condition accepts runs without marks.
     priority[base == (-1 if table.sink is None else table.sink)] = 1
-    kind = acceptance_of(header, delta, priority)
-    marks = CONDITIONS[kind].table
-    return make_automaton(
-        delta,
-        initial,
-        alphabet,
-        names,
-        state_names=[table.names[q] for q in base] if table.names else (),
-        final=priority[:, 0] == 0 if marks == "final" else None,
-        acceptance=kind if marks == "final" else None,
-        accepting=priority == 0 if marks == "accepting" else None,
-        priority=priority if marks == "priority" else None,
+    return Automaton(
+        delta=np.asarray(delta, np.int32),
+        initial=np.asarray(initial, np.int32),
+        priority=np.asarray(priority, np.int32),
+        letters=alphabet,
+        propositions=names,
+        acceptance=acceptance_of(header, delta, priority),
+        state_names=tuple(table.names[q] for q in base) if table.names else (),
     )
