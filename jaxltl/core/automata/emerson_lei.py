@@ -262,7 +262,7 @@ def to_parity(
         return tree, [frozenset(source[list(part)].tolist()) for part in tree.labels]
 
     follow: list[list[int]] = delta.tolist()
-    edges: list[list[int]] = edge.reshape(delta.shape).tolist()
+    edges: list[list[int]] = [row.tolist() for row in edge.reshape(delta.shape)]
     part_of: list[int] = component.tolist()
 
     def entered(state: int) -> tuple[int, int]:

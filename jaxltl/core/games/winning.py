@@ -223,7 +223,7 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     target[random] = host.num_states + np.arange(random.size)
     origin = np.concatenate([np.arange(host.num_states), host.state[random]])
     count = np.concatenate([np.diff(host.row_start), width[random]])
-    action = host.rank if model.action is None else np.asarray(model.action)
+    action = model.rank if model.action is None else np.asarray(model.action)
     split = make_sparse(
         offsets_from_counts(count),
         np.arange(count.sum() + 1),
