@@ -40,7 +40,7 @@ def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
     distance, normal, share = 0.0, np.full(scale.size, 1 / scale.size), np.eye(len(points))[0]
     for _ in range(_ZOOMS):
         size = float(np.abs(ahead[chosen]).max())
-        found = _apart(ahead[chosen] / size) if size > 0 else None
+        found = _apart(ahead[chosen] / size, np.ones(scale.size)) if size > 0 else None
         if found is None:
             break
         distance, normal, share = found[0] * size, found[1], np.zeros(len(points))
@@ -58,14 +58,14 @@ def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
     return Separation(distance, normal / scale, share)
 
 
-def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
-    """The least t with ``sum_i share_i ahead_i >= -t``, the normal of that face, and the shares."""
+def _apart(ahead: Floats, along: Floats) -> tuple[float, Floats, Floats] | None:
+    """The least t with ``sum_i share_i ahead_i >= -t along``, the normal of that face, the shares."""
     from scipy import optimize
 
     count, size = ahead.shape
     found = optimize.linprog(
         np.append(np.zeros(count), 1.0),
-        A_ub=np.hstack([-ahead.T, -np.ones((size, 1))]),
+        A_ub=np.hstack([-ahead.T, -along[:, None]]),
         b_ub=np.zeros(size),
         A_eq=np.append(np.ones(count), 0.0)[None],
         b_eq=[1.0],
@@ -141,25 +141,27 @@ def largest(
     points: Floats,
     half_spaces: tuple[Floats, Floats],
     index: int,
-    least: Floats,
+    thresholds: tuple[Floats, Floats],
     scale: Floats,
     known: Floats | None = None,
 ) -> Largest:
-    """Bounds of the largest value of an objective under thresholds on the others."""
-    count = len(points)
+    """Bounds of the largest value of an objective under thresholds on the others.
+
+    The value of the mixture meets the first ones; no value that meets the second ones is larger.
+    """
+    least, count = thresholds[0], len(points)
     asked = np.flatnonzero(np.isfinite(least))
     lower, share = -np.inf, np.full(count, 1 / count)
     mixtures = _largest_mixtures(points, index, least, asked, scale) if asked.size else []
     if known is not None:
         mixtures.append(np.append(known, np.zeros(count - known.size)))
+    mixtures += list(np.eye(count)[(points[:, asked] >= least[asked]).all(1)])
     for tried in mixtures:
-        value = mixture(points, tried)
+        single = np.count_nonzero(tried) == 1
+        value = points[tried.argmax()] if single else mixture(points, tried)
         if value[index] > lower and meets(points, tried, least):
             lower, share = float(value[index]), tried
-    for i in np.flatnonzero((points[:, asked] >= least[asked]).all(1)):
-        if points[i, index] > lower:
-            lower, share = float(points[i, index]), np.eye(count)[i]
-    upper, vector = _outer(*half_spaces, index, least, asked, scale)
+    upper, vector = _outer(*half_spaces, index, thresholds[1], scale)
     return Largest(lower, share, upper, vector)
 
 
@@ -167,24 +169,13 @@ def _largest_mixtures(
     points: Floats, index: int, least: Floats, asked: Integers, scale: Floats
 ) -> list[Floats]:
     """Candidates for the best mixture under thresholds."""
-    from scipy import optimize
-
-    count = len(points)
-    found = optimize.linprog(
-        -points[:, index] / scale[index],
-        A_ub=-(points[:, asked] / scale[asked]).T,
-        b_ub=-least[asked] / scale[asked],
-        A_eq=np.ones((1, count)),
-        b_eq=[1.0],
-        bounds=[(0, None)] * count,
-        method="highs",
-        options=_EXACT,
-    )
     inner = separation(points[:, asked], least[asked], scale[asked]).share
-    if found.status != 0:
+    kept = np.append(asked, index)
+    ahead = (points - np.where(np.isfinite(least), least, 0))[:, kept] / scale[kept]
+    found = _apart(ahead, np.append(np.zeros(asked.size), 1.0))
+    if found is None:
         return [inner]
-    best = np.maximum(found.x, 0)
-    best /= best.sum()
+    best = found[2]
     # A program is rounded: a small share of an inner point makes up for its error.
     misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
     misses = np.maximum(misses, 0)
@@ -196,15 +187,17 @@ def _largest_mixtures(
 
 
 def _outer(
-    normals: Floats, bounds: Floats, index: int, least: Floats, asked: Integers, scale: Floats
+    normals: Floats, bounds: Floats, index: int, least: Floats, scale: Floats
 ) -> tuple[float, Floats | None]:
+    """Upper bound of an objective within half-spaces, and the vector that attains it."""
     from scipy import optimize
 
+    asked = np.isfinite(least)
     normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
     size = len(scale)
     goal = np.zeros(size)
     goal[index] = -1
-    floor = [(float(least[i] / scale[i]) if i in asked else None, None) for i in range(size)]
+    floor = [(x / s if np.isfinite(x) else None, None) for x, s in zip(least, scale, strict=True)]
     found = optimize.linprog(
         goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT
     )
@@ -216,10 +209,10 @@ def _outer(
     if not normal[index] > 0:
         return np.inf, found.x * scale
     others = np.arange(size) != index
-    needless = others & ~np.isfinite(least)
+    needless = others & ~asked
     if (normal[needless] > 1e-12 * normal[index]).any():
         return np.inf, found.x * scale
-    taken = np.where(others & np.isfinite(least), least, 0)
+    taken = np.where(others & asked, least, 0)
     upper = (bound - normal @ taken) / normal[index]
     slack = (
         8

@@ -34,7 +34,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     at_states,
     product_satisfaction,
 )
-from jaxltl.core.values.engine.state_quantities import solution_from_error
+from jaxltl.core.values.engine.state_quantities import safe_mean, solution_from_error
 
 _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at once
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
@@ -360,11 +360,4 @@ def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[in
 
 def _mean(weight: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
     """Bounds on a mean of numbers between zero and one, rounding included."""
-    slack = (weight.size + 4) * float(np.finfo(np.float64).eps)
-
-    def mean(x: np.ndarray, scale: float) -> float:
-        if (x == x[0]).all():
-            return float(x[0])
-        return float(np.clip(weight @ x / weight.sum() * scale, 0, 1))
-
-    return mean(lower, 1 - slack), mean(upper, 1 + slack)
+    return safe_mean(weight, lower, up=False), safe_mean(weight, upper, up=True, highest=1)

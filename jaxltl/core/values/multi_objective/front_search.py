@@ -6,7 +6,9 @@ policy leaves.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +31,13 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_pr
 from jaxltl.core.values.multi_objective.results import ConstrainedOptimum, Front, NearestMixture
 
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
+
+
+class Thresholds(NamedTuple):
+    """Lower thresholds ``float64[n]``, as doubles that are not easier, and not harder, to meet."""
+
+    hard: np.ndarray
+    easy: np.ndarray
 
 
 class _Sum(NamedTuple):
@@ -178,21 +187,37 @@ class FrontSearch:
             self.product,
         )
 
+    def thresholds(self, given: Sequence[float | Fraction | None]) -> Thresholds:
+        """Thresholds with the signs of the objectives, minus infinity without one."""
+        found = np.full((2, len(given)), -np.inf)
+        for i, (threshold, sign) in enumerate(zip(given, self.signs.tolist(), strict=True)):
+            if threshold is None:
+                continue
+            if not math.isfinite(threshold):
+                raise ValueError(
+                    f"the threshold of objective {i + 1} is {threshold}; give a finite number."
+                )
+            exact = sign * Fraction(threshold)
+            near = float(exact)
+            found[0, i] = near if near >= exact else math.nextafter(near, math.inf)
+            found[1, i] = near if near <= exact else math.nextafter(near, -math.inf)
+        return Thresholds(*found)
+
     def decide(
-        self, wanted: np.ndarray, max_points: int
+        self, wanted: Thresholds, max_points: int
     ) -> tuple[bool | None, np.ndarray | None, int | None]:
         """Decides whether a vector is attained, with a mixture or a half-space as evidence."""
-        looked = 0
+        looked, hard = 0, wanted.hard
         while True:
             for k, known in enumerate(self.solved[looked:], looked):
-                if frontier.exceeds(known.normal, known.bound, wanted):
+                if frontier.exceeds(known.normal, known.bound, wanted.easy):
                     return False, None, k
             lower, looked = self.lower, len(self.solved)
-            for i in np.flatnonzero((lower >= wanted).all(1)):
+            for i in np.flatnonzero((lower >= hard).all(1)):
                 return True, np.eye(looked)[int(i)], None
-            apart = frontier.separation(lower, wanted, self.scale)
+            apart = frontier.separation(lower, hard, self.scale)
             for share in (apart.share, frontier.plain(apart.share)):
-                if frontier.meets(lower, share, wanted):
+                if frontier.meets(lower, share, hard):
                     return True, share, None
             if looked >= max_points or not self.ask_anew(apart.normal):
                 return None, None, None
@@ -220,16 +245,20 @@ class FrontSearch:
         share = apart.share
         if index is not None:
             enough = wanted - (apart.distance + 1e-15) * self.scale
-            found = frontier.largest(lower, self.half_spaces, index, enough, self.scale)
+            found = frontier.largest(lower, self.half_spaces, index, (enough, enough), self.scale)
             share = found.share if np.isfinite(found.lower) else share
-        return nearest_mixture(self.front(), share, self.signs * wanted, self.signs)
+        front, used = self.front(), share > 0
+        low = frontier.mixture(front.lower[used], share[used])
+        high = -frontier.mixture(-front.upper[used], share[used])
+        missed = wanted - self.signs * np.where(self.signs > 0, low, high)
+        return NearestMixture(share, low, high, np.maximum(missed, 0))
 
-    def best(self, index: int, wanted: np.ndarray, max_points: int) -> ConstrainedOptimum:
+    def best(self, index: int, wanted: Thresholds, max_points: int) -> ConstrainedOptimum:
         """The optimal value of one objective under thresholds on the others."""
         sign, tolerance = self.signs[index], self.tolerance
-        enough = wanted.copy()
-        enough[index] = self.lower[:, index].min() - self.scale[index]
-        holds, share, _ = self.decide(enough, max_points)
+        enough = np.array(wanted)
+        enough[:, index] = self.lower[:, index].min() - self.scale[index]
+        holds, share, _ = self.decide(Thresholds(*enough), max_points)
         if holds is False:
             nan = float("nan")
             return ConstrainedOptimum(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
@@ -251,7 +280,7 @@ class FrontSearch:
             return ConstrainedOptimum(
                 (low + high) / 2, low, high, True, known.share, self.front(), status
             )
-        near = self.nearest(wanted, index)
+        near = self.nearest(wanted.hard, index)
         value = float(np.clip((near.lower[index] + near.upper[index]) / 2, low, high))
         return ConstrainedOptimum(
             value, low, high, holds, None, self.front(), Status.PRECISION, near
@@ -287,14 +316,3 @@ class FrontSearch:
             far[i] = held[names[i]].distance
             fresh.add(i)
         return held[names[i]]
-
-
-def nearest_mixture(
-    front: Front, share: np.ndarray, thresholds: np.ndarray, signs: np.ndarray
-) -> NearestMixture:
-    """Bounds of a mixture of a front's policies, and of its misses of thresholds."""
-    used = share > 0
-    lower = frontier.mixture(front.lower[used], share[used])
-    upper = -frontier.mixture(-front.upper[used], share[used])
-    missed = signs * (thresholds - np.where(signs > 0, lower, upper))
-    return NearestMixture(share, lower, upper, np.maximum(missed, 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 
 import numpy as np
 
@@ -39,7 +40,7 @@ __all__ = [
 def achievable(
     model: Model,
     objectives: Sequence[Objective],
-    thresholds: Sequence[float] | None = None,
+    thresholds: Sequence[float | Fraction | None] | None = None,
     *,
     tolerance: float = TOLERANCE,
     max_points: int = 200,
@@ -73,19 +74,18 @@ def achievable(
     """
     _require(model, objectives)
     if thresholds is None:
-        thresholds = [np.nan if o.threshold is None else o.threshold for o in objectives]
+        thresholds = [o.threshold for o in objectives]
     if len(thresholds) != len(objectives) or not np.isfinite(np.asarray(thresholds, float)).all():
         raise ValueError(
             f"thresholds={list(thresholds)}; give one finite number for each of the "
             f"{len(objectives)} objectives."
         )
     search = FrontSearch(model, objectives, tolerance)
-    wanted = search.signs * np.asarray(thresholds, np.float64)
+    wanted = search.thresholds(thresholds)
     holds, share, normal = search.decide(wanted, max_points)
     if holds is None:
-        return Achievable(
-            None, None, None, search.front(), Status.PRECISION, search.nearest(wanted)
-        )
+        near = search.nearest(wanted.hard)
+        return Achievable(None, None, None, search.front(), Status.PRECISION, near)
     return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
 
 
@@ -188,10 +188,5 @@ def multi_objective(
             )
         return pareto(model, objectives, tolerance=max(tolerance, 1e-6), max_points=max_points)
     search = FrontSearch(model, objectives, tolerance)
-    wanted = np.array(
-        [
-            -np.inf if o.threshold is None else s * o.threshold
-            for o, s in zip(objectives, search.signs, strict=True)
-        ]
-    )
+    wanted = search.thresholds([o.threshold for o in objectives])
     return search.best(free[0], wanted, max_points)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class Objective:
     avoid: Array | str | None = None
     reward: Array | str | None = None
     direction: str = "max"
-    threshold: float | None = None
+    threshold: float | Fraction | None = None
 
 
 @brief

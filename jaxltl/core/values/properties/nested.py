@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats
+from jaxltl.core.array_types import Booleans
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
@@ -55,45 +55,44 @@ def with_definitions(
 def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
     """The aggregate of an answer over its states; ``states`` is ``[-1]`` if it is of no single one."""
     kind, count = prop.aggregate, answer.states.size
+    lower, upper, value = answer.lower, answer.upper, answer.value
     if kind == "print":
         return answer
-    lower, upper, value = answer.lower, answer.upper, answer.value
-    if kind == "state":
-        if count != 1:
-            raise ValueError(f"{prop.text}: {count} states satisfy the condition; one must.")
-        kind = "first"
-    if kind in ("first", "min", "max"):
-        place = {"first": 0, "min": int(np.argmin(value)), "max": int(np.argmax(value))}[str(kind)]
-        one = answer._replace(
-            states=answer.states[place : place + 1],
-            value=value[place : place + 1],
-            lower=lower[place : place + 1],
-            upper=upper[place : place + 1],
-            holds=None if answer.holds is None else answer.holds[place : place + 1],
-            strategy=None,
-        )
-        if kind == "first":
-            return one
-        best = np.min if kind == "min" else np.max
-        return _number(prop, one, (best(lower), best(value), best(upper)), tolerance)
+    if kind == "state" and count != 1:
+        raise ValueError(f"{prop.text}: {count} states satisfy the condition; one must.")
+    if kind in ("state", "first"):
+        return _at(answer, 0)
+    if kind in ("min", "max"):
+        place, best = (np.argmin, np.min) if kind == "min" else (np.argmax, np.max)
+        found = best(lower), best(value), best(upper)
+        return _number(prop, _at(answer, int(place(value))), found, tolerance)
     whole = answer._replace(states=np.array([-1]), strategy=None)
     if answer.holds is not None:
         return _truth(whole, kind, answer.holds)
     if kind == "range":
-        ends = np.max(lower) - np.min(upper), np.max(upper) - np.min(lower)
-        bounds = max(0.0, math.nextafter(ends[0], -math.inf)), math.nextafter(ends[1], math.inf)
-        return _number(prop, whole, (bounds[0], np.ptp(value), bounds[1]), tolerance)
+        low, high = np.max(lower) - np.min(upper), np.max(upper) - np.min(lower)
+        ends = max(0.0, math.nextafter(low, -math.inf)), math.nextafter(high, math.inf)
+        return _number(prop, whole, (ends[0], np.ptp(value), ends[1]), tolerance)
     divisor = count if kind == "avg" else 1
-    low, middle, high = (_sum(x, side) for x, side in ((lower, -1), (value, 0), (upper, 1)))
-    if divisor > 1:
-        low, high = math.nextafter(low / count, -math.inf), math.nextafter(high / count, math.inf)
-    return _number(prop, whole, (low, middle / divisor, high), tolerance)
+    # The sum of fsum is the nearest double.
+    low, high = (
+        math.nextafter(math.nextafter(math.fsum(x.tolist()), end) / divisor, end)
+        for x, end in ((lower, -math.inf), (upper, math.inf))
+    )
+    return _number(prop, whole, (low, math.fsum(value.tolist()) / divisor, high), tolerance)
 
 
-def _sum(values: Floats, side: int) -> float:
-    """The sum, rounded down (-1) or up (1): that of fsum is the nearest double."""
-    total = math.fsum(values.tolist())
-    return math.nextafter(total, side * math.inf) if side else total
+def _at(answer: Answer, place: int) -> Answer:
+    """The answer at one of its states."""
+    one = slice(place, place + 1)
+    return answer._replace(
+        states=answer.states[one],
+        value=answer.value[one],
+        lower=answer.lower[one],
+        upper=answer.upper[one],
+        holds=None if answer.holds is None else answer.holds[one],
+        strategy=None,
+    )
 
 
 def _truth(answer: Answer, kind: str | None, holds: list[bool | None]) -> Answer:
