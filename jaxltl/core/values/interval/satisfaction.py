@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.interval import IntervalMDP
@@ -58,24 +59,15 @@ def robust_satisfaction(
     tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
     """Robust satisfaction probability of a task in an interval MDP; labels are read on exit."""
-    model, system = world_of(model)
+    world, system = world_of(model)
     asked = width_asked(tolerance)
-    automaton, letter = automaton_and_letters(model.nominal, task)
-    states = starting_states(model, states)
-    yes, no = universal_states(automaton), ~live_states(automaton)
-    initial = np.broadcast_to(automaton.initial, states.shape)
-    numbered, delta = _numbered(model), np.asarray(automaton.delta)
-    product, host = _uncertain(
-        model,
-        sparse_product(numbered, delta, letter, (states, initial), on_entry=False, still=yes | no),
+    automaton, letter = automaton_and_letters(world.nominal, task)
+    states = starting_states(world, states)
+    start = states, np.broadcast_to(automaton.initial, states.shape)
+    product, host, verdicts = _product(
+        world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
-    priority = None
-    if not automaton.has_final_states:
-        source = product.memory, letter[product.base_state]
-        priority = np.asarray(automaton.priority)[source]
     moves = None if system is None else system[product.base_state]
-    q = product.memory
-    verdicts = _Verdicts(yes[q], no[q], priority, automaton.is_safety)
     found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
     row = product.base_row[found.row].astype(np.int32)
     solution = solution_at(found, product.start, product.start.shape, row, asked)
@@ -103,30 +95,19 @@ def robust_product_satisfaction(
             "world by with_allowed(world, rows)."
         )
     asked = width_asked(tolerance)
-    world: IntervalMDP = model.mdp
-    task, letter, shape = model.automaton, np.asarray(model.letter), model.state_shape
-    delta, priority = np.asarray(task.delta), np.asarray(task.priority)
-    yes, no = universal_states(task), ~live_states(task)
+    shape = model.state_shape
     state, memory = (x.ravel() for x in np.indices(shape))
-    on_entry = model.label_on == "entry"
-    product, host = _uncertain(
-        world, sparse_product(_numbered(world), delta, letter, (state, memory), on_entry=on_entry)
+    product, host, verdicts = _product(
+        model.mdp,
+        model.automaton,
+        np.asarray(model.letter),
+        (state, memory),
+        on_entry=model.label_on == "entry",
+        is_absorbing=False,
     )
-    pair: Integers = np.arange(product.memory.size)
-    level = None
-    if not task.has_final_states:
-        level = priority[product.memory, letter[product.base_state]]
-        if on_entry:
-            mdp = host.mdp
-            read = priority[
-                product.memory[mdp.state[mdp.row]], letter[product.base_state[mdp.successor]]
-            ]
-            host, level, pair = _reading(host, read)
     sides = host_sides(host, None, objective, nature)
     if policy is not None:
         sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
-    q = product.memory[pair]
-    verdicts = _Verdicts(yes[q], no[q], level, task.is_safety)
     found = _solved(sides, host, verdicts, asked)
     if policy is not None:
         solution = solution_at(found, product.start, shape, np.asarray(policy), asked)
@@ -135,6 +116,36 @@ def robust_product_satisfaction(
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     found = replace(found, probability=found.probability[: product.host.num_transitions])
     return solution_at(found, product.start, shape, policy, asked)
+
+
+def _product(
+    world: IntervalMDP,
+    automaton: Automaton,
+    letter: Integers,
+    start: tuple[Integers, Integers],
+    *,
+    on_entry: bool,
+    is_absorbing: bool,
+) -> tuple[SparseProduct, UncertainMDP, _Verdicts]:
+    """The product, its uncertain MDP, and the verdicts of its states, which may be absorbing."""
+    yes, no = universal_states(automaton), ~live_states(automaton)
+    still = yes | no if is_absorbing else None
+    delta, priority = np.asarray(automaton.delta), np.asarray(automaton.priority)
+    numbered = sparse_product(
+        _numbered(world), delta, letter, start, on_entry=on_entry, still=still
+    )
+    product, host = _uncertain(world, numbered)
+    pair: Integers = np.arange(product.memory.size)
+    level: Integers | None = None
+    if not automaton.has_final_states:
+        level = priority[product.memory, letter[product.base_state]]
+        if on_entry:
+            mdp = host.mdp
+            memory = product.memory[mdp.state[mdp.row]]
+            read = priority[memory, letter[product.base_state[mdp.successor]]]
+            host, level, pair = _reading(host, read)
+    q = product.memory[pair]
+    return product, host, _Verdicts(yes[q], no[q], level, automaton.is_safety)
 
 
 def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:

@@ -9,7 +9,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct, validation
+from jaxltl.core import struct
+from jaxltl.core.validation import float_array
 from jax import lax
 
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
@@ -38,7 +39,7 @@ from jaxltl.core.values.interval.contest import (
     rounding,
     system,
 )
-from jaxltl.core.values.interval.robust import interval_reward, nature_direction, width_asked
+from jaxltl.core.values.interval.robust import interval_reward, nature_direction
 from jaxltl.core.values.engine.state_quantities import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
@@ -248,25 +249,17 @@ def solve_prepared_interval(
     max_steps: chex.Array | int = 100,
 ) -> Solution:
     """Solution of a prepared question about an interval model, see `solve_prepared`."""
-    shape = prepared.lower.shape
+    dtype = prepared.lower.dtype
     lower, upper, reward = (
-        None
-        if x is None
-        else jnp.asarray(
-            x if is_traced(x) else validation.float_array(name, x), prepared.lower.dtype
-        )
+        None if x is None else jnp.asarray(x if is_traced(x) else float_array(name, x), dtype)
         for name, x in (("lower", lower), ("upper", upper), ("reward", reward))
     )
-    if not is_traced(max_steps):
-        max_steps = validation.integer("max_steps", max_steps, most=2**31 - 1)
-    if tolerance is not None and not is_traced(tolerance):
-        tolerance = width_asked(tolerance)
     for name, ends in (("lower", lower), ("upper", upper)):
         if ends is not None:
-            require_shape(name, ends, shape)
+            require_shape(name, ends, prepared.lower.shape)
     require_prepared_reward(prepared.reward, reward)
     if tolerance is None:
-        tolerance = 1e-6 if prepared.lower.dtype == jnp.float64 else 1e-3
+        tolerance = 1e-6 if dtype == jnp.float64 else 1e-3
     return _solve(prepared, lower, upper, reward, tolerance, max_steps)
 
 

@@ -80,7 +80,10 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
         raise ValueError(f"{prop.text}: the model has no intervals from which nature could pick.")
     objective = _objective(model, prop)
     starts = _starts(model)
-    states = np.asarray(on_host(_pick(model, starts, model.number)))
+    states = np.asarray(on_host(_pick(model, model.number, starts)))
+    shape: tuple[int, ...] = model.state_shape
+    index: tuple[jax.Array, ...] = (starts,)
+    advance: Callable[[Bounds, float, int], Solution]
     if path.operator == "F" and is_boolean(path.operands[0]):
         holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
         target = jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
@@ -91,21 +94,16 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
                 return _reach_for(model, target, start, half, np.int32(steps), objective)
             return _earn_until(model, reward, target, 2 * half, objective)
 
-        return Question(
-            prop,
-            states,
-            model.state_shape,
-            advance,
-            lambda x: np.asarray(on_host(_pick(model, starts, x)), np.float64),
-        )
-    both = product(model, path)
-    return Question(
-        prop,
-        states,
-        both.state_shape,
-        partial(_satisfy, both, objective),
-        lambda x: np.asarray(on_host(_pick_memory(both, starts, x)), np.float64),
-    )
+    else:
+        both = product(model, path)
+        shape, advance = both.state_shape, partial(_satisfy, both, objective)
+        memory = _everywhere(model, lambda x, i: x.initial_memory[i], both, starts)
+        index = starts, memory
+
+    def taken(quantity: jax.Array) -> np.ndarray:
+        return np.asarray(on_host(_pick(model, quantity, *index)), np.float64)
+
+    return Question(prop, states, shape, advance, taken)
 
 
 def _path(prop: Property) -> Formula:
@@ -164,7 +162,7 @@ def _starts(model: ShardedMDP) -> jax.Array:
     """Positions of the initial states in order; on every device."""
     number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
     found = _everywhere(model, lambda x: jnp.flatnonzero(x > 0, size=number), model.initial)
-    order = np.argsort(on_host(_pick(model, found, model.number)), kind="stable")
+    order = np.argsort(on_host(_pick(model, model.number, found)), kind="stable")
     return _everywhere(model, lambda x: x[order], found)
 
 
@@ -175,14 +173,8 @@ def _everywhere(model: ShardedMDP, function: Callable[..., jax.Array], *given: P
     return found
 
 
-def _pick(model: ShardedMDP, places: jax.Array, quantity: jax.Array) -> jax.Array:
-    return _everywhere(model, lambda x, i: x[i], quantity, places)
-
-
-def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.Array:
-    return _everywhere(
-        both.mdp, lambda model, i, x: x[i, model.initial_memory[i]], both, places, quantity
-    )
+def _pick(model: ShardedMDP, quantity: jax.Array, *index: jax.Array) -> jax.Array:
+    return _everywhere(model, lambda x, *i: x[i], quantity, *index)
 
 
 @jit("objective")
