@@ -37,6 +37,7 @@ import numpy as np
 from flax import linen as nn
 
 from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common.actor_critic import summed_layers
 from jaxltl.algos.common.learner import Best, stop_early
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
@@ -77,7 +78,7 @@ class ConvolutionalPolicy(nn.Module):
         x = observation.reshape(-1, *self.observation_shape)
         for features in self.kernels:
             x = nn.relu(nn.Conv(features, (2, 2), padding="VALID")(x))
-        return _dense_layers(self, x.reshape(*rows, -1), memory)
+        return summed_layers(self, (x.reshape(*rows, -1), memory), (*self.hidden, self.num_actions))
 
 
 class DensePolicy(nn.Module):
@@ -91,22 +92,7 @@ class DensePolicy(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array, memory: jax.Array) -> jax.Array:
-        return _dense_layers(self, observation, memory)
-
-
-def _dense_layers(
-    module: ConvolutionalPolicy | DensePolicy, seen: jax.Array, memory: jax.Array
-) -> jax.Array:
-    """Scores by (observation, memory); the first layer is a sum of one for each."""
-    widths = (*module.hidden, module.num_actions)
-    inputs = seen.shape[-1] + memory.shape[-1]
-    kernel = module.param("kernel", nn.initializers.lecun_normal(), (inputs, widths[0]))
-    bias = module.param("bias", nn.initializers.zeros_init(), (widths[0],))
-    above, below = jnp.split(kernel, [seen.shape[-1]])
-    x = seen @ above + (memory @ below + bias)
-    for width in widths[1:]:
-        x = nn.Dense(width)(nn.relu(x))
-    return x
+        return summed_layers(self, (observation, memory), (*self.hidden, self.num_actions))
 
 
 # --- the learner's data --------------------------------------------------------------------------

@@ -41,11 +41,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import linen as nn
 from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common.actor_critic import summed_layers
 from jaxltl.algos.common.learner import Best, stop_early
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
@@ -69,8 +69,7 @@ class RewardNetwork(nn.Module):
     """A multilayer perceptron with ReLU on (observation, memory, action).
 
     Maps ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, to
-    ``float[...]``. The first layer is a sum of three, so that no input is repeated for each
-    combination with the others.
+    ``float[...]``.
 
     Attributes:
       hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
@@ -80,19 +79,7 @@ class RewardNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
-        widths = (*self.hidden, 1)
-        inputs = (observation, memory, action)
-        sizes = [x.shape[-1] for x in inputs]
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
-        bias = self.param("bias", nn.initializers.zeros_init(), (widths[0],))
-        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
-        terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
-        x = terms[0] + (terms[1] + terms[2] + bias)
-        rows = x.shape[:-1]
-        x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
-        for width in widths[1:]:
-            x = nn.Dense(width)(nn.relu(x))
-        return x.reshape(rows)
+        return summed_layers(self, (observation, memory, action), (*self.hidden, 1))[..., 0]
 
 
 class Concatenated(nn.Module):

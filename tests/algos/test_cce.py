@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import cce
-from jaxltl.algos.cce import Hparams, Polynomial, _elites
+from jaxltl.algos.cce import Hparams, Polynomial
 from jaxltl.algos.cce import exponential_family as ef
+from jaxltl.algos.cce import state as elites_of
 from jaxltl.algos.common.schedules import theorem_conditions
 from jaxltl.core.types import Status
 from tests.support import counted_traces, lane
@@ -67,8 +68,8 @@ def found(given, hparams=None, num_steps=60, seed=0, **options):
 
 # --- elites and weights -----------------------------------------------------------------------
 
-select = jax.jit(_elites.select, static_argnames="num")
-elite_weights = jax.jit(_elites.elite_weights, static_argnames="weighting")
+select = jax.jit(elites_of.select, static_argnames="num")
+elite_weights = jax.jit(elites_of.elite_weights, static_argnames="weighting")
 
 
 def slow_elites(objective, cost, limit, k, scale=1.0):
@@ -88,7 +89,7 @@ def test_elites_are_those_of_the_algorithm():
     likely = [0.05, 0.25, 0.15, 0.15, 0.3, 0.05, 0.05]
     cases = set()
     for num_costs in (1, 3):
-        choose = jax.jit(partial(_elites.select, num=5))
+        choose = jax.jit(partial(elites_of.select, num=5))
         limit, scale = np.zeros(num_costs), np.arange(1.0, num_costs + 1)
         for _ in range(150):
             objective = rng.choice(choices, 12, p=likely)
@@ -164,7 +165,7 @@ def test_weights_of_none_and_of_infinite_objectives():
 def test_the_number_of_elites_is_not_off_by_one():
     for percent in range(1, 100):
         for n in range(1, 200):
-            assert _elites.num_elites(percent / 100, n) == -(-percent * n // 100)
+            assert elites_of.num_elites(percent / 100, n) == -(-percent * n // 100)
 
 
 @pytest.mark.parametrize("share", [None, 0.4])
@@ -210,7 +211,7 @@ def test_later_samples_are_masked():
     objective, cost = map(np.asarray, jax.jit(jax.vmap(lambda v: quadratic(v, None)))(x))
     for num in (7, 12):
         elites, enough = slow_elites(
-            objective[:num], cost[:num, None], 1.0, _elites.num_elites(0.3, num)
+            objective[:num], cost[:num, None], 1.0, elites_of.num_elites(0.3, num)
         )
         weight = np.exp(objective[elites]) if enough else np.ones(len(elites))
         expected = 0.1 * weight @ np.asarray(x)[elites] / weight.sum()

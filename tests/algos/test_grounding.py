@@ -13,13 +13,13 @@ from jax.flatten_util import ravel_pytree
 import jaxltl as jl
 from jaxltl.algos import grounding, mlirl
 from jaxltl.algos.grounding.hypotheses import letters_of, step_log_likelihood
-from jaxltl.algos.grounding.likelihood import (
+from jaxltl.algos.grounding.problem import (
+    event_reward,
     forward,
     letter_log_probability,
     memory_log_moves,
     motive,
 )
-from jaxltl.algos.grounding.problem import event_reward
 from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.envs.gridworld import gridworld
 

@@ -41,38 +41,41 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos.cce import exponential_family as families
-from jaxltl.algos.cce._elites import (
-    Pool,
-    Sample,
-    better,
-    elite_weights,
-    num_elites,
-    rows_of,
-    select,
-)
-from jaxltl.algos.cce.assessment import Assessment, Result, assess, require_run, result
 from jaxltl.algos.cce.state import (
     WEIGHTINGS,
     Hparams,
     Metrics,
     Problem,
+    Sample,
     State,
+    better,
+    elite_weights,
     evaluate_all,
+    excess_of,
     make_problem,
+    num_elites,
+    rows_of,
+    scores,
+    select,
 )
 from jaxltl.algos.common import learner
-from jaxltl.algos.common.schedules import SLACK, Polynomial as Polynomial, at, is_schedule
-from jaxltl.core import validation
+from jaxltl.algos.common.schedules import Polynomial as Polynomial, SLACK, at, is_schedule
+from jaxltl.algos.common.settings import require_own
+from jaxltl.core import struct, validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import require_key
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, require_shape
 from jaxltl.core.validation import Range
+
 
 __all__ = [
     "WEIGHTINGS",
@@ -101,33 +104,24 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     _check(problem, hparams)
     require_key(key)
     point = families.center(problem.family)
-    dtype = point.dtype
-
-    def sample(objective: float, excess: float) -> Sample:
-        return Sample(
-            jnp.zeros_like(point),
-            jnp.asarray(objective, dtype),
-            jnp.full_like(problem.limit, jnp.nan),
-            jnp.asarray(excess, dtype),
-            jnp.bool_(False),
-        )
-
+    none = Sample(
+        jnp.zeros_like(point),
+        jnp.asarray(-jnp.inf, point.dtype),
+        jnp.full_like(problem.limit, jnp.nan),
+        jnp.asarray(jnp.inf, point.dtype),
+        jnp.bool_(False),
+    )
     elites = None
     if hparams.elite_reuse:
         num = num_elites(hparams.rho, hparams.population)
-        elites = Pool(
-            jnp.zeros((num, *point.shape), dtype),
-            jnp.zeros(num, dtype),
-            jnp.zeros((num, *problem.limit.shape), dtype),
-            jnp.zeros(num, bool),
-        )
+        elites = jax.tree.map(lambda x: jnp.zeros((num, *x.shape), x.dtype), none)
     zero = jnp.int32(0)
     return State(
         key=key,
         step=zero,
         family=problem.family,
-        best=sample(-jnp.inf, jnp.inf),
-        least=sample(jnp.nan, jnp.inf),
+        best=none,
+        least=replace(none, objective=none.objective * jnp.nan),
         elites=elites,
         num_evaluated=zero,
         num_invalid=zero,
@@ -145,26 +139,27 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     samples = draw(state.family, draw_key, hparams.population)
     objective, cost = evaluate_all(problem, hparams, samples, evaluate_key)
     num_samples, count = _sizes(hparams, state.step)
-    fresh = Pool(samples, objective, cost, jnp.arange(hparams.population) < num_samples)
+    active = jnp.arange(hparams.population) < num_samples
+    limit = problem.limit - hparams.margin
+    excess = excess_of(cost, limit, problem.scale)
+    fresh = Sample(samples, objective, cost, excess, active)
     pool = fresh
     if hparams.elite_reuse:
         pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
     chosen = select(
-        jnp.where(pool.active, pool.objective, jnp.inf),
+        jnp.where(pool.found, pool.objective, jnp.inf),
         pool.cost,
-        problem.limit - hparams.margin,
+        limit,
         num=num_elites(hparams.rho, hparams.population),
         count=count,
         scale=problem.scale,
     )
-    elites = replace(rows_of(pool, chosen.index), active=chosen.taken)
+    elites = replace(rows_of(pool, chosen.index), found=chosen.taken)
     rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)
     family = _moved(state, hparams, fresh, elites, chosen.enough_feasible, rate)
     family, restarted = _restarted(family, problem, hparams)
 
-    feasible, usable, excess = (
-        x[: hparams.population] for x in (chosen.feasible, chosen.usable, chosen.excess)
-    )
+    feasible, usable = (x[: hparams.population] for x in (chosen.feasible, chosen.usable))
     invalid = num_samples - jnp.sum(usable)
     fine = jnp.any(usable)
     for x in jax.tree.leaves(family):
@@ -173,8 +168,8 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         state,
         step=state.step + 1,
         family=family,
-        best=better(state.best, fresh, excess, feasible, objective, state.best.objective),
-        least=better(state.least, fresh, excess, usable, -excess, -state.least.excess),
+        best=better(state.best, fresh, feasible, objective, state.best.objective),
+        least=better(state.least, fresh, usable, -excess, -state.least.excess),
         elites=elites if hparams.elite_reuse else None,
         num_evaluated=learner.saturating_add(state.num_evaluated, num_samples),
         num_invalid=learner.saturating_add(state.num_invalid, invalid),
@@ -203,8 +198,7 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The mean policy ``float[D]`` of the last distribution, which :func:`result` evaluates again."""
-    require_run(problem, hparams)
-    validation.instance("state", state, State, "one of cce.init or cce.train")
+    require_own((state, State), (problem, Problem), (hparams, Hparams))
     return families.center(state.family)
 
 
@@ -220,22 +214,27 @@ def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _moved(
-    state: State, hparams: Hparams, fresh: Pool, elites: Pool, enough: jax.Array, rate: jax.Array
+    state: State,
+    hparams: Hparams,
+    fresh: Sample,
+    elites: Sample,
+    enough: jax.Array,
+    rate: jax.Array,
 ) -> PyTree:
     """The distribution after (4.14) and the options that add variance."""
     weights = elite_weights(
         elites.objective,
-        elites.active,
+        elites.found,
         enough,
         weighting=hparams.weighting,
         temperature=hparams.temperature,
     )
-    some = jnp.any(elites.active)
+    some = jnp.any(elites.found)
     samples, total = elites.parameters, rate
     if hparams.sample_share is not None:
         share = (1 - rate) * at(hparams.sample_share, state.step)
         total = jnp.asarray(rate + share, rate.dtype)
-        own = fresh.active / jnp.sum(fresh.active, dtype=rate.dtype)
+        own = fresh.found / jnp.sum(fresh.found, dtype=rate.dtype)
         samples = jnp.concatenate([samples, fresh.parameters])
         weights = jnp.concatenate([rate * weights, share * own])
     weights = jnp.where(some, weights, 1)
@@ -255,7 +254,7 @@ def _restarted(family: PyTree, problem: Problem, hparams: Hparams) -> tuple[PyTr
 
 
 def _require_state(state: State, problem: Problem) -> None:
-    validation.instance("state", state, State, "one of cce.init or cce.train")
+    require_own((state, State))
     found, own = (families.center(x.family).shape for x in (state, problem))
     if found != own or state.best.cost.shape != problem.limit.shape:
         raise ValueError(
@@ -265,7 +264,7 @@ def _require_state(state: State, problem: Problem) -> None:
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
-    require_run(problem, hparams)
+    require_own((problem, Problem), (hparams, Hparams))
     if hparams.rho * hparams.population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite; "
@@ -285,3 +284,170 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         raise ValueError(
             f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding."
         )
+
+
+@struct.dataclass
+class Assessment:
+    """A policy with fresh evaluations.
+
+    Attributes:
+      parameters: ``float[D]``.
+      objective: ``float[]``, mean over the evaluations.
+      cost: ``float[C]``, likewise; the estimate of H.
+      lower, upper: ``float[C]``, a 95% confidence interval of each cost (Student's t); of length zero
+        for a constant cost.
+      excess: ``float[]``, ``max_c (cost_c - limit_c) / scale_c``.
+      feasible: ``bool[]``, whether every cost is at most its limit.
+      confident: ``bool[]``, whether every `upper` is.
+    """
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    excess: jax.Array
+    feasible: jax.Array
+    confident: jax.Array
+
+
+@brief
+class Result(NamedTuple):
+    """The solution of a search, by fresh evaluations.
+
+    Attributes:
+      solution: ``float[D]``, the feasible one of `mean` and `best` with the higher objective; None if
+        neither is feasible.
+      solution_name: ``"mean"`` or ``"best"``, or None.
+      mean: the mean policy of the last distribution.
+      best: the best feasible sample, or without any, the sample of the least violation.
+      violation: the least `excess` of the two; at most 0 if there is a solution.
+      num_evaluations: of each.
+      message: one sentence.
+    """
+
+    solution: jax.Array | None
+    solution_name: str | None
+    mean: Assessment
+    best: Assessment
+    violation: float
+    num_evaluations: int
+    message: str
+
+
+def assess(
+    problem: Problem, parameters: jax.Array, key: Key, *, num_evaluations: int = 1000
+) -> Assessment:
+    """The :class:`Assessment` of a policy `parameters`, ``float[D]``, on fresh evaluations.
+
+    With `num_evaluations`, at least 2, static, of a `problem` with keys of a fresh `key`; for ``jit``
+    and ``vmap``; not differentiable.
+
+    Raises:
+      ValueError: fewer than two evaluations, or arguments of another search.
+    """
+    num_evaluations = validation.integer("num_evaluations", num_evaluations, most=2**31 - 1)
+    if num_evaluations < 2:
+        raise ValueError(
+            f"num_evaluations={num_evaluations}; a confidence interval needs at least 2."
+        )
+    require_own((problem, Problem))
+    shape = families.center(problem.family).shape
+    if not hasattr(parameters, "dtype") or jnp.shape(parameters) != shape:
+        raise ValueError(
+            f"parameters is {validation.shorten(parameters)}; give those of one policy, float{[*shape]}, "
+            "such as cce.policy(state, problem, hparams). Many are a vmap."
+        )
+    return _assessed(problem, parameters, require_key(key), num_evaluations)
+
+
+@partial(jax.jit, static_argnames="num_evaluations")
+def _assessed(
+    problem: Problem, parameters: jax.Array, key: Key, num_evaluations: int
+) -> Assessment:
+    from scipy.special import stdtrit
+
+    keys = jax.random.split(key, num_evaluations)
+    objective, cost = jax.vmap(partial(scores, problem), (None, 0))(parameters, keys)
+    objective, (mean, deviation) = _moments(objective)[0], _moments(cost)
+    margin = float(stdtrit(num_evaluations - 1, 0.975)) / math.sqrt(num_evaluations) * deviation
+    known = jnp.isfinite(mean)
+    lower, upper = (jnp.where(known, mean + s * margin, s * jnp.inf) for s in (-1, 1))
+    real = objective < jnp.inf  # and no NaN
+    return Assessment(
+        parameters=parameters,
+        objective=objective,
+        cost=mean,
+        lower=lower,
+        upper=upper,
+        excess=excess_of(mean, problem.limit, problem.scale),
+        feasible=real & (mean <= problem.limit).all(),
+        confident=real & (upper <= problem.limit).all(),
+    )
+
+
+def _moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation; a constant's are exact."""
+    offset = x - x[0]
+    mean = jnp.mean(offset, axis=0)
+    deviation = jnp.sqrt(jnp.sum(jnp.square(offset - mean), axis=0) / (len(x) - 1))
+    return jnp.where(jnp.isfinite(x[0]), x[0] + mean, jnp.mean(x, axis=0)), deviation
+
+
+def result(
+    state: State, problem: Problem, hparams: Hparams, key: Key, *, num_evaluations: int = 1000
+) -> Result:
+    """The :class:`Result` of a search: the mean policy and the best sample on fresh evaluations.
+
+    On the host, of the `state`, `problem` and `hparams` of one run, with `num_evaluations` of each policy by
+    keys of a fresh `key`.
+
+    Raises:
+      ValueError: the last step had no usable sample, a batch of states, or arguments of another search.
+    """
+    require_own((state, State), (problem, Problem), (hparams, Hparams))
+    require_key(key)
+    if jnp.ndim(state.step):
+        raise ValueError(
+            f"state holds a batch of {np.shape(state.step)} runs; take one: "
+            "jax.tree.map(lambda x: x[i], state)."
+        )
+    if int(state.status) == Status.NONFINITE:
+        raise ValueError(
+            f"step {int(state.step) - 1}: evaluate returned NaN for all samples "
+            f"({int(state.num_invalid)} of {int(state.num_evaluated)} in the run). Look for NaN in "
+            "the rollout or in the parameters that are drawn."
+        )
+    keys = jax.random.split(key)
+    sampled = state.best if bool(state.best.found) else state.least
+    look = partial(assess, problem, num_evaluations=num_evaluations)
+    both = {
+        "mean": look(families.center(state.family), keys[0]),
+        "best": look(sampled.parameters, keys[1]),
+    }
+    if not bool(sampled.found):  # no step was made
+        both["best"] = both["mean"]
+    feasible = [name for name in both if bool(both[name].feasible)]
+    name = max(feasible, key=lambda n: float(both[n].objective), default=None)
+    violation = float(np.fmin.reduce([float(a.excess) for a in both.values()]))
+    if name is None:
+        seen = "" if bool(state.best.found) else " and no sample was"
+        message = (
+            f"No feasible policy: neither the mean nor the best sample is feasible on "
+            f"{num_evaluations} fresh evaluations{seen}; the least violation is {violation:.4g}."
+        )
+    else:
+        sure = "" if bool(both[name].confident) else ", but the interval reaches beyond a limit"
+        message = (
+            f"The {name} policy is feasible on {num_evaluations} fresh evaluations{sure}; its "
+            f"objective is {float(both[name].objective):.6g}."
+        )
+    return Result(
+        None if name is None else both[name].parameters,
+        name,
+        both["mean"],
+        both["best"],
+        violation,
+        num_evaluations,
+        message,
+    )

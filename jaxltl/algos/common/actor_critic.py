@@ -124,6 +124,35 @@ class _Layers(nn.Module):
         return dense(self.outputs, self.last_scale, "out")(x)
 
 
+def summed_layers(
+    module: nn.Module, inputs: Sequence[jax.Array], widths: Sequence[int]
+) -> jax.Array:
+    """A perceptron with ReLU, in a `module`, of the concatenation of `inputs` that broadcast.
+
+    Layers have the given `widths`; the first one is a sum of one for each input, so that no input is
+    repeated for each combination with the others.
+
+    >>> class Sum(nn.Module):
+    ...     @nn.compact
+    ...     def __call__(self, x, y):
+    ...         return summed_layers(self, (x, y), (4, 1))
+    >>> read = jnp.zeros((5, 1, 3)), jnp.zeros((2, 6))
+    >>> jax.eval_shape(Sum().init_with_output, jax.random.key(0), *read)[0].shape
+    (5, 2, 1)
+    """
+    sizes = [x.shape[-1] for x in inputs]
+    kernel = module.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
+    bias = module.param("bias", nn.initializers.zeros_init(), (widths[0],))
+    parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
+    first, *others = (x @ part for x, part in zip(inputs, parts, strict=True))
+    x = first + sum(others, bias)
+    rows = x.shape[:-1]
+    x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
+    for width in widths[1:]:
+        x = nn.Dense(width)(nn.relu(x))
+    return x.reshape(*rows, widths[-1])
+
+
 def action_parameters(module: nn.Module, layer: Callable[[int], jax.Array]) -> PyTree:
     """The logits of a network `module`, or mean and log standard deviation, by a `layer` of outputs.
 

@@ -15,11 +15,6 @@ from jaxltl.algos.grounding.automaton_search import (
     LearnedAutomaton as LearnedAutomaton,
     learn_automaton as learn_automaton,
 )
-from jaxltl.algos.grounding.clusters import (
-    cluster_meanings as cluster_meanings,
-    fit_labels as fit_labels,
-    network_labels as network_labels,
-)
 from jaxltl.algos.grounding.history import (
     HistoryTables as HistoryTables,
     fit_history as fit_history,
@@ -36,7 +31,10 @@ from jaxltl.algos.grounding.learner import (
     Metrics as Metrics,
     Objective as Objective,
     State as State,
+    cluster_meanings as cluster_meanings,
+    fit_labels as fit_labels,
     init as init,
+    network_labels as network_labels,
     objective as objective,
     policy as policy,
     run as run,
@@ -45,11 +43,11 @@ from jaxltl.algos.grounding.learner import (
     train as train,
     train_until as train_until,
 )
-from jaxltl.algos.grounding.likelihood import motive_policy as motive_policy
 from jaxltl.algos.grounding.problem import (
     Hparams as Hparams,
     LinearGrounding as LinearGrounding,
     Problem as Problem,
     event_reward as event_reward,
     make_problem as make_problem,
+    motive_policy as motive_policy,
 )

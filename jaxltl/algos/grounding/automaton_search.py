@@ -2,7 +2,7 @@
 
 What is visible in each state is known, and so are the letters; the task is not, except its number of
 memory states. A candidate is a table ``delta`` and a set of events, transitions that are rewarded; its
-likelihood is that of :mod:`jaxltl.algos.grounding.likelihood`. The search starts from the likeliest
+likelihood is that of :mod:`jaxltl.algos.grounding.problem`. The search starts from the likeliest
 sequences of letters, which end or repeat, and changes one transition at a time, as long as the likelihood
 minus a penalty for each transition that moves the memory increases.
 

@@ -4,7 +4,7 @@ In mode z a demonstrator draws actions from ``pi_z(a | h_t) ~ exp(Q_z(s_t, a) + 
 action values of a reward that is linear in features, and evidence of the history ``h_t``, such as the
 logarithms of :mod:`count tables <jaxltl.algos.grounding.history>` (a log-linear pool). After a step in
 s the mode moves with probability ``M_s(z, z')`` (as in Ke et al. 2025). The likelihood sums over all mode
-paths by the forward recursion of :mod:`jaxltl.algos.grounding.likelihood`: the product of the
+paths by the forward recursion of :mod:`jaxltl.algos.grounding.problem`: the product of the
 probabilities of each action given the past. It is differentiated implicitly through
 :func:`~jaxltl.core.values.discounted.soft.soft_value`; many random starts are a ``vmap``.
 
@@ -34,8 +34,7 @@ from numpy.typing import ArrayLike
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.settings import Number, static, traced
 from jaxltl.algos.grounding.learner import State as State
-from jaxltl.algos.grounding.likelihood import NEVER, forward
-from jaxltl.algos.grounding.problem import joined_demonstrations
+from jaxltl.algos.grounding.problem import NEVER, forward, joined_demonstrations
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models import MDP, Trajectories

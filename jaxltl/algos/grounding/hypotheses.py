@@ -33,8 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common.settings import Number
-from jaxltl.algos.grounding.likelihood import certain_memory, motive_log_policy
-from jaxltl.algos.grounding.problem import Hparams, Problem
+from jaxltl.algos.grounding.problem import Hparams, Problem, certain_memory, motive_log_policy
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata import Automaton, is_equivalent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -87,12 +87,12 @@ def make_problem(
     reward = np.asarray(reward, float)
     shape = game.mdp.probability.shape
     require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
-    joint = _joint_game(game, spec, start_distribution(game, start))
-    played = _merge_successors(joint.game)
-    observed = check_reward(joint.game, reward[joint.base_state])
-    accepting = to_jax(joint.accepting)
+    joint, accepting, base_state, memory = _joint_game(game, spec, start_distribution(game, start))
+    played = _merge_successors(joint)
+    observed = check_reward(joint, reward[base_state])
+    accepting = to_jax(accepting)
     region = solve(played, buchi(played, accepting)).region
-    _require_start_in(region, joint)
+    _require_start_in(region, joint, base_state, memory)
     problem = Problem(
         game=played,
         reward=observed,
@@ -102,41 +102,34 @@ def make_problem(
         environment=jnp.zeros(()),
         start=played.initial,
         start_table=to_jax(cumulative(np.asarray(played.initial, float))),
-        base_state=to_jax(joint.base_state.astype(np.int32)),
-        memory=to_jax(joint.memory.astype(np.int32)),
+        base_state=to_jax(base_state.astype(np.int32)),
+        memory=to_jax(memory.astype(np.int32)),
     )
     rows = _environment_rows(problem, game, environment, discount)
     return replace(problem, environment=to_jax(np.asarray(rows, played.dtype)))
 
 
-@dataclass(frozen=True)
-class _JointGame:
-    """An explicit game, its accepting states, and the origin of each state."""
-
-    game: Game
-    accepting: NDArray[np.bool_]
-    base_state: NDArray[np.integer]
-    memory: NDArray[np.integer]
-
-
 def _joint_game(
     game: Game, spec: ArrayLike | Parity | Automaton | Formula | str, start: NDArray[np.float64]
-) -> _JointGame:
-    """The given game, or the reachable part of its product with an automaton."""
+) -> tuple[Game, NDArray[np.bool_], NDArray[np.integer], NDArray[np.integer]]:
+    """The given game, or the reachable part of its product with an automaton.
+
+    With the accepting states, and the game's and the automaton's state of each state.
+    """
     game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
     if isinstance(spec, Automaton | Formula | str):
         joint, objective = task_game(game, spec)
         part = restrict(joint)
         base, memory = np.asarray(part.base_state), np.asarray(part.memory)
         number = jnp.asarray(base * joint.state_shape[1] + memory)
-        return _JointGame(part.model, _accepting(objective_at(objective, number)), base, memory)
+        return part.model, _accepting(objective_at(objective, number)), base, memory
     if isinstance(spec, Parity):
         accepting = _accepting(spec)
     else:
         accepting = np.asarray(spec)
         require_shape("spec", accepting, (game.num_states,))
     base = np.arange(game.num_states)
-    return _JointGame(game, accepting.astype(bool), base, np.zeros_like(base))
+    return game, accepting.astype(bool), base, np.zeros_like(base)
 
 
 def _accepting(objective: Parity) -> NDArray[np.bool_]:
@@ -170,14 +163,15 @@ def _safe_actions(game: Game, region: jax.Array) -> jax.Array:
     return inside & (~game.system[:, None] | forall_successor(game, region))
 
 
-def _require_start_in(region: jax.Array, joint: _JointGame) -> None:
+def _require_start_in(
+    region: jax.Array, joint: Game, base_state: NDArray[np.integer], memory: NDArray[np.integer]
+) -> None:
     """Raises ValueError naming initial states outside of the winning region."""
-    outside = np.flatnonzero((np.asarray(joint.game.initial) > 0) & ~np.asarray(region))
+    outside = np.flatnonzero((np.asarray(joint.initial) > 0) & ~np.asarray(region))
     if outside.size == 0:
         return
     named = ", ".join(
-        f"{joint.base_state[i]}"
-        + (f" (automaton state {joint.memory[i]})" if joint.memory.any() else "")
+        f"{base_state[i]}" + (f" (automaton state {memory[i]})" if memory.any() else "")
         for i in outside[:5]
     ) + (", ..." if outside.size > 5 else "")
     raise ValueError(

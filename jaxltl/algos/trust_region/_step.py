@@ -143,7 +143,7 @@ def direction(
     # divergence is as promised.
     gram = natural @ jax.vmap(damped)(natural).T
     delta = jnp.asarray(hparams.delta, flat.dtype)
-    limit: tuple[Numeric, ...] = (0.0, 0.0, -1.0)  # that no step breaks
+    limit: tuple[Numeric, Numeric, Numeric] = (0.0, 0.0, -1.0)  # that no step breaks
     if hparams.method == "cpo":
         limit = ((gram[0, 1] + gram[1, 0]) / 2, gram[1, 1], excess)
     dual, weights = cpo_step(gram[0, 0], *limit, delta)
