@@ -159,7 +159,7 @@ def test_a_key_without_a_stated_default_is_an_error(text):
     class Training(Table):
         steps: Key[Count | None, text] = None
 
-    (key,) = schema.keys_of(Training)
+    (key,) = site_files.keys_of(Training)
     with pytest.raises(ValueError, match="steps lacks a text, a default or an example"):
         site_files.entry(Training, key)
 
@@ -171,4 +171,4 @@ def test_the_example_of_a_type():
         own: Key[Count, "Own.", "7"] = 3
         nothing: Key[str | None, "Nothing."] = None
 
-    assert [key.example for key in schema.keys_of(Training)] == ["0.95", "7", ""]
+    assert [key.example for key in site_files.keys_of(Training)] == ["0.95", "7", ""]

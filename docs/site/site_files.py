@@ -2,11 +2,13 @@
 
 import dataclasses
 import re
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args, get_origin
+
+import attrs
 
 from jaxltl.algos import cce, mlirl, ppo, todirl, trust_region
 from jaxltl.app.files import game, schema, task_environment, task_grounding, task_mlirl, task_todirl
-from jaxltl.app.files.schema import File, KeyHelp, Table
+from jaxltl.app.files.schema import File, Table
 
 
 class FilePage(NamedTuple):
@@ -78,6 +80,47 @@ class Entry(NamedTuple):
     meaning: str
 
 
+class KeyHelp(NamedTuple):
+    """Entry of a key in the reference: name, requirement on values, default, help, an example."""
+
+    name: str
+    requirement: str
+    default: Any
+    help: str
+    example: str
+
+
+def keys_of(kind: type[Table]) -> list[KeyHelp]:
+    """The keys of a table in the order of the schema; a required key has the default ``...``."""
+    entries = []
+    for field in schema._fields(kind):
+        value, default = field.type, field.default
+        if default is attrs.NOTHING:
+            default = ...
+        elif hasattr(default, "factory"):
+            default = default.factory()
+        texts = [x for x in getattr(value, "__metadata__", ()) if isinstance(x, str)] or [""]
+        about, example = [*texts, _example(value, default)][:2]
+        entries.append(
+            KeyHelp(schema.key_name(field), schema.requirement(value), default, about, example)
+        )
+    return entries
+
+
+def _example(kind: object, default: object) -> str:
+    """Example of a type: of its requirement, or an option that is not the default."""
+    for part in schema._parts(kind):
+        for meta in getattr(part, "__metadata__", ()):
+            if isinstance(meta, schema.Meta) and (meta.example or "such as " in meta.title):
+                return meta.example or meta.title.partition("such as ")[2].partition(", with")[0]
+        if get_origin(part) is Literal:
+            options = get_args(part)
+            return f'"{next((x for x in options if x != default), options[0])}"'
+        if part is bool:
+            return "true"
+    return ""
+
+
 def tables(file: type[File]) -> dict[str, tuple[type[Table], bool]]:
     """Tables of a file by name, and whether each is required."""
     found = {}
@@ -89,12 +132,12 @@ def tables(file: type[File]) -> dict[str, tuple[type[Table], bool]]:
 
 def file_keys(file: type[File]) -> list[KeyHelp]:
     """Keys of a file outside of its tables."""
-    return [key for key in schema.keys_of(file) if key.name not in tables(file)]
+    return [key for key in keys_of(file) if key.name not in tables(file)]
 
 
 def table_keys(table: type[Table]) -> list[KeyHelp]:
     """Keys of a table that a file may have."""
-    keys = schema.keys_of(table)
+    keys = keys_of(table)
     return [key for key in keys if not key.requirement.startswith("left out")]
 
 

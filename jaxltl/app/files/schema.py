@@ -26,7 +26,6 @@ from typing import (
     Self,
     TypeVar,
     Union,
-    cast,
     dataclass_transform,
     get_args,
     get_origin,
@@ -297,50 +296,3 @@ def requirement(kind: object) -> str:
         if part in names or get_origin(part) in names:
             return names[part if part in names else get_origin(part)]
     return "left out"
-
-
-class KeyHelp(NamedTuple):
-    """Entry of a key in the reference: name, requirement on values, default, help, an example."""
-
-    name: str
-    requirement: str
-    default: Any
-    help: str
-    example: str
-
-
-def keys_of(schema: type[Table]) -> list[KeyHelp]:
-    """The keys of a table in the order of the schema; a required key has the default ``...``.
-
-    Example:
-      >>> @table
-      ... class Training(Table):
-      ...     steps: Key[Count, "Largest number of steps."] = 500
-      >>> keys_of(Training)[0].default, keys_of(Training)[0].help
-      (500, 'Largest number of steps.')
-    """
-    entries = []
-    for field in _fields(schema):
-        kind, default = field.type, cast(Any, field.default)
-        if default is attrs.NOTHING:
-            default = ...
-        elif hasattr(default, "factory"):
-            default = default.factory()
-        texts = [x for x in getattr(kind, "__metadata__", ()) if isinstance(x, str)] or [""]
-        about, example = [*texts, _example(kind, default)][:2]
-        entries.append(KeyHelp(key_name(field), requirement(kind), default, about, example))
-    return entries
-
-
-def _example(kind: object, default: object) -> str:
-    """Example of a type: of its requirement, or an option that is not the default."""
-    for part in _parts(kind):
-        for meta in getattr(part, "__metadata__", ()):
-            if isinstance(meta, Meta) and (meta.example or "such as " in meta.title):
-                return meta.example or meta.title.partition("such as ")[2].partition(", with")[0]
-        if get_origin(part) is Literal:
-            options = get_args(part)
-            return f'"{next((x for x in options if x != default), options[0])}"'
-        if part is bool:
-            return "true"
-    return ""
