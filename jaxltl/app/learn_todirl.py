@@ -259,9 +259,8 @@ def learn(setup: Setup, training: Training) -> Outcome:
         lane = replace(one_seed(learned, chosen), parameters=parameters)
         learned, chosen = _weighed(setup, problem, hparams, lane, seed), 0
     training.stage("checking")
-    judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
-    test = judged.part(slice(count, None)) if count < len(judged.status) else None
-    return Outcome(setup, learned, chosen, judged.part(slice(count)), test, training.seed)
+    judged = _judge(setup, learned, network, hparams, chosen)
+    return Outcome(setup, learned, chosen, judged, training.seed)
 
 
 def _train(
@@ -467,13 +466,13 @@ def save(out: Path, outcome: Outcome) -> None:
         for stale in out.glob(pattern):
             stale.unlink()
     save_reward(out / "network.npz", learned_reward(outcome))
-    worlds = outcome.setup.training
-    for w, scene in enumerate(worlds.scenes):
+    worlds, judged = outcome.setup.worlds, outcome.judged
+    for w, scene in enumerate(worlds.scenes[: outcome.setup.num_training]):
         size = scene.mdp.num_states
         model = replace(part_of(worlds.model, w), mdp=scene.mdp)
         model = replace(model, letter=model.letter[:size])
-        policy = outcome.training.policy[w][..., :size, :, :]
-        value = outcome.training.performance["learned"].value[w, :size]
+        policy = judged.policy[w][..., :size, :, :]
+        value = judged.performance["learned"].value[w, :size]
         save_policy(
             out / f"policy_{w + 1}.npz",
             project_policy(model, policy, actions=ACTIONS),

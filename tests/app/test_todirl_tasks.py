@@ -124,10 +124,10 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
     few = ("steps = 40", "steps = 2"), ("[task]", "[task]\nsteps_factor = 1.1")
     setup = prepared(write(*few, ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
     outcome = job.learn(setup, Training(0, 1))
-    assert (outcome.training.quick_share > 0).all()
+    assert (outcome.judged.quick_share[: setup.num_training] > 0).all()
     summary = job.summary(outcome)
     worlds = [x for kind in ("training", "test") for x in summary[kind]["expected_steps"]["worlds"]]
-    policies = [*outcome.training.policy, *outcome.test.policy]
+    policies = outcome.judged.policy
     for w, (world, policy) in enumerate(zip(worlds, policies, strict=True)):
         found = satisfaction_steps(part_of(setup.worlds.model, w), policy)
         assert world["quickest"] is not None or w == 2
@@ -288,18 +288,17 @@ def learned(path, seed=0):
 def check_reached(outcome, asked, over):
     """In every world that counts it has what was asked, and no more than the share gives it."""
     setup, mixed = outcome.setup, 0
-    judged = [(outcome.training, w, w) for w in range(setup.num_training)]
-    judged += [(outcome.test, i, setup.num_training + i) for i in range(2)]
-    for judgement, i, w in judged:
+    judged = outcome.judged
+    for w in range(setup.num_training + 2):
         model = own(setup, w)
-        policy = judgement.policy[i][: model.mdp.num_states]
+        policy = judged.policy[w][: model.mdp.num_states]
         np.testing.assert_allclose(policy.sum(-1), 1)
         value, _ = evaluate(model, policy)
         reached, _ = at_starts(model, value, over)
-        assert judgement.attained[i] == pytest.approx(reached, abs=1e-9)
+        assert judged.attained[w] == pytest.approx(reached, abs=1e-9)
         assert reached >= asked - 1e-12
-        share = judgement.share[i]
-        assert share == 0 or asked <= judgement.attained[i] <= asked + WINDOW
+        share = judged.share[w]
+        assert share == 0 or asked <= judged.attained[w] <= asked + WINDOW
         mixed += share > 0
     return mixed
 
@@ -325,7 +324,9 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     scene = outcome.setup.worlds.scenes[1]
     _, solution = plan_in(reward, scene.mdp, scene.observation)
     np.testing.assert_allclose(
-        solution.policy, outcome.test.policy[0][: scene.mdp.num_states], atol=1e-6
+        solution.policy,
+        outcome.judged.policy[outcome.setup.num_training][: scene.mdp.num_states],
+        atol=1e-6,
     )
     scene = outcome.setup.worlds.scenes[3]
     with pytest.raises(ValueError, match=r"guarantee = 0.85: the best .* is 0 .*least from state"):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.app.files.scenes import Scene
 from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
@@ -28,7 +29,7 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app.todirl.results import Outcome, Setup, counted_worlds, part_of
 from jaxltl.app.todirl.results import summary
 from jaxltl.app.wording import Record, Result, many
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -221,13 +222,16 @@ def _caption_of_curves(outcome: Outcome) -> str:
 class _Drawn:
     """A world that is drawn: its index, file stem, title, and demonstrations."""
 
-    worlds: Worlds
-    judged: Judged
+    outcome: Outcome
     w: int
     stem: str
     title: str
     arrows: bool
     demonstrations: Trajectories | None
+
+    @property
+    def scene(self) -> Scene:
+        return self.outcome.setup.worlds.scenes[self.w]
 
     @property
     def live(self) -> str:
@@ -249,39 +253,40 @@ class _Drawn:
     @property
     def policy(self) -> np.ndarray:
         """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
-        return self.judged.policy[self.w][..., : self.worlds.scenes[self.w].mdp.num_states, :, :]
+        return self.outcome.judged.policy[self.w][..., : self.scene.mdp.num_states, :, :]
 
     @property
     def value(self) -> np.ndarray:
         """``[S]``: the satisfaction probability from an initial state."""
-        size = self.worlds.scenes[self.w].mdp.num_states
-        return np.asarray(self.judged.performance["learned"].value[self.w])[:size]
+        value = self.outcome.judged.performance["learned"].value[self.w]
+        return np.asarray(value)[: self.scene.mdp.num_states]
 
 
 def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
-    setup, training, test = outcome.setup, outcome.setup.training, outcome.setup.test
+    setup, mean = outcome.setup, np.asarray(outcome.judged.performance["learned"].mean)
 
-    def title(worlds: Worlds, judged: Judged, w: int) -> str:
-        mean = float(judged.performance["learned"].mean[w])
-        return f"{worlds.scenes[w].name} ({mean:.4f})"
+    def drawn(w: int, kind: str, stem: str, arrows: bool, shown: Trajectories | None) -> _Drawn:
+        title = f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
+        return _Drawn(outcome, w, stem, title, arrows, shown)
 
-    judged = outcome.training
     for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
-        text = f"Training world: {title(training, judged, w)}"
-        yield _Drawn(training, judged, w, f"training_{w + 1}", text, True, shown)
-    if test is not None and outcome.test is not None:
-        for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
-            text = f"Test world, {rank}: {title(test, outcome.test, w)}"
-            yield _Drawn(test, outcome.test, w, f"test_{n + 1}", text, n == 0, None)
+        yield drawn(w, "Training world", f"training_{w + 1}", True, shown)
+    # The test worlds of least, median and greatest satisfaction probability, each once.
+    counted = counted_worlds(setup)
+    if order := counted[np.argsort(mean[counted], kind="stable")].tolist():
+        ranks = {"best": order[-1], "median": order[len(order) // 2], "worst": order[0]}
+        named = {w: rank for rank, w in ranks.items()}
+        for n, (w, rank) in enumerate(reversed(named.items())):
+            yield drawn(w, f"Test world, {rank}", f"test_{n + 1}", n == 0, None)
 
 
 def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
-    setup, scene = outcome.setup, one.worlds.scenes[one.w]
+    setup, scene = outcome.setup, one.scene
     names = _memory_names(setup)
     layers = {str(q): Layer(name, None, one.moving[:, q]) for q, name in names.items()}
     starts = np.asarray(scene.mdp.initial) > 0
     layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
-    model = part_of(one.worlds.model, one.w)
+    model = part_of(setup.worlds.model, one.w)
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
     place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return Explorer(
@@ -300,19 +305,9 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
     )
 
 
-def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
-    """The test worlds of least, median and greatest satisfaction probability."""
-    counted = np.flatnonzero(counted_worlds(setup))
-    mean = np.asarray(judged.performance["learned"].mean)
-    order = counted[np.argsort(mean[counted], kind="stable")]
-    ranks = {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
-    first = {int(w): rank for rank, w in reversed(ranks.items())}
-    return [(rank, int(w)) for rank, w in ranks.items() if first[int(w)] == rank]
-
-
 def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     """Pictures of a world: its policy, and trajectories."""
-    setup, scene, caption = outcome.setup, one.worlds.scenes[one.w], one.caption
+    setup, scene, caption = outcome.setup, one.scene, one.caption
     names, moving = _memory_names(setup), one.moving
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
@@ -365,5 +360,5 @@ def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     if setup.memory is not setup.judge:
         policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge))
         count = len(setup.judge.delta)  # the formula's automaton state varies fastest
-    found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)
+    found = learned_runs(part_of(setup.worlds.judged, one.w), policy, outcome.seed)
     return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]

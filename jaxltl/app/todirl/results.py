@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import EllipsisType
 from typing import TypeVar
@@ -43,11 +43,6 @@ class Worlds:
     def names(self) -> list[str]:
         return [scene.name for scene in self.scenes]
 
-    def part(self, chosen: slice) -> Worlds:
-        """Some of the worlds."""
-        arrays = part_of((self.model, self.judged, self.observation), chosen)
-        return Worlds(self.scenes[chosen], *arrays)
-
 
 def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
     """Part of arrays along their first axis, as NumPy arrays, which need no compilation."""
@@ -86,15 +81,12 @@ class Setup:
         return not isinstance(self.asked, str)
 
     @property
-    def training(self) -> Worlds:
-        return self.worlds.part(slice(self.num_training))
-
-    @property
-    def test(self) -> Worlds | None:
-        """The test worlds, or None."""
-        if len(self.worlds.scenes) == self.num_training:
-            return None
-        return self.worlds.part(slice(self.num_training, None))
+    def groups(self) -> dict[str, slice]:
+        """The training worlds and, if there are any, the test worlds."""
+        groups = {"training": slice(self.num_training)}
+        if len(self.worlds.scenes) > self.num_training:
+            groups["test"] = slice(self.num_training, None)
+        return groups
 
 
 @dataclass(frozen=True)
@@ -126,12 +118,6 @@ class Judged:
     steps: np.ndarray | None = None
     quick_share: np.ndarray | None = None
 
-    def part(self, chosen: slice) -> Judged:
-        """The part for some of the worlds."""
-        each = part_of(self.performance, chosen)
-        held = part_of((self.share, self.attained, self.steps, self.quick_share), chosen)
-        return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen], *held)
-
 
 @dataclass
 class Outcome:
@@ -140,15 +126,15 @@ class Outcome:
     setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
     chosen: int  # index of the kept seed, by held-out likelihood or loss
-    training: Judged  # training, test: evaluations (test: None without test worlds)
-    test: Judged | None
+    judged: Judged  # in all worlds
     seed: int  # the first seed
 
 
 def counted_worlds(setup: Setup) -> np.ndarray:
-    """``bool[W]``: the test worlds that count."""
-    names = setup.worlds.names[setup.num_training :]
-    return np.array([name not in setup.task.left_out for name in names])
+    """Indices of the test worlds that count."""
+    names = enumerate(setup.worlds.names)
+    counted = [w for w, x in names if w >= setup.num_training and x not in setup.task.left_out]
+    return np.array(counted, int)
 
 
 # --- summary ---------------------------------------------------------------------------------
@@ -156,14 +142,7 @@ def counted_worlds(setup: Setup) -> np.ndarray:
 
 def summary(outcome: Outcome) -> Record:
     """The result as a JSON object."""
-    setup, task, count = outcome.setup, outcome.setup.task, outcome.setup.num_training
-    bounds, leave_out = setup.bounds or [], task.left_out
-    infeasible = np.array(
-        [
-            np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
-            for w in range(len(setup.worlds.scenes))
-        ]
-    )
+    setup, task = outcome.setup, outcome.setup.task
     pairs = [int(np.sum(shown.length)) for shown in setup.demonstrations]
     result = {
         **about(task),
@@ -189,12 +168,9 @@ def summary(outcome: Outcome) -> Record:
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
-        "training": _about_worlds(
-            setup.training, outcome.training, infeasible[:count], (), bounds[:count]
-        ),
-        "test": outcome.test
-        and setup.test
-        and _about_worlds(setup.test, outcome.test, infeasible[count:], leave_out, bounds[count:]),
+        "training": None,
+        "test": None,
+        **{kind: _about_worlds(outcome, part) for kind, part in setup.groups.items()},
         **_about_learning(outcome),
         "network": {
             "file": "network.npz",
@@ -211,7 +187,8 @@ def summary(outcome: Outcome) -> Record:
 
 def _about_learning(outcome: Outcome) -> Record:
     """The final figures and the history of the kept seed, and figures of all."""
-    learned, history, i = outcome.learned, outcome.learned.history, outcome.chosen
+    setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
+    history, seeds, counted = learned.history, outcome.judged.seeds, counted_worlds(setup)
     return {
         "learning": {
             **{k: history[k][-1][i] for k in ("loss", "neg_log_likelihood", "gradient_norm")},
@@ -221,7 +198,7 @@ def _about_learning(outcome: Outcome) -> Record:
             "steps": learned.num_steps,
             "solver": Status(int(history["status"][:, i].max())).name,
             "solver_error": history["error"][:, i].max(),
-            "hyperparameters": outcome.setup.task.learner.hyperparameters(),
+            "hyperparameters": setup.task.learner.hyperparameters(),
         },
         "history": {
             "step": history["step"],
@@ -233,24 +210,21 @@ def _about_learning(outcome: Outcome) -> Record:
             "kept": i,
             "held_out": learned.held_out,
             "best_step": learned.best_step,
-            "training_mean": outcome.training.seeds.mean(axis=1),
-            "test_mean": (
-                outcome.test and outcome.test.seeds[:, counted_worlds(outcome.setup)].mean(axis=1)
-            ),
+            "training_mean": seeds[:, : setup.num_training].mean(axis=1),
+            "test_mean": seeds[:, counted].mean(axis=1) if counted.size else None,
         },
     }
 
 
-def _about_worlds(
-    worlds: Worlds,
-    judged: Judged,
-    infeasible: np.ndarray,
-    leave_out: Sequence[str],
-    bounds: Sequence[StepBound],
-) -> Record:
-    found: Record = {"num_worlds": len(worlds.scenes)}
+def _about_worlds(outcome: Outcome, part: slice) -> Record:
+    setup, judged = outcome.setup, outcome.judged
+    scenes, names = setup.worlds.scenes[part], setup.worlds.names[part]
+    models = part_of(setup.worlds.judged, part)
+    infeasible = [int(infeasible_starts(part_of(models, w)).sum()) for w in range(len(names))]
+    leave_out = setup.task.left_out if part.start else ()
+    found: Record = {"num_worlds": len(scenes)}
     for who, performance in judged.performance.items():
-        mean = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
+        mean = summarize(models, part_of(performance, part), names=names, leave_out=leave_out)
         found[who] = {
             "mean": enclosure(mean.mean, mean.lower, mean.upper),
             "std": mean.std,
@@ -260,33 +234,36 @@ def _about_worlds(
         }
         found["infeasible"], found["left_out"] = list(mean.infeasible), list(mean.left_out)
         found["num_counted"] = mean.num_worlds
-    if judged.steps is not None:
+    if judged.steps is not None and judged.quick_share is not None:
+        bounds, steps = (setup.bounds or [])[part], judged.steps[part]
         least = np.array([b.quickest.steps.upper for b in bounds])
         possible = np.isfinite(least) & (least > 0)
-        w = int(np.argmax(np.where(possible, judged.steps[:, 2], 0) / np.where(possible, least, 1)))
+        w = int(np.argmax(np.where(possible, steps[:, 2], 0) / np.where(possible, least, 1)))
         found["expected_steps"] = {
             "factor": bounds[w].factor,
-            "mixed": int((judged.quick_share > 0).sum()) if judged.quick_share is not None else 0,
-            "worst_world": worlds.names[w],
-            "learned": judged.steps[w, 0],
-            "learned_bounds": judged.steps[w, 1:],
+            "mixed": int((judged.quick_share[part] > 0).sum()),
+            "worst_world": names[w],
+            "learned": steps[w, 0],
+            "learned_bounds": steps[w, 1:],
             "quickest": bounds[w].quickest.steps.value,
             "quickest_bounds": bounds[w].quickest.steps[1:3],
             "worlds": [
-                {"name": name, "steps": steps, "quickest": bound.quickest.steps.value}
-                for name, steps, bound in zip(worlds.names, judged.steps, bounds, strict=True)
+                {"name": name, "steps": each, "quickest": bound.quickest.steps.value}
+                for name, each, bound in zip(names, steps, bounds, strict=True)
             ],
         }
-    found["solver"] = Status(int(judged.status.max())).name
+    found["solver"] = Status(int(judged.status[part].max())).name
+    first = part.start or 0
     found["worlds"] = [
-        _about_world(scene, judged, w, int(infeasible[w])) for w, scene in enumerate(worlds.scenes)
+        {**_about_world(scene, judged, first + w), "infeasible_starts": infeasible[w]}
+        for w, scene in enumerate(scenes)
     ]
     return found
 
 
-def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> Record:
+def _about_world(scene: Scene, judged: Judged, w: int) -> Record:
     one = part_of(judged.performance["learned"], w)
-    return {
+    found = {
         "name": scene.name,
         "mean": enclosure(one.mean, one.lower, one.upper),
         "minimum": {
@@ -297,10 +274,7 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> Recor
         "expert": judged.performance["expert"].mean[w],
         "random": judged.performance["random"].mean[w],
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
-        "infeasible_starts": infeasible,
-        **{
-            key: x[w]
-            for key, x in (("share", judged.share), ("attained", judged.attained))
-            if x is not None
-        },
     }
+    if judged.share is not None and judged.attained is not None:
+        found |= {"share": judged.share[w], "attained": judged.attained[w]}
+    return found
