@@ -30,12 +30,12 @@ from jaxltl.core.values.multi_objective.multi_objective import (
 )
 from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
 from jaxltl.app.wording import Record
+from jaxltl.io.templates import render
 
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
 _PROGRESS_SECONDS = 5.0
-SHOWN = 10  # initial states with printed values
 MAX_FILE = 2**24  # bytes of a property file
 
 SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
@@ -61,10 +61,17 @@ class Result:
     fault: int = SOLVED  # NOT_CONVERGED for the solver, INVALID for the property
 
     @property
+    def status(self) -> str:
+        """The name of the status of the answer or of its lack."""
+        if self.answer is not None:
+            return Status(self.answer.status).name
+        return "MAX_STEPS" if self.fault == NOT_CONVERGED else "INVALID"
+
+    @property
     def exit_status(self) -> int:
         if self.answer is None:
             return self.fault
-        return SOLVED if self.answer.status == Status.CONVERGED else NOT_CONVERGED
+        return SOLVED if self.status == "CONVERGED" else NOT_CONVERGED
 
 
 def parse_queries(arguments: Sequence[str], definitions: Definitions | None = None) -> list[Query]:
@@ -247,22 +254,19 @@ def result_entry(result: Result) -> Record:
     """Answer to a property, as a JSON object."""
     found = result.answer
     none = dict.fromkeys(("value", "lower", "upper"))
-    entry: Record = {"property": result.query.text, **none, "status": "INVALID"}
+    entry: Record = {"property": result.query.text, **none, "status": result.status}
     if result.query.parsed is not None and result.query.parsed.name is not None:
         entry["name"] = result.query.parsed.name
     if isinstance(found, Answer):
         entry |= {
             "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
             **{key: _over_states(getattr(found, key).tolist()) for key in ("lower", "upper")},
-            "status": found.status.name,
             "method": found.method,
         }
         if found.states.size > 1:
             entry["states"] = found.states.tolist()
     elif found is not None:
         entry |= _several_entry(found)
-    elif result.fault == NOT_CONVERGED:
-        entry["status"] = "MAX_STEPS"
     if result.error is not None:
         entry["error"] = result.error
     return entry | {"seconds": result.seconds}
@@ -270,9 +274,9 @@ def result_entry(result: Result) -> Record:
 
 def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> Record:
     """A multi-objective answer: achievability, optimum, or points of the Pareto curve."""
-    entry: Record = {"status": Status(found.status).name}
     if isinstance(found, Pareto):
-        return entry | {"value": found.points.tolist(), "gap": _number(float(found.gap))}
+        return {"value": found.points.tolist(), "gap": _number(float(found.gap))}
+    entry: Record = {}
     if found.nearest is not None:
         near = {key: getattr(found.nearest, key).tolist() for key in ("lower", "upper", "gap")}
         entry["nearest"] = {key: _over_states(values) for key, values in near.items()}
@@ -296,55 +300,8 @@ def _number(x: object) -> Any:
 
 def text(result: Result) -> str:
     """Answer to a property, as text."""
-    lines = [result.query.text]
-    parsed, found = result.query.parsed, result.answer
-    if parsed is not None and parsed.name is not None:
-        lines[0] = f'"{parsed.name}": {lines[0]}'
-    if result.error is not None:
-        lines.append("  " + result.error.replace("\n", "\n  "))
-    if found is None:
-        return "\n".join(lines)
-    status = "" if found.status == Status.CONVERGED else f", {Status(found.status).name}"
-    if not isinstance(found, Answer):
-        return "\n".join([*lines, *_several_text(found), f"  {result.seconds:.3f} s{status}"])
-    for i, state in enumerate(found.states[:SHOWN].tolist()):
-        where = f"state {state}: " if found.states.size > 1 else ""
-        lines.append(f"  {where}{_value_text(found, i)}")
-    if found.states.size > SHOWN:
-        lines.append(f"  and {found.states.size - SHOWN} more initial states")
-    how = f", {found.method}" if found.method else ""
-    lines.append(f"  {result.seconds:.3f} s{how}{status}")
-    return "\n".join(lines)
-
-
-def _several_text(found: Achievable | ConstrainedOptimum | Pareto) -> list[str]:
-    if isinstance(found, Pareto):
-        head = f"  {len(found.points)} points, whose convex hull is the curve up to {found.gap:.1e}"
-        return [head, *("  " + ", ".join(f"{x:.9g}" for x in p) for p in found.points.tolist())]
-    if isinstance(found, ConstrainedOptimum) and found.holds:
-        return [f"  {found.value!r}, in [{found.lower!r}, {found.upper!r}]"]
-    verdict = {True: "true", False: "false", None: "not decided"}[found.holds]
-    lines = [f"  the thresholds can be met: {verdict}"]
-    if found.nearest is not None:
-        near = found.nearest
-        lines += [
-            f"  attained: in [{low!r}, {high!r}]"
-            + (f", at most {gap:.1e} short of what is asked" if gap else "")
-            for low, high, gap in zip(
-                near.lower.tolist(), near.upper.tolist(), near.gap.tolist(), strict=True
-            )
-        ]
-    return lines
-
-
-def _value_text(found: Answer, i: int) -> str:
-    lower, upper = (float(x[i]) for x in (found.lower, found.upper))
-    within = f"exactly {lower!r}" if lower == upper else f"in [{lower!r}, {upper!r}]"
-    if found.holds is None:
-        value = float(found.value[i])
-        return f"{value!r}, {within}" if lower != upper else f"{value!r}, exactly"
-    verdict = {True: "true", False: "false", None: "not decided"}[found.holds[i]]
-    return f"{verdict}: the value is {within}"
+    lines = render("jaxltl.app.reports", "solve.txt", result=result, found=result.answer)
+    return lines.rstrip("\n")
 
 
 # --- strategies -------------------------------------------------------------------------------
