@@ -37,23 +37,18 @@ _as_json = click.option(
 )
 
 
-def _say(text: str) -> None:
-    """Prints a line of progress to standard error."""
-    click.echo(text, err=True)
+def _begin(text: str, process: int = 0) -> Callable[[str], None]:
+    """Prints the first line, before slow imports, and returns the function that prints others.
 
+    Both print to standard error, and nothing in other processes than the first.
+    """
 
-def _begin(text: str) -> None:
-    """Prints the first line, before slow imports."""
-    _say(_first_line(text))
+    def say(line: str) -> None:
+        if process == 0:
+            click.echo(line, err=True)
 
-
-def _first_line(text: str) -> str:
-    return f"jaxltl {jaxltl.__version__}: {text}"
-
-
-def _say_once(launch: processes.Launch) -> Callable[[str], None]:
-    """:func:`_say` in the first of several processes, and nothing in others."""
-    return _say if launch.process == 0 else lambda text: None
+    say(f"jaxltl {jaxltl.__version__}: {text}")
+    return say
 
 
 def _print_json(result: object) -> None:
@@ -104,8 +99,7 @@ def learn(
     of which is started with the same arguments; see docs/devices.md.
     """
     launch = processes.launched(devices)
-    say = _say_once(launch)
-    say(_first_line(f"learning from {task_file}"))
+    say = _begin(f"learning from {task_file}", launch.process)
     # No subprocesses of several processes: they could outlive them.
     apart = compilation.is_fresh() and launch.processes == 1
     # First, so that matplotlib is imported in the background.
@@ -378,8 +372,7 @@ def solve(
     """
     constants, max_states, method = reading["constants"], reading["max_states"], reading["method"]
     launch = processes.launched(devices)
-    say = _say_once(launch)
-    say(_first_line(f"solving {model_file}"))
+    say = _begin(f"solving {model_file}", launch.process)
     options = (
         ("--strategy", strategy, False),
         ("--relative", reading["relative"] or None, False),
@@ -485,12 +478,12 @@ def certify(
     that of its task, is proven; see docs/continuous-proofs.md. The exit status is 1 if the bounds did
     not converge, 2 for errors of usage.
     """
-    _begin(f"certifying {formula or 'the task'} from {log}")
+    say = _begin(f"certifying {formula or 'the task'} from {log}")
     if log.suffix == ".npz":
         others = (policy, curve, *(x for name, x in options.items() if name != "method"))
         if any(x not in (None, (), False) for x in others):
             raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
-        _certify_policy(log, formula, as_json)
+        _certify_policy(log, formula, as_json, say)
         return
     if formula is None or options["confidence"] is None:
         missing = "FORMULA" if formula is None else "--confidence, such as 0.95"
@@ -510,12 +503,14 @@ def certify(
         raise SystemExit(1)
 
 
-def _certify_policy(policy: Path, formula: str | None, as_json: bool) -> None:
+def _certify_policy(
+    policy: Path, formula: str | None, as_json: bool, say: Callable[[str], None]
+) -> None:
     """Proves a saved policy in its dynamics."""
     from jaxltl.app.learn_environment import certify_policy_file
     from jaxltl.app.reports import proof
 
-    result = proof.entry(certify_policy_file(policy, formula, _say))
+    result = proof.entry(certify_policy_file(policy, formula, say))
     click.echo(f"{result['formula']}\n{proof.sentence(result)}")
     if as_json:
         _print_json(result)
@@ -546,13 +541,13 @@ _EXPERIMENTS = {
 @plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published and measured numbers side by side."""
-    _begin(f"reproducing {what}")
+    say = _begin(f"reproducing {what}")
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     options = {} if seeds is None else {"seeds": seeds}
     if seeds is not None and "seeds" not in inspect.signature(experiment.measure).parameters:
         raise ValueError(f"reproduce {what} has no seeds; leave --seeds out.")
     with float64():
-        result = experiment.measure(_say, **options)
+        result = experiment.measure(say, **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else {}
     click.echo(experiment.table(result))
     if pictures:

@@ -109,14 +109,14 @@ def _is_int(value: object) -> TypeGuard[int]:
 
 
 def _read_cell(value: object, world: World) -> int:
-    if world.cells is None:
+    if world.shape is None:
         raise ValueError('the model has no map, so give "states" instead of "cells".')
     if not (isinstance(value, list) and len(value) == 2 and all(map(_is_int, value))):
         raise ValueError(f"the cell is {value!r}; it must be [row, column].")
     row, column = value
-    rows, columns = world.cells.shape
+    rows, columns = world.shape
     if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(f"the cell [{row}, {column}] is {off_map(world.cells.shape)}")
+        raise ValueError(f"the cell [{row}, {column}] is {off_map(world.shape)}")
     return (row - 1) * columns + column - 1
 
 

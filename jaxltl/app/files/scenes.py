@@ -14,11 +14,10 @@ from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_todirl import TodirlFile, WorldTable, map_file
 from jaxltl.app.files.worlds import World, grid_options
-from jaxltl.app.wording import where
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import parse_ltl
-from jaxltl.core.models import MDP, Trajectories
+from jaxltl.core.models import Trajectories
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS, gridworld
@@ -26,20 +25,19 @@ from jaxltl.envs.text_map import parse_map
 from jaxltl.io.colored_world import read_world
 
 
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, kw_only=True)
+class Scene(World):
     """A world and its observations."""
 
     name: str  # for people
-    mdp: MDP  # the world
     observation: jax.Array  # float[S, O]
-    shape: tuple[int, int]  # rows and columns
-    colored: temporal_gridworld.World | None  # the coloured world, or None for a text map
-    cells: np.ndarray | None  # str[rows, columns], or None for a coloured world
+    colored: temporal_gridworld.World | None = None  # the coloured world, or None for a text map
+    actions: tuple[str, ...] = ACTIONS
 
-    def place(self, state: int) -> dict[str, int]:
-        """A state with its row and column, from 1."""
-        return where(state, self.shape)
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = (self.colored or self.cells).shape  # type: ignore[union-attr]
+        return rows, columns
 
 
 def load_scenes(task: TodirlFile, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
@@ -129,15 +127,14 @@ def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> Scene:
             f"{world.margin}; give [learner] radius = {world.margin}, or a map with a wider margin."
         )
     seen = temporal_gridworld.observations(world, radius)
-    return Scene(name, world.mdp, seen, world.shape, world, None)
+    return Scene(mdp=world.mdp, cells=None, name=name, observation=seen, colored=world)
 
 
 def _plain_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
     cells = parse_map(text)
     mdp = gridworld(text, **grid_options(world))
     seen = cell_observations(cells, cell_kinds(world), radius)
-    rows, columns = cells.shape
-    return Scene(name, mdp, jnp.asarray(seen, mdp.dtype), (rows, columns), None, cells)
+    return Scene(mdp=mdp, cells=cells, name=name, observation=jnp.asarray(seen, mdp.dtype))
 
 
 def cell_kinds(world: WorldTable) -> list[str]:
@@ -232,7 +229,5 @@ def _translate(
 
 def load_demonstrations(task: TodirlFile, scenes: Sequence[Scene]) -> list[Trajectories]:
     """The demonstrations in each of the training worlds, from their files."""
-    blank = (np.arange(x.mdp.num_states).reshape(x.shape).astype(str) for x in scenes)
-    worlds = (World(x.mdp, cells, ACTIONS) for x, cells in zip(scenes, blank, strict=True))
     files = (task.path.parent / name for name in task.demonstrations.files or ())
-    return [read_demonstrations(file, world) for file, world in zip(files, worlds, strict=True)]
+    return [read_demonstrations(file, scene) for file, scene in zip(files, scenes, strict=True)]

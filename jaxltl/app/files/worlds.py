@@ -32,9 +32,14 @@ class World:
     actions: tuple[str, ...]  # A names
     logged: Logged | None = None  # the log that the model was estimated from, or None
 
+    @property
+    def shape(self) -> tuple[int, ...] | None:
+        """Rows and columns of the map, if there is one."""
+        return None if self.cells is None else self.cells.shape
+
     def where(self, state: int) -> Record:
         """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
-        found = where(state, None if self.cells is None else self.cells.shape)
+        found = where(state, self.shape)
         return found if self.logged is None else {**found, "name": self.logged.states[state]}
 
     def place(self, state: int) -> str:

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxltl.app.todirl.results import Learned, Setup, part_of
-from jaxltl.app.wording import place as name_of
-from jaxltl.app.files.scenes import Scene
 from jaxltl.app.practical import StepBound, neg_log_likelihood, step_bound
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values.undiscounted.mixture import (
@@ -39,13 +37,13 @@ def check_attainable(setup: Setup) -> None:
     for w, (scene, sure) in enumerate(zip(scenes, setup.sure, strict=True)):
         if w >= setup.num_training and scene.name in task.left_out:
             continue
-
-        def place(state: int, scene: Scene = scene) -> str:
-            return name_of(scene.place(state))
-
         try:
             require_attainable(
-                part_of(setup.worlds.model, w), sure.best, float(setup.asked), task.over, place
+                part_of(setup.worlds.model, w),
+                sure.best,
+                float(setup.asked),
+                task.over,
+                scene.place,
             )
         except ValueError as error:
             kind = "training" if w < setup.num_training else "test"

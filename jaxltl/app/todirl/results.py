@@ -268,7 +268,7 @@ def _about_world(scene: Scene, judged: Judged, w: int) -> Record:
         "mean": enclosure(one.mean, one.lower, one.upper),
         "minimum": {
             **enclosure(one.worst, one.worst_lower, one.worst_upper),
-            **scene.place(int(one.worst_state)),
+            **scene.where(int(one.worst_state)),
         },
         "status": Status(int(one.status)).name,
         "expert": judged.performance["expert"].mean[w],
