@@ -311,8 +311,8 @@ def _weighed(
         return _plans(setup, problem.network, parameters, replace(hparams, mu=None), count)[:2]
 
     counts = np.asarray(problem.counts + problem.held_out)
-    found, weight = likeliest(setup, counts, free, None if hparams.mu is None else train, plans)
-    return replace(found, weight=weight)
+    found = likeliest(setup, counts, free, None if hparams.mu is None else train, plans)
+    return replace(found.learned, weight=found.weight)
 
 
 def _judge(

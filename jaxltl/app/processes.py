@@ -67,26 +67,19 @@ class Launch:
 
 def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ) -> Launch:
     """Launch of this process by its options, else by a launcher's environment."""
-    names = {
-        "--coordinator": options.coordinator,
-        "--process": options.process,
-        "--processes": options.processes,
-    }
-    given = [name for name, value in names.items() if value is not None]
+    given = [x for x in ("coordinator", "process", "processes") if getattr(options, x) is not None]
     if options.mesh is None:
         if given:
-            raise ValueError(f"{given[0]} needs --mesh; give that too.")
-        return Launch()
-    if options.processes == 1 and not options.process:
+            raise ValueError(f"--{given[0]} needs --mesh; give that too.")
         return Launch()
     launcher, detected = _detect(environment)
+    alone = options.processes == 1 and not options.process
+    if alone or (not given and (detected is None or detected.processes == 1)):
+        return Launch()
     processes, process = options.processes, options.process
     if detected is not None:
         processes = detected.processes if processes is None else processes
         process = detected.process if process is None else process
-    address = options.coordinator or environment.get("JAX_COORDINATOR_ADDRESS")
-    if not given and (detected is None or detected.processes == 1):
-        return Launch()
     if processes is None or process is None:
         missing = "--processes" if processes is None else "--process"
         raise ValueError(
@@ -98,6 +91,7 @@ def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ
             f"--process {process} is out of range for {processes} processes; number them from "
             f"0 to {processes - 1}."
         )
+    address = options.coordinator or environment.get("JAX_COORDINATOR_ADDRESS")
     if address is not None:
         _host_and_port(address)
     elif detected is None or any(name not in environment for name in _LAUNCHERS[launcher][2]):
@@ -177,27 +171,25 @@ class ProcessGroup:
         for process, other in enumerate(every):
             for name in {**every[0], **other}:
                 one, two = (x.get(name, "nothing") for x in (every[0], other))
-                if one == two:
-                    continue
-                if not self.is_first:
-                    raise SystemExit(2)
-                raise ValueError(
-                    f"process {process} has {name} {two}, and process 0 {one}; start all processes "
-                    "with the same arguments, files and versions."
-                )
+                if one != two:
+                    raise self._error(
+                        f"process {process} has {name} {two}, and process 0 {one}; start all "
+                        "processes with the same arguments, files and versions."
+                    )
 
     def sees(self, what: str, here: bool) -> bool:
         """True if a file is present, which must be the same in all processes."""
         every = self.exchanged(str(here))
         if len(set(every)) > 1:
-            without = every.index("False")
-            if not self.is_first:
-                raise SystemExit(2)
-            raise ValueError(
-                f"process {without} does not see {what}; give --out a directory that "
+            raise self._error(
+                f"process {every.index('False')} does not see {what}; give --out a directory that "
                 "all processes share."
             )
         return here
+
+    def _error(self, text: str) -> ValueError | SystemExit:
+        """The error that all processes find, and the first reports."""
+        return ValueError(text) if self.is_first else SystemExit(2)
 
 
 @contextlib.contextmanager

@@ -9,11 +9,11 @@ kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from jaxltl.app.todirl.results import Learned, Setup, part_of
+from jaxltl.app.guarantee import Attempt
 from jaxltl.app.practical import StepBound, neg_log_likelihood, step_bound
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values.undiscounted.mixture import (
@@ -86,42 +86,31 @@ def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> l
     return found
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """An attempt with a weight."""
-
-    learned: Learned  # learned, weight: the network, and mu
-    weight: float
-    attained: float  # least certified probability over the training worlds, before mixing
-    neg_log_likelihood: float  # of the demonstrations, after mixing
-
-
 def likeliest(
     setup: Setup,
     counts: np.ndarray,
     free: Learned,
     train: Callable[[float], Learned] | None,
     plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
-) -> tuple[Learned, float]:
-    """The network of greatest likelihood over some weights, and its weight."""
+) -> Attempt:
+    """The network of greatest likelihood over some weights."""
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
 
-    def judged(learned: Learned, weight: float) -> _Tried:
+    def judged(learned: Learned, weight: float) -> Attempt:
         policy, inside = plans(learned)
         held = np.stack([one.policy for one in hold(setup, policy, inside)])
         loss = neg_log_likelihood(held[:, : counts.shape[1]], counts)
         each = [attained(m, p, setup.task.over) for m, p in zip(models, policy, strict=True)]
-        return _Tried(learned, weight, min(each), loss)
+        # The least certified probability over the training worlds, before mixing.
+        return Attempt(held, loss, min(each), weight, 0.0, learned)
 
-    first = judged(free, 0.0)
-    found = [first]
-    if first.attained < float(setup.asked) and train is not None:
+    found = [judged(free, 0.0)]
+    if found[0].attained < float(setup.asked) and train is not None:
         found += _bracket(lambda mu: judged(train(mu), mu), float(setup.asked))
-    best = min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
-    return best.learned, best.weight
+    return min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
 
 
-def _bracket(tried: Callable[[float], _Tried], asked: float) -> Iterator[_Tried]:
+def _bracket(tried: Callable[[float], Attempt], asked: float) -> Iterator[Attempt]:
     """Yields attempts with increasing weights until one suffices, then by bisection."""
     # The likelihood has several maxima, and those found from too large a weight are lower.
     low = 0.0
