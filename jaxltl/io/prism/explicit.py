@@ -65,9 +65,7 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
       >>> read_prism(path).successor.tolist()
       [1, 2, 1, 2]
     """
-    path, match = Path(path), _NAME.fullmatch(Path(path).name)
-    if match is None:
-        refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
+    path, match = _parsed_name(path)
     sections = _in_one(path) if match["kind"].lower() == "pexp" else list(_beside(path, match))
     text = next(text for kind, _, text in sections if kind == "tra")
     try:
@@ -106,9 +104,7 @@ def write_prism(
       >>> read_prism(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """
-    path, match = Path(path), _NAME.fullmatch(Path(path).name)
-    if match is None:
-        refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
+    path, match = _parsed_name(path)
     if dialect not in ("prism", "storm"):
         raise ValueError(f"dialect is {dialect!r}; give 'prism' or 'storm'.")
     sections = written_sections(model, dialect)
@@ -133,6 +129,14 @@ def write_prism(
             if section.kind in ("srew", "trew") and dialect == "prism":
                 file.writelines(section.header)  # contains the name
             file.writelines(section.lines())
+
+
+def _parsed_name(path: str | os.PathLike[str]) -> tuple[Path, re.Match[str]]:
+    """The path, and the parts of its name."""
+    match = _NAME.fullmatch(Path(path).name)
+    if match is None:
+        refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
+    return Path(path), match
 
 
 # --- which files ----------------------------------------------------------------------------
@@ -344,22 +348,11 @@ def _with_loops(rows: _Rows) -> _Rows:
     has = np.zeros(rows.num_states, bool)
     has[rows.state] = True
     missing = np.flatnonzero(~has).astype(np.int32)
-    if not missing.size:
-        return rows
     place = np.searchsorted(rows.state, missing)
-
-    def put(column: NDArray, value: NDArray | float) -> NDArray:
-        return np.insert(column, place, value, axis=0)
-
-    return replace(
-        rows,
-        state=put(rows.state, missing),
-        choice=put(rows.choice, 0),
-        target=put(rows.target, missing),
-        probability=put(rows.probability, 1),
-        action=put(rows.action, -1),
-        line=put(rows.line, 0),
-    )
+    loop = {"state": missing, "choice": 0, "target": missing, "probability": 1}
+    loop |= {"action": -1, "line": 0}
+    columns = {name: np.insert(getattr(rows, name), place, x, axis=0) for name, x in loop.items()}
+    return replace(rows, **columns)
 
 
 def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:

@@ -32,20 +32,22 @@ _LABEL = re.compile(rb'\s*(\d+)\s*=\s*"([^"]*)"')
 Section = tuple[str, str, Text]  # "tra", "lab", "sta", "srew" or "trew"; of which reward; the text
 
 
+def _section(sections: list[Section], kind: str) -> Text | None:
+    return next((text for other, _, text in sections if other == kind), None)
+
+
 def read_labels(
     sections: list[Section], num_states: int
 ) -> tuple[Booleans, tuple[str, ...], Floats]:
     """Label matrix ``bool[S, P]``, label names and the initial distribution."""
-    text = next((text for kind, _, text in sections if kind == "lab"), None)
-    if text is None:
-        return np.zeros((num_states, 0), bool), (), np.eye(1, num_states)[0]
-    if text.data.startswith(b"#DECLARATION", text.begin):
-        holds, names = _storm_labels(text, num_states)
-    else:
-        holds, names = _prism_labels(text, num_states)
-    if "init" not in names:
-        return holds, tuple(names), np.eye(1, num_states)[0]
-    return split_init(text, holds, names)
+    text = _section(sections, "lab")
+    holds, names = np.zeros((num_states, 0), bool), list[str]()
+    if text is not None:
+        storm = text.data.startswith(b"#DECLARATION", text.begin)
+        holds, names = (_storm_labels if storm else _prism_labels)(text, num_states)
+        if "init" in names:
+            return split_init(text, holds, names)
+    return holds, tuple(names), np.eye(1, num_states)[0]
 
 
 def _prism_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
@@ -105,7 +107,7 @@ def _storm_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
 
 def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArray]:
     """Values of the state variables, ``[S]`` each: bool, int64 or float64."""
-    text = next((text for kind, _, text in sections if kind == "sta"), None)
+    text = _section(sections, "sta")
     if text is None:
         return {}
     first, line, rest = text.first_line(b"#")
@@ -159,19 +161,16 @@ def _fields(block: Block, width: int) -> list[list[bytes]]:
 
 def _values(block: Block, name: str, texts: list[bytes]) -> NDArray:
     """Values of a column as bool, int64 or float64."""
-    is_true = np.fromiter((x == b"true" for x in texts), bool, len(texts))
-    if (is_true | np.fromiter((x == b"false" for x in texts), bool, len(texts))).all():
-        return is_true
+    if set(texts) <= {b"true", b"false"}:
+        return np.fromiter((x == b"true" for x in texts), bool, len(texts))
     try:
         return np.fromiter(map(_integer, texts), np.int64, len(texts))
     except (ValueError, OverflowError):
         pass
     values = [as_double(x) for x in texts]
     if None in values:
-        bad = values.index(None)
-        raise block.malformed(
-            bad, f"a value of {name!r}: true, false or a number, in all states alike"
-        )
+        form = f"a value of {name!r}: true, false or a number, in all states alike"
+        raise block.malformed(values.index(None), form)
     return np.array(values, np.float64)
 
 
@@ -190,29 +189,28 @@ _TO_BLANKS = bytes.maketrans(b":(),", b"    ")
 
 def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> dict[str, Rewards]:
     """Reward structures of a model by name, from its ``srew`` and ``trew`` sections."""
-    parts: dict[str, tuple[str, Text, Rewards]] = {}
+    found: dict[str, dict[str, tuple[Text, Rewards]]] = {}
     reward_sections = [s for s in sections if s[0] in ("srew", "trew")]
     unnamed = len({number for _, number, text in reward_sections if not _reward_name(text)})
     for kind, number, text in reward_sections:
         name = _reward_name(text)
-        key = name or (number if unnamed > 1 else "")
-        part = (
-            _state_reward(text, model.num_states)
-            if kind == "srew"
-            else _transition_reward(text, model, is_chain)
-        )
-        before = parts.get(key)
-        if before is None:
-            parts[key] = kind, text, part
-        elif before[0] == kind:
+        parts = found.setdefault(name or (number if unnamed > 1 else ""), {})
+        if kind in parts:
             raise text.error(
                 text.line,
-                f"a second reward {name!r} of this kind, beside that of {before[1].name!r}.",
+                f"a second reward {name!r} of this kind, beside that of {parts[kind][0].name!r}.",
             )
+        if kind == "srew":
+            parts[kind] = text, _state_reward(text, model.num_states)
         else:
-            states, moves = (part, before[2]) if kind == "srew" else (before[2], part)
-            parts[key] = "both", text, replace(moves, state=states.state)
-    return {key: part for key, (_, _, part) in parts.items()}
+            parts[kind] = text, _transition_reward(text, model, is_chain)
+    return {
+        key: replace(
+            parts["trew"][1] if "trew" in parts else Rewards(),
+            state=parts["srew"][1].state if "srew" in parts else None,
+        )
+        for key, parts in found.items()
+    }
 
 
 def _reward_name(text: Text) -> str:
@@ -226,19 +224,16 @@ def _reward_lines(text: Text, num_states: int, form: str) -> tuple[int | None, T
     sizes = first.split()
     if not first:
         return 0, rest
+    shown = repr(first[:60].decode(errors="replace"))
     if not sizes[0].isdigit() or len(sizes[0]) > 18 or int(sizes[0]) > num_states:
         raise text.error(
             line,
-            f"{first[:60].decode(errors='replace')!r}; expected a number of "
-            f"states, here {num_states}, and of rewards, or {form}.",
+            f"{shown}; expected a number of states, here {num_states}, and of rewards, or {form}.",
         )
     if int(sizes[0]) < num_states:
         return None, text
     if not sizes[-1].isdigit() or len(sizes[-1]) > 18 or len(sizes) not in (2, 3):
-        raise text.error(
-            line,
-            f"{first[:60].decode(errors='replace')!r}; expected a number of states and of rewards.",
-        )
+        raise text.error(line, f"{shown}; expected a number of states and of rewards.")
     return int(sizes[-1]), rest
 
 
@@ -313,7 +308,8 @@ def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Writ
             "Storm reads no intervals in explicit files; write PRISM's (dialect='prism'), or UMB "
             "or DRN."
         )
-    labels, holds = _labels(model, storm)
+    masks = labels_with_init(model)
+    labels, holds = _plain(tuple(masks), "label", ' "' if storm else '"'), list(masks.values())
     title = ("" if model is source else "I") + ("DTMC" if model.is_chain else "MDP")
     kind = f"# Transitions ({title})\n".encode()
     action = (
@@ -386,12 +382,6 @@ def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
     return [f" {name}" if name else "" for name in model.action_names].__getitem__
 
 
-def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:
-    """Label names, "init" first, and their masks."""
-    masks = labels_with_init(model)
-    return _plain(tuple(masks), "label", ' "' if storm else '"'), list(masks.values())
-
-
 def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) -> Iterator[bytes]:
     if storm:
         yield f"#DECLARATION\n{' '.join(names)}\n#END\n".encode()
@@ -437,24 +427,14 @@ def _rewards(
     model: SparseMDP, name: str, reward: Rewards, number: str, storm: bool
 ) -> Iterator[Written]:
     title = f'# Reward structure "{name}"\n' if name else "# Reward structure\n"
-    state = None if reward.state is None else np.asarray(reward.state, np.float64)
     earned = _on_entries(model, reward)
-    if state is not None or earned is None:
-        state_rewards = np.zeros(model.num_states) if state is None else state
-        yield Written(
-            "srew",
-            number,
-            [title.encode(), b"# State rewards\n"],
-            lambda: _state_rewards(state_rewards, storm),
-        )
+    if reward.state is not None or earned is None:
+        state = np.zeros(model.num_states) if reward.state is None else np.asarray(reward.state)
+        header = [title.encode(), b"# State rewards\n"]
+        yield Written("srew", number, header, lambda: _state_rewards(state, storm))
     if earned is not None:
-        entry_rewards = earned
-        yield Written(
-            "trew",
-            number,
-            [title.encode(), b"# Transition rewards\n"],
-            lambda: _transition_rewards(model, entry_rewards, storm),
-        )
+        header = [title.encode(), b"# Transition rewards\n"]
+        yield Written("trew", number, header, lambda: _transition_rewards(model, earned, storm))
 
 
 def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None:
@@ -468,29 +448,28 @@ def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None
     return transition if choice is None else choice + transition
 
 
-def _state_rewards(reward: NDArray[np.float64], storm: bool) -> Iterator[bytes]:
-    state = np.flatnonzero(reward)
-    if not storm:
-        yield b"%d %d\n" % (reward.size, state.size)
-    for begin in range(0, state.size, _STEP):
-        part = state[begin : begin + _STEP]
-        yield _infinity(joined_lines("%d %r\n", part.tolist(), reward[part].tolist()), storm)
+def _state_rewards(reward: NDArray[np.generic], storm: bool) -> Iterator[bytes]:
+    reward = reward.astype(np.float64)
+    yield from _nonzero(reward, [reward.size], lambda part: [part.tolist()], storm)
 
 
 def _transition_rewards(
     model: SparseMDP, earned: NDArray[np.float64], storm: bool
 ) -> Iterator[bytes]:
     host = model.host
-    entries = np.flatnonzero(earned)
     sizes = [host.num_states] if host.is_chain else [host.num_states, host.num_rows]
+    yield from _nonzero(earned, sizes, _entry_columns(model), storm)
+
+
+def _nonzero(
+    reward: Floats, sizes: list[int], columns: Callable[[Integers], list[list[int]]], storm: bool
+) -> Iterator[bytes]:
+    """Lines of the numbers that are not zero, after columns of their places."""
+    place = np.flatnonzero(reward)
     if not storm:
-        yield (" ".join(map(str, [*sizes, entries.size])) + "\n").encode()
-    columns_of = _entry_columns(model)
-    form = "%d " * (len(sizes) + 1) + "%r\n"
-    for begin in range(0, entries.size, _STEP):
-        part = entries[begin : begin + _STEP]
-        yield _infinity(joined_lines(form, *columns_of(part), earned[part].tolist()), storm)
-
-
-def _infinity(lines: bytes, storm: bool) -> bytes:
-    return lines if storm else lines.replace(b"inf", b"Infinity")
+        yield (" ".join(map(str, [*sizes, place.size])) + "\n").encode()
+    for begin in range(0, place.size, _STEP):
+        part = place[begin : begin + _STEP]
+        before = columns(part)
+        lines = joined_lines("%d " * len(before) + "%r\n", *before, reward[part].tolist())
+        yield lines if storm else lines.replace(b"inf", b"Infinity")
