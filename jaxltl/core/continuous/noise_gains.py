@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.core.enclosures.linear_bounds import Enclosed
-from jaxltl.core.enclosures.program import Elementwise, MatrixProduct, Program, make_program
+from jaxltl.core.enclosures.program import Elementwise, Program, make_program
 from jaxltl.core.models.protocols import PyTree
 
 Step = Callable[[PyTree, PyTree, PyTree], PyTree]
@@ -49,8 +49,7 @@ def jumps(program: Program) -> bool:
     """True if a function that may jump is applied to variables that depend on the last input."""
     noisy = {program.inputs[-1]}
     for operation in program.operations:
-        inputs = (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
-        if not noisy.intersection(inputs):
+        if not noisy.intersection(operation.inputs):
             continue
         noisy.add(operation.output)
         if isinstance(operation, Elementwise):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,21 +103,28 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
     forms: dict[int, AffineForm] = {}
     if linear:
         forms |= zip(program.inputs, _input_forms(boxes, radius), strict=True)
-    last_use = {x: i for i, each in enumerate(program.operations) for x in _inputs(each)}
+    last_use = {x: i for i, each in enumerate(program.operations) for x in each.inputs}
     for position, operation in enumerate(program.operations):
         y = operation.output
-        inputs = _inputs(operation)
-        if isinstance(operation, MatrixProduct) and _is_bounded(forms.get(operation.input)):
+        if isinstance(operation, MatrixProduct) and _is_bounded(forms.get(operation.inputs[0])):
             # Interval arithmetic is rarely narrower here, and costs as much as the form.
-            forms[y] = _forward_product(operation.matrix, forms[operation.input])
+            forms[y] = _forward_product(operation.matrix, forms[operation.inputs[0]])
             intervals[y] = forms[y].interval()
         else:
-            found = _bounds(operation, intervals)
-            if jnp.issubdtype(found.low.dtype, jnp.floating) and any(x in forms for x in inputs):
-                forms[y] = _forward(operation, intervals, found, forms)
+            values = [intervals[x] for x in operation.inputs]
+            match operation:
+                case MatrixProduct():
+                    found = _product(operation.matrix, *values)
+                case Select():
+                    found = _select(operation, values)
+                case Elementwise():
+                    found = elementwise.bounds(operation, values)
+            real = jnp.issubdtype(found.low.dtype, jnp.floating)
+            if real and any(x in forms for x in operation.inputs):
+                forms[y] = _forward(operation, values, found, forms)
                 found = intersect(found, forms[y].interval())
             intervals[y] = found
-        for x in inputs:
+        for x in operation.inputs:
             if last_use[x] == position and x not in program.outputs:
                 forms.pop(x, None)
     return Enclosed(program, intervals, radius, middle, forms)
@@ -125,22 +133,6 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
 def _is_bounded(form: AffineForm | None) -> bool:
     """True for a form of NumPy arrays without infinite bounds."""
     return form is not None and module_of(form.error) is np and bool(np.isfinite(form.error).all())
-
-
-def _bounds(
-    operation: Select | MatrixProduct | Elementwise, intervals: Mapping[int, Interval]
-) -> Interval:
-    """The interval of an operation's output from those of its inputs."""
-    if isinstance(operation, MatrixProduct):
-        return _product(operation.matrix, intervals[operation.input])
-    inputs = [intervals[x] for x in operation.inputs]
-    if isinstance(operation, Select):
-        return _select(operation, inputs)
-    return elementwise.bounds(operation, inputs)
-
-
-def _inputs(operation: Select | MatrixProduct | Elementwise) -> tuple[int, ...]:
-    return (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
 
 
 def _input_forms(boxes: list[Interval], radius: Array) -> list[AffineForm]:
@@ -156,16 +148,16 @@ def _input_forms(boxes: list[Interval], radius: Array) -> list[AffineForm]:
 
 
 def _select(operation: Select, inputs: list[Interval]) -> Interval:
-    if len(inputs) == 1:
-        x = inputs[0]
-        low = x.low[:, operation.index]
-        return Interval(low, low if x.low is x.high else x.high[:, operation.index])
-    return Interval(*(_joined([getattr(x, side) for x in inputs])[..., operation.index]
-                      for side in ("low", "high")))  # fmt: skip
+    low = _joined([x.low for x in inputs])[..., operation.index]
+    if all(x.low is x.high for x in inputs):
+        return point(low)
+    return Interval(low, _joined([x.high for x in inputs])[..., operation.index])
 
 
 def _joined(arrays: list[Array]) -> Array:
     """Concatenation along the last axis, with boxes repeated."""
+    if len(arrays) == 1:
+        return arrays[0]
     xp = module_of(arrays[0])
     lead = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
     result: Array = xp.concatenate([xp.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays], -1)
@@ -226,24 +218,22 @@ def _padded(slope: Array, count: int) -> Array:
 
 def _forward(
     operation: Select | MatrixProduct | Elementwise,
-    intervals: Mapping[int, Interval],
+    values: list[Interval],
     found: Interval,
     forms: Mapping[int, AffineForm],
 ) -> AffineForm:
     """The affine form of an operation's output from those of its inputs."""
-    inputs = [forms.get(x) or _constant(intervals[x], found.low.dtype) for x in _inputs(operation)]
-    if isinstance(operation, Select):
-        index = operation.index
-        if len(inputs) == 1:
-            x = inputs[0]
-            return AffineForm(x.slope[..., index], x.middle[:, index], x.error[:, index])
-        count = max(x.slope.shape[1] for x in inputs)
-        parts = ([_padded(x.slope, count) for x in inputs], [x.middle for x in inputs],
-                 [x.error for x in inputs])  # fmt: skip
-        return AffineForm(*(_joined(part)[..., index] for part in parts))
+    inputs = [
+        forms.get(x) or _constant(value, found.low.dtype)
+        for x, value in zip(operation.inputs, values, strict=True)
+    ]
     if isinstance(operation, MatrixProduct):
         return _forward_product(operation.matrix, inputs[0])
-    values = [intervals[x] for x in operation.inputs]
+    if isinstance(operation, Select):
+        count = max(x.slope.shape[1] for x in inputs)
+        slopes = [_padded(x.slope, count) for x in inputs]
+        parts = (slopes, [x.middle for x in inputs], [x.error for x in inputs])
+        return AffineForm(*(_joined(part)[..., operation.index] for part in parts))
     if operation.name in ("add", "sub"):
         return _forward_sum(inputs[0], inputs[1], 1 if operation.name == "add" else -1)
     return _forward_elementwise(relaxation(operation, values, found, parallel=True), inputs)
@@ -294,19 +284,15 @@ def _forward_elementwise(bounds: Relaxation, inputs: list[AffineForm]) -> Affine
     middle, error = (low + high) / 2, xp.where(finite, (high - low) / 2, xp.inf)
     size = size_of(low) + size_of(high)
     slopes: list[Array] = []
+    count = max(x.slope.shape[1] for x in inputs)
     for x, a in zip(inputs, bounds.lower_slope, strict=True):
         magnitude = size_of(a)
         middle = middle + a * x.middle
         error = error + times(magnitude, x.error)
+        size = size + magnitude * (x.slope_size() + size_of(x.middle))
         if x.slope.shape[1]:
-            size = size + magnitude * (x.slope_size() + size_of(x.middle))
-            slopes.append(a[:, None] * x.slope)
-        else:
-            size = size + magnitude * size_of(x.middle)
-    count = max(a.shape[1] for a in slopes)
-    slope = _padded(slopes[0], count)
-    for other in slopes[1:]:
-        slope = slope + _padded(other, count)
+            slopes.append(_padded(a[:, None] * x.slope, count))
+    slope = reduce(xp.add, slopes)
     rounding = 4 * (len(inputs) + 2) * eps(middle)
     error = error * (1 + rounding) + size * rounding + tiny(middle)
     return AffineForm(slope, middle, error)
@@ -393,10 +379,10 @@ def backward(known: Enclosed, target: int) -> LinearForm:
             case Select():
                 _back_select(state, operation, lower, upper)
             case MatrixProduct():
-                matrix = xp.asarray(operation.matrix)
-                size = intervals[operation.input].magnitude @ size_of(matrix).T
+                matrix, (x,) = xp.asarray(operation.matrix), operation.inputs
+                size = intervals[x].magnitude @ size_of(matrix).T
                 state.rounded(lower, upper, size, matrix.shape[0])
-                state.add(operation.input, lower @ matrix, upper @ matrix)
+                state.add(x, lower @ matrix, upper @ matrix)
             case Elementwise():
                 _back_elementwise(state, operation, lower, upper)
     return _resolved(state, target)

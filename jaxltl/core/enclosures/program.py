@@ -59,7 +59,7 @@ class Select:
 class MatrixProduct:
     """`matrix x`."""
 
-    input: int
+    inputs: tuple[int]
     output: int
     matrix: Array  # float[n, m]
 
@@ -303,7 +303,7 @@ class _Builder:
             )
         matrix = _matrix(equation, [self.known.get(x) for x in inputs], index)
         found = self.new(output)
-        self.operations.append(MatrixProduct(inputs[index], found, matrix))
+        self.operations.append(MatrixProduct((inputs[index],), found, matrix))
         return found
 
     def _dot(self, equation: core.JaxprEqn, inputs: list[int]) -> int:
@@ -326,7 +326,7 @@ class _Builder:
         rows = math.prod(output.shape)
         matrix = np.repeat(np.eye(rows, dtype=full.dtype), math.prod(full.shape) // rows, axis=1)
         found = self.new(output)
-        self.operations.append(MatrixProduct(products, found, matrix))
+        self.operations.append(MatrixProduct((products,), found, matrix))
         return found
 
     def _unroll(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:

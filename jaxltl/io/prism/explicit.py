@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Annotations, SparseMDP, make_sparse
@@ -349,7 +349,12 @@ def _with_loops(rows: _Rows) -> _Rows:
     has[rows.state] = True
     missing = np.flatnonzero(~has).astype(np.int32)
     place = np.searchsorted(rows.state, missing)
-    loop = {"state": missing, "choice": 0, "target": missing, "probability": 1}
+    loop: dict[str, ArrayLike] = {
+        "state": missing,
+        "choice": 0,
+        "target": missing,
+        "probability": 1,
+    }
     loop |= {"action": -1, "line": 0}
     columns = {name: np.insert(getattr(rows, name), place, x, axis=0) for name, x in loop.items()}
     return replace(rows, **columns)
