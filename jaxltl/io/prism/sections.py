@@ -429,7 +429,8 @@ def _rewards(
     title = f'# Reward structure "{name}"\n' if name else "# Reward structure\n"
     earned = _on_entries(model, reward)
     if reward.state is not None or earned is None:
-        state = np.zeros(model.num_states) if reward.state is None else np.asarray(reward.state)
+        none = np.zeros(model.num_states)
+        state = none if reward.state is None else np.asarray(reward.state, np.float64)
         header = [title.encode(), b"# State rewards\n"]
         yield Written("srew", number, header, lambda: _state_rewards(state, storm))
     if earned is not None:
@@ -448,8 +449,7 @@ def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None
     return transition if choice is None else choice + transition
 
 
-def _state_rewards(reward: NDArray[np.generic], storm: bool) -> Iterator[bytes]:
-    reward = reward.astype(np.float64)
+def _state_rewards(reward: Floats, storm: bool) -> Iterator[bytes]:
     yield from _nonzero(reward, [reward.size], lambda part: [part.tolist()], storm)
 
 
