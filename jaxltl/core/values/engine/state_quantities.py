@@ -75,6 +75,21 @@ def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndar
     return earned, choice_reward(model, Rewards(**sizes))
 
 
+def nonnegative_reward(
+    model: SparseMDP, reward: Reward, use: str, name: str = "the reward"
+) -> np.ndarray:
+    """Expected rewards of rows, ``float64[R]``; ValueError if some are negative or not finite."""
+    earned = choice_reward(model, reward)
+    bad = np.flatnonzero(~(np.isfinite(earned) & (earned >= 0)))
+    if bad.size:
+        row, state = bad[0], model.host.state[bad[0]]
+        raise ValueError(
+            f"{name} of state {state}, choice {row - model.host.row_start[state]} is "
+            f"{earned[row]:.6g}; {use} need finite rewards of at least 0."
+        )
+    return earned
+
+
 def transition_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
     """The reward of each entry, ``float64[T]``."""
     mdp = model.host

@@ -14,7 +14,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
-from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
 from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, choices_as_nature
 from jaxltl.core.sparse.interval.reachability import reachability
@@ -25,7 +25,11 @@ from jaxltl.core.types import Solution, require_shape
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.values.engine.host_solution import status_between
-from jaxltl.core.values.engine.state_quantities import state_mask
+from jaxltl.core.values.engine.state_quantities import (
+    nonnegative_reward,
+    state_mask,
+    transition_reward,
+)
 
 TOLERANCE = 1e-6
 
@@ -191,8 +195,8 @@ def robust_discounted_value(
       ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
     world, sides = sides_of(model, policy, objective, nature)
-    entry = sides.encoded.entry
-    earned = np.where(entry < 0, 0, entry_reward(world, reward)[entry])
+    entry, given = sides.encoded.entry, reward_structure(world.nominal, reward)
+    earned = np.where(entry < 0, 0, transition_reward(world.nominal, given)[entry])
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
     discounts = np.where(sides.choosing, 1.0, float(discount))
@@ -236,35 +240,9 @@ def robust_expectation(
     return model.host.sum_rows(p * ahead), p
 
 
-def entry_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
-    """Finite reward of each entry, ``float64[T]``."""
-    given = reward_structure(model.nominal, reward)
-    host = model.nominal.host
-    apart = choice_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
-    earned = apart[host.row]
-    if given.transition is not None:
-        earned = earned + np.asarray(given.transition, np.float64)
-    if not np.isfinite(earned).all():
-        row = int(host.row[np.flatnonzero(~np.isfinite(earned))[0]])
-        raise ValueError(
-            f"the reward of state {host.state[row]}, choice "
-            f"{row - int(host.row_start[host.state[row]])} is not finite."
-        )
-    return earned
-
-
 def interval_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
     """Non-negative reward of each choice, ``float64[R]``, if it is independent of nature."""
-    earned = choice_reward(model.nominal, reward)
-    bad = ~((earned >= 0) & np.isfinite(earned))
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        state = int(model.nominal.host.state[row])
-        raise ValueError(
-            f"the reward of state {state}, choice "
-            f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
-            "be finite and at least 0."
-        )
+    earned = nonnegative_reward(model.nominal, reward, "total rewards")
     of = reward_structure(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)

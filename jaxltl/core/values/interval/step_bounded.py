@@ -15,9 +15,14 @@ from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.array_types import Floats
 from jaxltl.core.models.protocols import Array
-from jaxltl.core.models.sparse import Reward
-from jaxltl.core.values.interval.robust import entry_reward, nature_direction
-from jaxltl.core.values.engine.state_quantities import solution_from_error, state_reward, state_mask
+from jaxltl.core.models.sparse import Reward, reward_structure
+from jaxltl.core.values.interval.robust import nature_direction
+from jaxltl.core.values.engine.state_quantities import (
+    solution_from_error,
+    state_mask,
+    state_reward,
+    transition_reward,
+)
 
 
 def robust_next_probability(
@@ -131,8 +136,9 @@ def robust_cumulative_reward(
       >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="cooperative").value.tolist()
       [1.5, 0.0]
     """
-    zero = np.zeros(require_interval(model).num_states)
-    return _earned(model, entry_reward(model, reward), zero, num_steps, objective, nature)
+    world = require_interval(model).nominal
+    earned = transition_reward(world, reward_structure(world, reward))
+    return _earned(model, earned, np.zeros(world.num_states), num_steps, objective, nature)
 
 
 def robust_instantaneous_reward(

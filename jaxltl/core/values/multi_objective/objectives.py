@@ -10,15 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.translate import Task
 from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.automata.table import explore
+from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief, describe
 from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
-from jaxltl.core.values.engine.state_quantities import finite_reward, state_mask
+from jaxltl.core.values.engine.state_quantities import nonnegative_reward, state_mask
 
 _MOST = 8  # probabilities at once, of which all sets are looked at
 
@@ -170,14 +171,8 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
         raise ValueError(f"{name}: stay goes with the probability of a target.")
     if objective.reward is None:
         return None
-    reward = finite_reward(model, objective.reward)[0]
-    if (reward < 0).any():
-        r = int(np.flatnonzero(reward < 0)[0])
-        raise ValueError(
-            f"{name}: the reward of a choice of state {model.host.state[r]} is {reward[r]:.6g}; "
-            "expected total rewards need rewards of at least 0."
-        )
-    return reward
+    use = "expected total rewards"
+    return nonnegative_reward(model, objective.reward, use, f"{name}: the reward")
 
 
 def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracker | None:
@@ -221,39 +216,26 @@ def _product(
     model: SparseMDP, trackers: list[_Tracker], all_end: bool
 ) -> tuple[SparseProduct, np.ndarray]:
     """The product with all monitors, and the state of each in each joint one, ``int[J, n]``."""
-    first = np.flatnonzero(np.asarray(model.initial) > 0)
     letters: Integers = np.zeros((model.num_states, len(trackers)), np.int64)
     for i, x in enumerate(trackers):
         letters[:, i] = x.letter
     shown, letter = np.unique(letters, axis=0, return_inverse=True)
-    letter = letter.reshape(-1)
+    letter, words = letter.reshape(-1), shown.tolist()
+    tables = [x.delta.tolist() for x in trackers]
 
-    def after(members: np.ndarray, read: np.ndarray) -> np.ndarray:
-        if not trackers:
-            return members
-        return np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)], -1)
+    def step(members: tuple[int, ...]) -> list[tuple[tuple[int, ...], int]]:
+        rows = [table[q] for table, q in zip(tables, members, strict=True)]
+        return [(tuple(r[x] for r, x in zip(rows, word, strict=True)), 0) for word in words]
 
-    begin = np.tile([x.first for x in trackers], (first.size, 1)).reshape(first.size, -1)
-    begin = after(begin.astype(np.int64), letters[first])
-    known: Integers = np.zeros((0, len(trackers)), np.int64)
-    frontier, steps = np.unique(begin, axis=0), []
-    codes: dict[tuple[int, ...], int] = {}
-    while len(frontier):
-        for member in frontier.tolist():
-            codes[tuple(member)] = len(codes)
-        known = np.vstack([known, frontier])
-        reached = after(np.repeat(frontier, len(shown), 0), np.tile(shown, (len(frontier), 1)))
-        steps.append(reached)
-        new = [x for x in map(tuple, np.unique(reached, axis=0).tolist()) if x not in codes]
-        frontier = np.array(new, np.int64).reshape(len(new), len(trackers))
-    delta = np.array([codes[tuple(x)] for x in np.vstack(steps).tolist()]).reshape(
-        len(known), len(shown)
-    )
-    still = np.full(len(known), all_end)
+    # The first joint state is that of before anything is read.
+    order, rows, _ = explore(tuple(x.first for x in trackers), step)
+    members, delta = np.array(order, np.int64).reshape(len(order), len(trackers)), np.stack(rows)
+    still = np.full(len(order), all_end)
     for i, x in enumerate(trackers):
-        still &= x.decided[known[:, i]]
-    memory = np.array([codes[tuple(x)] for x in begin.tolist()])
-    return sparse_product(model.host, delta, letter, (first, memory), still=still), known
+        still &= x.decided[members[:, i]]
+    first = np.flatnonzero(np.asarray(model.initial) > 0)
+    start = first, delta[0, letter[first]]
+    return sparse_product(model.host, delta, letter, start, still=still), members
 
 
 def _priorities(

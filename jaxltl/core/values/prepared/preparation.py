@@ -14,13 +14,14 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
-from jaxltl.core.models.sparse import Rewards, choice_reward, refuse_underflow
+from jaxltl.core.models.sparse import Rewards, refuse_underflow
 from jaxltl.core.pretty_print import array_text, brief, count
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
 from jaxltl.core.types import require_states
 from jaxltl.core.values.engine.block_sweeps import Blocks
+from jaxltl.core.values.engine.state_quantities import nonnegative_reward
 from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval
 
@@ -178,13 +179,7 @@ def prepare(
     if stay is not None:
         require_states("stay", stay, model.state_shape)
         stay = np.asarray(stay, bool).ravel()
-    cost = None if reward is None else choice_reward(sparse, reward)
-    if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
-        r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
-        raise ValueError(
-            f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
-            "prepared solves need finite rewards of at least 0."
-        )
+    cost = None if reward is None else nonnegative_reward(sparse, reward, "prepared solves")
     if objective == "policy":
         plan = plan_policy(host, target, stay, cost)
     elif cost is None:
