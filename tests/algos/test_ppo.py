@@ -19,7 +19,7 @@ from jaxltl.algos.common import learner
 from jaxltl.algos.common.actor_critic import orthogonal
 from jaxltl.algos.common.moments import scale_of, updated_moments
 from jaxltl.algos.common.schedules import Linear
-from jaxltl.algos.ppo import _collect as collecting
+from jaxltl.algos.ppo import collection as collecting
 from jaxltl.algos.ppo import learner as updating
 from jaxltl.core.environments.environment import Finite, Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode

@@ -8,6 +8,7 @@ dies, that file and the parts that it names are complete.
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -80,16 +81,12 @@ def _part(path: Path, process: int, token: np.ndarray) -> Path:
 
 def parts_of(path: Path) -> list[Path]:
     """All parts in the directory of a file, named by it or not."""
-    return sorted(path.parent.glob(f"{_literal(path.name)}.part-*"))
+    return sorted(path.parent.glob(f"{glob.escape(path.name)}.part-*"))
 
 
 def unfinished(path: Path) -> list[Path]:
     """Temporary files that killed processes left of a file and of its parts."""
-    return sorted(path.parent.glob(f".{_literal(path.name)}.*"))
-
-
-def _literal(name: str) -> str:
-    return "".join(f"[{x}]" if x in "*?[" else x for x in name)
+    return sorted(path.parent.glob(f".{glob.escape(path.name)}.*"))
 
 
 def remove(paths: list[Path]) -> None:

@@ -15,7 +15,7 @@ from jaxltl.algos.grounding.automaton_search import (
     LearnedAutomaton as LearnedAutomaton,
     learn_automaton as learn_automaton,
 )
-from jaxltl.algos.grounding.history import (
+from jaxltl.algos.grounding.hidden_modes import (
     HistoryTables as HistoryTables,
     fit_history as fit_history,
 )

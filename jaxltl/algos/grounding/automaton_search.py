@@ -172,18 +172,16 @@ def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, 
                 continue
             new, events = moves.copy(), event.copy()
             new[q, letter], events[q, letter] = to, rewarded
-            if len(_reachable(new)) == num_memory:
+            if _all_reachable(new):
                 found.append((new, events))
     return found
 
 
-def _reachable(moves: np.ndarray) -> set[int]:
-    seen, queue = {0}, [0]
-    while queue:
-        new = {int(q) for q in moves[queue.pop()]} - seen
-        seen |= new
-        queue += sorted(new)
-    return seen
+def _all_reachable(moves: np.ndarray) -> bool:
+    """True if the first state reaches all others."""
+    steps = np.eye(len(moves), dtype=bool)
+    steps[np.arange(len(moves))[:, None], moves] = True
+    return bool(np.linalg.matrix_power(steps.astype(float), len(moves))[0].all())
 
 
 def _scores(problem: Problem, discount: float, moves: np.ndarray, event: np.ndarray) -> np.ndarray:

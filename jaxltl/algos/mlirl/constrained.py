@@ -60,36 +60,40 @@ def constrained_points(
     """
     points: list[Point] = []
     for i, start in enumerate(starts):
-        end = most * (i + 1) // len(starts)
-        known: dict[bytes, Point] = {}
-
-        def at(x: np.ndarray, known: dict[bytes, Point] = known, end: int = end) -> Point:
-            key = x.tobytes()
-            if key not in known:
-                if len(points) >= end:
-                    raise _BudgetSpent
-                known[key] = evaluate(x.copy())
-                points.append(known[key])
-            return known[key]
-
-        def loss(x: np.ndarray, at: Callable[..., Point] = at) -> tuple[float, np.ndarray]:
-            point = at(x)
-            # SLSQP shortens a step to a loss this large; it cannot use an infinite one.
-            if not point.is_finite:
-                return 1e12, 0 * x
-            return point.loss, np.asarray(point.gradient, float)
-
-        def excess(x: np.ndarray, at: Callable[..., Point] = at) -> float:
-            point = at(x)
-            return point.probability - required - _MARGIN if point.is_finite else -1.0
-
-        def slope(x: np.ndarray, at: Callable[..., Point] = at) -> np.ndarray:
-            point = at(x)
-            return np.asarray(point.slope, float) if point.is_finite else 0 * x
-
-        constraint = {"type": "ineq", "fun": excess, "jac": slope}
-        options = {"maxiter": most, "ftol": _PRECISION}
-        with contextlib.suppress(_BudgetSpent):
-            begin = np.asarray(start, float)
-            minimize(loss, begin, jac=True, method="SLSQP", constraints=constraint, options=options)
+        budget = most * (i + 1) // len(starts) - len(points)
+        points += _search(evaluate, np.asarray(start, float), required, budget)
     return [point for point in points if point.is_finite]
+
+
+def _search(
+    evaluate: Callable[[np.ndarray], Point], start: np.ndarray, required: float, budget: int
+) -> list[Point]:
+    """The points that SLSQP evaluates from one start."""
+    known: dict[bytes, Point] = {}
+
+    def at(x: np.ndarray) -> Point:
+        key = x.tobytes()
+        if key not in known:
+            if len(known) >= budget:
+                raise _BudgetSpent
+            known[key] = evaluate(x.copy())
+        return known[key]
+
+    # SLSQP shortens a step to a loss this large; it cannot use an infinite one.
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        point = at(x)
+        return (point.loss, point.gradient) if point.is_finite else (1e12, 0 * x)
+
+    def excess(x: np.ndarray) -> float:
+        point = at(x)
+        return point.probability - required - _MARGIN if point.is_finite else -1.0
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        point = at(x)
+        return point.slope if point.is_finite else 0 * x
+
+    constraint = {"type": "ineq", "fun": excess, "jac": slope}
+    options = {"maxiter": max(budget, 1), "ftol": _PRECISION}
+    with contextlib.suppress(_BudgetSpent):
+        minimize(loss, start, jac=True, method="SLSQP", constraints=constraint, options=options)
+    return list(known.values())

@@ -70,8 +70,16 @@ from jaxltl.algos.common.collection import acting, minibatch_epochs
 from jaxltl.algos.common.moments import no_moments
 from jaxltl.algos.common.schedules import at
 from jaxltl.algos.common.settings import require_own
-from jaxltl.algos.ppo._collect import Rows, collected, evaluate
-from jaxltl.algos.ppo.state import Hparams, Metrics, Problem, State, Walkers
+from jaxltl.algos.ppo.collection import (
+    Hparams,
+    Metrics,
+    Problem,
+    Rows,
+    State,
+    Walkers,
+    collected,
+    evaluate,
+)
 from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
