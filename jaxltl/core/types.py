@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import reduce
 from typing import Any, TypeVar
 
@@ -62,18 +61,20 @@ class NotConverged(RuntimeError):
     """
 
 
-def _facts(solution: Any) -> Iterator[str]:
+def _facts(solution: Any) -> tuple[str, ...]:
     more = solution.status.shape
     counts = enum_counts(solution.status, Status)
-    yield f"{batch_text(more)}: {counts}" if more else counts
-    yield f"value {describe(solution.value)}"
-    yield bounds_text(solution.lower, solution.upper)
     steps = value_range(solution.num_steps)
-    yield "1 step" if steps == "1" else f"{steps} steps"
-    yield f"residual {value_range(solution.residual)}"
-    yield f"by {solution.method}" if solution.method else ""
-    yield f"policy {array_text(solution.policy)}" if is_array(solution.policy) else ""
-    yield f"nature {array_text(solution.nature)}" if is_array(solution.nature) else ""
+    return (
+        f"{batch_text(more)}: {counts}" if more else counts,
+        f"value {describe(solution.value)}",
+        bounds_text(solution.lower, solution.upper),
+        "1 step" if steps == "1" else f"{steps} steps",
+        f"residual {value_range(solution.residual)}",
+        f"by {solution.method}" if solution.method else "",
+        f"policy {array_text(solution.policy)}" if is_array(solution.policy) else "",
+        f"nature {array_text(solution.nature)}" if is_array(solution.nature) else "",
+    )
 
 
 @brief(facts=_facts, drawn=True)

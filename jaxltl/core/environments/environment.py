@@ -18,7 +18,7 @@ visible; :func:`~jaxltl.core.environments.episodes.auto_reset_step` resets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypedDict, Unpack
 
@@ -48,10 +48,12 @@ class Finite:
     num: int = struct.field(pytree_node=False)
 
 
-def _space_facts(value: Box) -> Iterator[str]:
-    yield f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]"
+def _space_facts(value: Box) -> tuple[str, ...]:
     low, high = (value_range(x) for x in (value.low, value.high))
-    yield f"from {low} to {high}" if max(len(low), len(high)) < 40 else ""
+    return (
+        f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]",
+        f"from {low} to {high}" if max(len(low), len(high)) < 40 else "",
+    )
 
 
 @brief(facts=_space_facts)
@@ -175,17 +177,16 @@ def _spaces(tree: PyTree) -> str:
     return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in tree.items())})"
 
 
-def _facts(value: Environment) -> Iterator[str]:
+def _facts(value: Environment) -> tuple[str, ...]:
     one = value.actions
-    yield count(one.num, "action") if isinstance(one, Finite) else f"actions {nested_repr(one)}"
-    yield f"observations {_spaces(value.observations)}"
-    yield propositions_text(value.propositions)
-    if value.horizon is not None:
-        yield f"at most {count(value.horizon, 'step')}"
-    if value.allowed is not None:
-        yield "actions are masked"
-    if value.outcomes is not None:
-        yield "chances are told"
+    return (
+        count(one.num, "action") if isinstance(one, Finite) else f"actions {nested_repr(one)}",
+        f"observations {_spaces(value.observations)}",
+        propositions_text(value.propositions),
+        f"at most {count(value.horizon, 'step')}" if value.horizon is not None else "",
+        "actions are masked" if value.allowed is not None else "",
+        "chances are told" if value.outcomes is not None else "",
+    )
 
 
 @brief(facts=_facts)

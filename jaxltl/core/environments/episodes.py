@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -79,21 +79,20 @@ def _without_memory(
     return function(observation, key), memory
 
 
-def _facts(value: Episode) -> Iterator[str]:
+def _facts(value: Episode) -> tuple[str, ...]:
     *more, steps = value.valid.shape
-    yield batch_text(more)
-    yield f"at most {count(steps, 'step')}"
-    read = readable(value.valid)
+    first = batch_text(more), f"at most {count(steps, 'step')}"
+    read, reward, cost = (readable(x) for x in (value.valid, value.reward, value.cost))
     if read is None:
-        yield f"reward {array_text(value.reward)}"
-        return
-    yield f"made {value_range(read.sum(-1))}"
-    for name in ("reward", "cost"):
-        numbers = readable(getattr(value, name))
-        if numbers is not None and (name == "reward" or numbers.any()):
-            yield f"{name} {value_range(numbers.sum(-1))}"
-    for name in ("terminated", "truncated"):
-        yield f"{name} {value_range(getattr(value, name))}"
+        return (*first, f"reward {array_text(value.reward)}")
+    return (
+        *first,
+        f"made {value_range(read.sum(-1))}",
+        f"reward {value_range(reward.sum(-1))}" if reward is not None else "",
+        f"cost {value_range(cost.sum(-1))}" if cost is not None and cost.any() else "",
+        f"terminated {value_range(value.terminated)}",
+        f"truncated {value_range(value.truncated)}",
+    )
 
 
 @brief(facts=_facts)

@@ -7,7 +7,7 @@ verification for LTL and TLTL"). The letter of a terminal state repeats for ever
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -28,12 +28,14 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import batch_text, brief, count, enum_counts
 
 
-def _facts(value: Monitor) -> Iterator[str]:
+def _facts(value: Monitor) -> tuple[str, ...]:
     *more, states, letters = value.delta.shape
-    yield batch_text(more)
-    yield count(states, "state")
-    yield count(letters, "letter")
-    yield enum_counts(value.verdict, Verdict)
+    return (
+        batch_text(more),
+        count(states, "state"),
+        count(letters, "letter"),
+        enum_counts(value.verdict, Verdict),
+    )
 
 
 @brief(facts=_facts)

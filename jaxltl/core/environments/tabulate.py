@@ -35,14 +35,15 @@ _LIVE, _TERMINATED, _TRUNCATED = range(3)
 _EVIDENCE = ("keyless", "told", "keys", "distinct")  # from the strongest to the weakest
 
 
-def _facts(value: Table) -> Iterator[str]:
-    yield nested_repr(value.model, 92)
-    yield count(value.start.shape[-1], "beginning")
-    for name in ("terminated", "truncated"):
-        yield f"{name} {value_range(getattr(value, name))}"
-    if value.num_steps is not None:
-        yield f"at most {count(value.num_steps, 'step')}"
-    yield f"evidence {value.evidence!r}"
+def _facts(value: Table) -> tuple[str, ...]:
+    return (
+        nested_repr(value.model, 92),
+        count(value.start.shape[-1], "beginning"),
+        f"terminated {value_range(value.terminated)}",
+        f"truncated {value_range(value.truncated)}",
+        f"at most {count(value.num_steps, 'step')}" if value.num_steps is not None else "",
+        f"evidence {value.evidence!r}",
+    )
 
 
 @brief(facts=_facts)

@@ -24,7 +24,7 @@ from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import host_callback, is_traced, jit
 from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.construct.convert import keep_latest
+from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
@@ -164,7 +164,7 @@ def is_table(model: Model) -> bool:
     return isinstance(world, MDP | DenseMDP)
 
 
-@keep_latest
+@keep_with_model
 def host_graph(model: MDP | DenseMDP | Product) -> RowGraph:
     """The graph of a concrete padded model; unavailable actions are not read."""
     world = model.mdp if isinstance(model, Product) else model

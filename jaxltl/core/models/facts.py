@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from jaxltl.core.models.protocols import RowModel
@@ -16,23 +14,28 @@ from jaxltl.core.pretty_print import (
 )
 
 
-def sparse(model: RowModel) -> Iterator[str]:
+def sparse(model: RowModel) -> tuple[str, ...]:
     """Summary of a sparse model."""
-    yield batch_text(model.row_start.shape[:-1])
-    yield count(model.num_states, "state")
-    yield "a chain" if model.is_chain else count(model.num_rows, "choice")
-    yield count(model.num_transitions, "transition")
-    yield propositions_text(model.propositions)
-    yield from named_annotations(model)
-    yield initial_states(model.initial)
-    yield str(model.dtype)
+    return (
+        batch_text(model.row_start.shape[:-1]),
+        count(model.num_states, "state"),
+        "a chain" if model.is_chain else count(model.num_rows, "choice"),
+        count(model.num_transitions, "transition"),
+        propositions_text(model.propositions),
+        *named_annotations(model),
+        initial_states(model.initial),
+        str(model.dtype),
+    )
 
 
-def named_annotations(model: object) -> Iterator[str]:
+def named_annotations(model: object) -> list[str]:
     """Names of rewards, actions and variables."""
-    for noun, field in (("rewards",) * 2, ("actions", "action_names"), ("variables", "valuation")):
-        if names := getattr(model, field, ()):
-            yield f"{noun} {names_text(names)}"
+    parts = {"rewards": "rewards", "actions": "action_names", "variables": "valuation"}
+    return [
+        f"{noun} {names_text(names)}"
+        for noun, field in parts.items()
+        if (names := getattr(model, field, ()))
+    ]
 
 
 def initial_states(initial: object) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
 from typing import Generic
@@ -29,13 +29,14 @@ from jaxltl.core.models.protocols import (
 from jaxltl.core.models.sparse import SparseMDP
 
 
-def _facts(value: Game) -> Iterator[str]:
+def _facts(value: Game) -> tuple[str, ...]:
     read = readable(value.system)
-    if read is None:
-        yield f"system: {array_text(value.system)}"
-    else:
-        yield f"the system moves in {np.count_nonzero(read):,} of {count(read.size, 'state')}"
-    yield nested_repr(value.mdp, 92)
+    return (
+        f"system: {array_text(value.system)}"
+        if read is None
+        else f"the system moves in {np.count_nonzero(read):,} of {count(read.size, 'state')}",
+        nested_repr(value.mdp, 92),
+    )
 
 
 @brief(facts=_facts, drawn=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -36,13 +36,15 @@ _ENDS = ("lower", "upper", "center", "radius")
 _PREFIX = "\0"  # of the names of rewards that are ends, centers or radii
 
 
-def _facts(model: IntervalMDP) -> Iterator[str]:
-    yield from facts.sparse(model.nominal)
+def _facts(model: IntervalMDP) -> tuple[str, ...]:
     low, high = readable(model.lower), readable(model.upper)
-    if low is not None and high is not None and low.size:
-        yield f"intervals at most {number(float((high - low).max()))} wide"
-    if model.radius is not None:
-        yield f"radius {value_range(model.radius)}"
+    return (
+        *facts.sparse(model.nominal),
+        f"intervals at most {number(float((high - low).max()))} wide"
+        if low is not None and high is not None and low.size
+        else "",
+        f"radius {value_range(model.radius)}" if model.radius is not None else "",
+    )
 
 
 @brief(facts=_facts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import chex
 import jax
@@ -45,20 +45,20 @@ class _PaddedShape:
         return (self.num_states,)
 
 
-def _facts(model: MDP | DenseMDP) -> Iterator[str]:
-    yield batch_text(model.available.shape[:-2])
-    yield count(model.num_states, "state")
-    yield count(model.num_actions, "action")
+def _facts(model: MDP | DenseMDP) -> tuple[str, ...]:
     weights = model.probability if isinstance(model, MDP) else model.transition
     weight, available = readable(weights), readable(model.available)
-    if weight is None or available is None:
-        yield array_text(weights)
-    else:
-        yield count(np.count_nonzero((weight > 0) & available[..., None]), "transition")
-    yield propositions_text(model.propositions)
-    yield facts.initial_states(model.initial)
-    if weight is not None:
-        yield str(weights.dtype)
+    return (
+        batch_text(model.available.shape[:-2]),
+        count(model.num_states, "state"),
+        count(model.num_actions, "action"),
+        array_text(weights)
+        if weight is None or available is None
+        else count(np.count_nonzero((weight > 0) & available[..., None]), "transition"),
+        propositions_text(model.propositions),
+        facts.initial_states(model.initial),
+        str(weights.dtype) if weight is not None else "",
+    )
 
 
 @brief(facts=_facts, drawn=True)

@@ -6,7 +6,7 @@ the value of a successor is read.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from functools import singledispatch
 from typing import Generic, cast, overload
 
@@ -35,15 +35,16 @@ struct.register(
 )
 
 
-def _facts(model: Product) -> Iterator[str]:
-    yield batch_text(model.automaton.delta.shape[:-2])
+def _facts(model: Product) -> tuple[str, ...]:
     memories = count(model.num_memory, "memory", "memories")
-    yield f"{count(model.num_states, 'state')} with {memories}"
-    yield nested_repr(model.mdp, 92)
-    yield f"beside {nested_repr(model.automaton, 92)}"
-    yield f"labels read on {model.label_on}"
-    if model.allowed is not None:
-        yield f"allowed: {describe(model.allowed)}"
+    return (
+        batch_text(model.automaton.delta.shape[:-2]),
+        f"{count(model.num_states, 'state')} with {memories}",
+        nested_repr(model.mdp, 92),
+        f"beside {nested_repr(model.automaton, 92)}",
+        f"labels read on {model.label_on}",
+        f"allowed: {describe(model.allowed)}" if model.allowed is not None else "",
+    )
 
 
 @brief(facts=_facts, drawn=True)

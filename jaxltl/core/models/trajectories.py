@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import chex
@@ -29,13 +29,14 @@ struct.register(
 )
 
 
-def _facts(value: Trajectories) -> Iterator[str]:
+def _facts(value: Trajectories) -> tuple[str, ...]:
     *more, number_of, longest = value.state.shape
-    yield batch_text(more)
-    yield f"{number_of:,} of at most {count(longest, 'step')}"
-    yield f"lengths {value_range(value.length)}"
-    if value.state_shape is not None:
-        yield f"states {value.state_shape}"
+    return (
+        batch_text(more),
+        f"{number_of:,} of at most {count(longest, 'step')}",
+        f"lengths {value_range(value.length)}",
+        f"states {value.state_shape}" if value.state_shape is not None else "",
+    )
 
 
 @brief(facts=_facts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,22 +16,27 @@ from jaxltl.core.statistics.binomial import anytime, bounded_mean, clopper_pears
 from jaxltl.core.status import Status
 
 
-def _evaluation_facts(value: Evaluation) -> Iterator[str]:
-    yield value.status.name
-    yield count(value.num_episodes, "episode")
-    for name in ("success", "reward", "cost", "length"):
-        found = getattr(value, name)
-        if found is not None and (name != "cost" or found.mean):
-            yield f"{name} {number(found.mean)} in [{found.lower:.6g}, {found.upper:.6g}]"
-    yield f"confidence {value.confidence:g}"
-    if value.threshold is not None:
-        known = {True: "met", False: "not met", None: "open"}[value.decision]
-        yield f"threshold {value.threshold:g} {known}"
+def _evaluation_facts(value: Evaluation) -> tuple[str, ...]:
+    estimates = {name: getattr(value, name) for name in ("success", "reward", "cost", "length")}
+    decision = {True: "met", False: "not met", None: "open"}[value.decision]
+    return (
+        value.status.name,
+        count(value.num_episodes, "episode"),
+        *(
+            f"{name} {number(x.mean)} in [{x.lower:.6g}, {x.upper:.6g}]"
+            for name, x in estimates.items()
+            if x is not None and (name != "cost" or x.mean)
+        ),
+        f"confidence {value.confidence:g}",
+        f"threshold {value.threshold:g} {decision}" if value.threshold is not None else "",
+    )
 
 
-def _estimate_facts(value: Estimate) -> Iterator[str]:
-    yield f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]"
-    yield value.method
+def _estimate_facts(value: Estimate) -> tuple[str, ...]:
+    return (
+        f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]",
+        value.method,
+    )
 
 
 @brief(codes={"verdict": Verdict})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -34,15 +34,17 @@ class Progress(NamedTuple):
     step: Array
 
 
-def _facts(value: FiniteMemoryPolicy) -> Iterator[str]:
+def _facts(value: FiniteMemoryPolicy) -> tuple[str, ...]:
     *more, states, memories = value.next_memory.shape
-    yield batch_text(more)
-    yield count(states, "state")
-    yield count(memories, "memory", "memories")
-    yield f"mixes {count(value.num_actions, 'action')}" if value.is_random else "deterministic"
-    yield f"over {count(len(value.action), 'step')}" if value.has_horizon else ""
-    yield f"action {array_text(value.action)}"
-    yield f"labels read on {value.label_on}"
+    return (
+        batch_text(more),
+        count(states, "state"),
+        count(memories, "memory", "memories"),
+        f"mixes {count(value.num_actions, 'action')}" if value.is_random else "deterministic",
+        f"over {count(len(value.action), 'step')}" if value.has_horizon else "",
+        f"action {array_text(value.action)}",
+        f"labels read on {value.label_on}",
+    )
 
 
 @brief(facts=_facts)

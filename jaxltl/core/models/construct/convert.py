@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 from functools import wraps
 from typing import TypeVar
@@ -137,23 +136,18 @@ M = TypeVar("M")
 R = TypeVar("R")
 
 
-def keep_latest(convert: Callable[[M], R]) -> Callable[[M], R]:
-    """Keeps the result for the latest model while that is alive and none of its arrays can change."""
-    kept: dict[str, tuple[weakref.ref[M], R]] = {}
+def keep_with_model(convert: Callable[[M], R]) -> Callable[[M], R]:
+    """Keeps the result with the model if none of the model's arrays can change."""
+    name = f"_{convert.__module__}.{convert.__name__}"
 
     @wraps(convert)
     def wrapper(model: M) -> R:
-        latest = kept.get("latest")
-        if latest is not None and latest[0]() is model:
-            return latest[1]
+        if name in vars(model):
+            return vars(model)[name]  # type: ignore[no-any-return]
         found = convert(model)
-        if all(isinstance(x, jax.Array) for x in jax.tree.leaves(model)):
-            kept["latest"] = weakref.ref(model, forget), found
+        fixed = all(isinstance(x, jax.Array) for x in jax.tree.leaves(model))
+        if fixed and found is not model:
+            vars(model)[name] = found
         return found
-
-    def forget(reference: weakref.ref[M]) -> None:
-        latest = kept.get("latest")
-        if latest is not None and latest[0] is reference:
-            del kept["latest"]
 
     return wrapper

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -27,12 +27,14 @@ _ANY = "any"  # the only action of an unvisited state
 Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
 
 
-def _facts(value: TransitionCounts) -> Iterator[str]:
+def _facts(value: TransitionCounts) -> tuple[str, ...]:
     samples = readable(value.count)
-    yield count(samples.sum(), "sample") if samples is not None else ""
-    yield f"of {count(len(value.count), 'transition')}"
-    yield f"{count(len(value.states), 'state')}: {names_text(value.states)}"
-    yield f"{count(len(value.actions), 'action')}: {names_text(value.actions)}"
+    return (
+        count(samples.sum(), "sample") if samples is not None else "",
+        f"of {count(len(value.count), 'transition')}",
+        f"{count(len(value.states), 'state')}: {names_text(value.states)}",
+        f"{count(len(value.actions), 'action')}: {names_text(value.actions)}",
+    )
 
 
 @brief(facts=_facts)

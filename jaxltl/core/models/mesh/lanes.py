@@ -147,20 +147,23 @@ def require_split(name: str, sharding: NamedSharding | None, **sizes: int) -> No
             )
 
 
-def split_axis(tree: PyTree, sharding: NamedSharding | None, axis: int = 0) -> PyTree:
-    """A tree with one axis of its arrays split over the devices of a sharding; None: unchanged. Under ``jit``."""
+def split_axis(tree: PyTree, sharding: NamedSharding | None, axis: int | None = 0) -> PyTree:
+    """A tree with one axis of its arrays split over the devices of a sharding, under ``jit``.
+
+    Replicated for the axis None; unchanged for no sharding.
+    """
     if sharding is None:
         return tree
-    spec = PartitionSpec(*[None] * axis, _first_axes(sharding))
-    return jax.tree.map(lambda x: _constrained(x, _here(sharding.mesh), spec), tree)
+    mesh, spec = _here(sharding.mesh), _split(sharding, axis)
+    return jax.tree.map(lambda x: _constrained(x, mesh, spec), tree)
 
 
-def replicate(tree: PyTree, sharding: NamedSharding | None) -> PyTree:
-    """A tree with arrays replicated over the devices of a sharding; None: unchanged."""
-    if sharding is None:
-        return tree
-    mesh = _here(sharding.mesh)
-    return jax.tree.map(lambda x: _constrained(x, mesh, PartitionSpec()), tree)
+replicate = partial(split_axis, axis=None)
+
+
+def _split(sharding: NamedSharding, axis: int | None) -> PartitionSpec:
+    """The spec that splits an axis as a sharding splits its first one."""
+    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _first_axes(sharding))
 
 
 def shard_function(
@@ -172,17 +175,13 @@ def shard_function(
     """A function on each device's share of the arguments, split along `axes`, under ``jit``; None: unchanged."""
     if sharding is None:
         return function
-    names, mesh = _first_axes(sharding), _here(sharding.mesh)
-
-    def spec(axis: int | None) -> PartitionSpec:
-        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, names)
-
+    spec = partial(_split, sharding)
     return jax.shard_map(
         function,
-        mesh=mesh,
+        mesh=_here(sharding.mesh),
         in_specs=tuple(map(spec, axes)),
         out_specs=jax.tree.map(spec, out_axes, is_leaf=lambda x: x is None),
-        axis_names=set(names),
+        axis_names=set(_first_axes(sharding)),
         check_vma=False,
     )
 

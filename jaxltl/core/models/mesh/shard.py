@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -35,12 +35,14 @@ _PADDED = 1.25  # size of a single table of all rows, relative to the transition
 _HALO = 0.6  # fraction of the other devices' values from which on all of them are sent
 
 
-def _part_facts(value: ModelPart) -> Iterator[str]:
+def _part_facts(value: ModelPart) -> tuple[str, ...]:
     rows = len(value.entry_start) - 1
-    yield count(rows if value.row_start is None else len(value.row_start) - 1, "state")
-    yield count(rows, "choice")
-    yield count(len(value.successor), "transition")
-    yield from facts.named_annotations(value)
+    return (
+        count(rows if value.row_start is None else len(value.row_start) - 1, "state"),
+        count(rows, "choice"),
+        count(len(value.successor), "transition"),
+        *facts.named_annotations(value),
+    )
 
 
 @brief(facts=_part_facts)

@@ -6,7 +6,7 @@ first, then those received before a sweep by one exchange, of a halo or of all v
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -35,15 +35,17 @@ class RowTable(NamedTuple):
         self.successor[place], self.probability[place] = successor, probability
 
 
-def _facts(model: ShardedMDP) -> Iterator[str]:
-    yield count(model.num_given, "state")
-    yield count(model.num_actions, "action")
+def _facts(model: ShardedMDP) -> tuple[str, ...]:
     rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
-    yield f"rows {truncate(rows)}"
-    yield propositions_text(model.propositions)
-    yield from facts.named_annotations(model)
-    yield f"on {count(model.mesh.shape[model.axis], 'device')} along {model.axis!r}"
-    yield str(model.dtype)
+    return (
+        count(model.num_given, "state"),
+        count(model.num_actions, "action"),
+        f"rows {truncate(rows)}",
+        propositions_text(model.propositions),
+        *facts.named_annotations(model),
+        f"on {count(model.mesh.shape[model.axis], 'device')} along {model.axis!r}",
+        str(model.dtype),
+    )
 
 
 @brief(facts=_facts)

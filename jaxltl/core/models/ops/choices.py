@@ -6,7 +6,7 @@ methods.
 
 from __future__ import annotations
 
-from functools import singledispatch
+from functools import reduce, singledispatch
 from typing import NamedTuple, Protocol, TypeAlias
 
 import chex
@@ -18,8 +18,7 @@ from numpy.typing import DTypeLike
 from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
+from jaxltl.core import struct, validation
 
 
 def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
@@ -34,10 +33,7 @@ def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
     quantity = jnp.where(available, quantity, -jnp.inf)
     if quantity.shape[-1] > kernels.UNROLL:
         return quantity.max(axis=-1)
-    best = quantity[..., 0]
-    for a in range(1, quantity.shape[-1]):
-        best = jnp.maximum(best, quantity[..., a])
-    return best
+    return reduce(jnp.maximum, [quantity[..., a] for a in range(quantity.shape[-1])])
 
 
 def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -71,8 +67,8 @@ def is_deterministic(policy: chex.Array) -> bool:
     return jnp.issubdtype(kind, jnp.integer)
 
 
-@brief
-class Actions(NamedTuple):
+@struct.dataclass
+class Actions:
     """Choices padded to the same number of actions in each state."""
 
     available: jax.Array  # bool[S, A]
@@ -101,8 +97,7 @@ class Actions(NamedTuple):
         """The maximum and the first maximiser, ``[S]`` each."""
         return action_argmax(quantity, self.available)
 
-    def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return first_action(condition)
+    first = staticmethod(first_action)
 
     def all(self, condition: jax.Array) -> jax.Array:
         """``bool[S]``, True where a condition holds for all entries of a state."""
@@ -121,9 +116,7 @@ class Actions(NamedTuple):
     def softmax(self, logits: jax.Array) -> jax.Array:
         return jax.nn.softmax(logits, axis=-1)
 
-    def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
-        """``sum_a pi(s, a) x(s, a)`` for weights, or integers that choose an action in each state."""
-        return action_mean(policy, quantity)
+    mean = staticmethod(action_mean)
 
     def one_hot(self, choice: jax.Array, dtype: DTypeLike) -> jax.Array:
         return jax.nn.one_hot(choice, self.shape[-1], dtype=dtype)
@@ -137,8 +130,8 @@ class Actions(NamedTuple):
         return jnp.stack(columns, axis=-1).reshape(self.shape)
 
 
-@brief
-class Columns(NamedTuple):
+@struct.dataclass
+class Columns:
     """Padded choices as an array ``[N, ...]`` for each action; weight 0 and value -inf where unavailable."""
 
     def spread(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
@@ -146,16 +139,10 @@ class Columns(NamedTuple):
         return [x] * len(like)
 
     def sum(self, quantity: list[jax.Array]) -> jax.Array:
-        total = quantity[0]
-        for x in quantity[1:]:
-            total = jnp.add(total, x)
-        return total
+        return reduce(jnp.add, quantity)
 
     def max(self, quantity: list[jax.Array]) -> jax.Array:
-        best = quantity[0]
-        for x in quantity[1:]:
-            best = jnp.maximum(best, x)
-        return best
+        return reduce(jnp.maximum, quantity)
 
     def best(self, quantity: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
         """The maximum, and weight one on the first maximiser."""
@@ -181,8 +168,12 @@ class Columns(NamedTuple):
         return list(packed)
 
 
-@brief
-class Rows(NamedTuple):
+def _unchanged(quantity: jax.Array) -> jax.Array:
+    return quantity
+
+
+@struct.dataclass
+class Rows:
     """Choices without padding, grouped by state; quantities have the shape ``[R, ...]`` in every layout."""
 
     state: jax.Array  # int32[R], ascending
@@ -271,17 +262,7 @@ class Rows(NamedTuple):
         best, row = self.argmax(quantity)
         return best, self.one_hot(row, best.dtype)
 
-    def columns(self, quantity: jax.Array) -> jax.Array:
-        return quantity
-
-    def whole(self, quantity: jax.Array) -> jax.Array:
-        return quantity
-
-    def packed(self, quantity: jax.Array) -> jax.Array:
-        return quantity
-
-    def unpacked(self, quantity: jax.Array) -> jax.Array:
-        return quantity
+    columns = whole = packed = unpacked = staticmethod(_unchanged)
 
 
 Layout: TypeAlias = Columns | Rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import chex
@@ -23,10 +23,12 @@ Ends = Array  # for all parameters, for each name, or float[D]
 _TRIALS = 64  # candidate points for a valid model
 
 
-def _facts(model: ParametricMDP) -> Iterator[str]:
+def _facts(model: ParametricMDP) -> tuple[str, ...]:
     ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
-    yield f"{names_text((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
-    yield nested_repr(model.model, 92)
+    return (
+        names_text((f"{name} in [{low:.6g}, {high:.6g}]" for name, low, high in ends), 90),
+        nested_repr(model.model, 92),
+    )
 
 
 @brief(facts=_facts)

@@ -17,7 +17,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.construct.convert import keep_latest
+from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
@@ -216,7 +216,7 @@ def rows_of_model(model: Model) -> SparseMDP:
     return _rows(model.mdp if isinstance(model, Game) else model)
 
 
-_rows = keep_latest(to_sparse)
+_rows = keep_with_model(to_sparse)
 
 
 def on_rows(sparse: SparseMDP, quantity: Array) -> Array:
