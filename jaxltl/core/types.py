@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import reduce
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import chex
 import jax
@@ -191,8 +191,7 @@ def worst(*statuses: chex.Array, axis: int | None = None) -> jax.Array:
     """The most severe of several statuses; of one batch, along an axis or of all of it."""
     if len(statuses) == 1:
         return jnp.max(statuses[0], axis=axis)
-    found: jax.Array = reduce(jnp.maximum, statuses)
-    return found
+    return cast(jax.Array, reduce(jnp.maximum, statuses))
 
 
 def row_tolerance(dtype: object) -> float:

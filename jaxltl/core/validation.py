@@ -11,7 +11,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -125,8 +125,7 @@ def first_true(mask: Any) -> list[Any]:
     ([1], [])
     """
     place = np.argwhere(mask)[:1]
-    found: list[Any] = (place[:, 0] if place.shape[1] == 1 else place).tolist()
-    return found
+    return cast(list[Any], (place[:, 0] if place.shape[1] == 1 else place).tolist())
 
 
 def float_array(name: str, value: object) -> Floats:

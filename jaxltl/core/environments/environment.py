@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack, cast
 
 import jax
 import jax.numpy as jnp
@@ -333,13 +333,15 @@ def as_partial(function: Callable[..., PyTree], name: str = "function") -> Parti
 
 def require_environment(environment: object) -> Environment:
     """An :class:`Environment`, or that of an object with the property `environment`; else ValueError."""
-    found: Environment = validation.instance(
-        "environment",
-        getattr(environment, "environment", environment),
+    return cast(
         Environment,
-        "one of make_environment",
+        validation.instance(
+            "environment",
+            getattr(environment, "environment", environment),
+            Environment,
+            "one of make_environment",
+        ),
     )
-    return found
 
 
 def require_key(key: Key) -> Key:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,14 +28,16 @@ from jaxltl.core.pretty_print import array_text, batch_text, brief, count, reada
 
 def require_agent(agent: object) -> Agent:
     """Raises ValueError for anything but an :class:`Agent`."""
-    found: Agent = validation.instance(
-        "agent",
-        agent,
+    return cast(
         Agent,
-        "an Agent, such as ppo.policy(state, problem, hparams), or "
-        "make_agent(function) of (observation, key)",
+        validation.instance(
+            "agent",
+            agent,
+            Agent,
+            "an Agent, such as ppo.policy(state, problem, hparams), or "
+            "make_agent(function) of (observation, key)",
+        ),
     )
-    return found
 
 
 @struct.dataclass

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -149,8 +151,7 @@ def _step_of_two(
     key, other = jax.random.split(key)
     reply = jax.random.categorical(other, jnp.asarray(opponent)[state])
     mine = jnp.asarray(system)[state]
-    found: Timestep = step(state, jnp.where(mine, action, reply).astype(jnp.int32), key)
-    return found
+    return cast(Timestep, step(state, jnp.where(mine, action, reply).astype(jnp.int32), key))
 
 
 def _outcomes_of_two(

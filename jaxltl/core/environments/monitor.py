@@ -8,7 +8,7 @@ verification for LTL and TLTL"). The letter of a terminal state repeats for ever
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -155,8 +155,7 @@ def trace_verdicts(monitor: Monitor, letters: Array, length: Array | None = None
         )
     counts = jnp.broadcast_to(jnp.arange(steps) < length[..., None], letters.shape)
     _check_range(monitor, letters, length, counts)
-    found: jax.Array = _scan(monitor, letters, counts)
-    return found
+    return cast(jax.Array, _scan(monitor, letters, counts))
 
 
 @jax.jit  # so that calls outside of jit share one compilation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -273,8 +273,7 @@ def _codes(kind: _Kind, plain: PyTree) -> tuple[np.ndarray, np.ndarray]:
         jax.tree.map(lambda x, n=rows: np.asarray(x)[:n], _codes_of_batch(kind, batch))
         for rows, batch in _batches(plain, len(jax.tree.leaves(plain)[0]), _BATCH)
     ]
-    found: tuple[np.ndarray, np.ndarray] = _joined(parts)
-    return found
+    return cast(tuple[np.ndarray, np.ndarray], _joined(parts))
 
 
 def _fits(worlds: PyTree, shape: PyTree) -> bool:

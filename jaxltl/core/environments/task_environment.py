@@ -532,8 +532,7 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
 
 
 def _stacked(trees: Sequence[_Tree]) -> _Tree:
-    made: _Tree = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(row) for row in x]), *trees)
-    return made
+    return cast(_Tree, jax.tree.map(lambda *x: jnp.stack([jnp.asarray(row) for row in x]), *trees))
 
 
 def _structure(tree: PyTree) -> PyTree:

@@ -346,8 +346,7 @@ class _Rows:
         return (np.diff(self.entry_start) + 2) * np.finfo(np.float64).eps
 
     def sums(self, x: np.ndarray) -> np.ndarray:
-        result: np.ndarray = np.add.reduceat(x, self.entry_start[:-1])
-        return result
+        return np.add.reduceat(x, self.entry_start[:-1])
 
     def require(self, good: np.ndarray, text: Callable[[int], str], *, entries: bool) -> None:
         """Raises ValueError, naming the choice, unless all rows or entries are good."""
@@ -486,8 +485,7 @@ def _around(rows: _Rows) -> _Rows:
 def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
     """``x + y``, rounded down (-1) or up (1)."""
     total, rest = two_sum(x, y)
-    result: np.ndarray = np.where(side * rest > 0, np.nextafter(total, side * np.inf), total)
-    return result
+    return np.where(side * rest > 0, np.nextafter(total, side * np.inf), total)
 
 
 def _pointed(rows: _Rows) -> _Rows:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from collections.abc import Mapping, Sequence
 
 import chex
@@ -365,8 +367,7 @@ def checked_initial(
     if (small := underflows(initial, dtype)) is not None:
         s = int(np.argmax(small))
         raise ValueError(f"initial probability of state {s} {underflow_text(initial[s], dtype)}.")
-    result: np.ndarray = initial
-    return result
+    return cast(np.ndarray, initial)
 
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:

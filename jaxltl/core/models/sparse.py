@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeAlias, TypedDict, Unpack
+from typing import Any, TypeAlias, TypedDict, Unpack, cast
 
 import chex
 import jax
@@ -152,8 +152,7 @@ class SparseMDP:
     @property
     def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
-        result: np.dtype = np.dtype(self.probability.dtype)
-        return result
+        return cast(np.dtype, np.dtype(self.probability.dtype))
 
     @cached_property
     def host(self) -> HostMDP:
@@ -206,8 +205,7 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
     """
     reward = reward_structure(model, reward)
     if is_traced((model, reward)):
-        result: np.ndarray = _traced_reward(model, reward)
-        return result
+        return cast(np.ndarray, _traced_reward(model, reward))
     host = model.host
     total = np.zeros(host.num_rows)
     if reward.state is not None:
@@ -518,8 +516,7 @@ def _checked_action(action: Array, num_rows: int, names: tuple[str, ...]) -> np.
             f"actions go from {action.min()} to {action.max()}; there are "
             f"{len(names)} names, for 0 to {len(names) - 1}."
         )
-    result: np.ndarray = action.astype(np.int32)
-    return result
+    return cast(np.ndarray, action.astype(np.int32))
 
 
 def _canonical(
@@ -573,8 +570,7 @@ def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> 
     shape = (entry_start.size - 1, int(successor.max()) + 1)
     within = csr_array((place, successor.copy(), entry_start), shape=shape)
     within.sort_indices()
-    result: np.ndarray = within.data
-    return result
+    return cast(np.ndarray, within.data)
 
 
 def scaled(
@@ -592,5 +588,4 @@ def scaled(
     wrong = off > (count + 2) * np.finfo(np.float64).eps
     if not wrong.any():
         return probability
-    result: np.ndarray = probability / np.repeat(np.where(wrong, total, 1), count)
-    return result
+    return cast(np.ndarray, probability / np.repeat(np.where(wrong, total, 1), count))

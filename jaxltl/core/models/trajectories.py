@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import contextlib
 from collections.abc import Sequence
 from functools import partial
@@ -220,10 +222,12 @@ def rollout(
             f"{model.state_shape}; give the model that the policy was projected to."
         )
     nowhere = np.zeros(model.state_shape, bool)
-    result: Trajectories = _rollout(
-        model, policy, key, nowhere if stop is None else stop, num_trajectories, num_steps
+    return cast(
+        Trajectories,
+        _rollout(
+            model, policy, key, nowhere if stop is None else stop, num_trajectories, num_steps
+        ),
     )
-    return result
 
 
 @partial(jax.jit, static_argnums=(4, 5))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import os
 import re
 from pathlib import Path
@@ -118,10 +120,10 @@ def _first_numbers(weight: NDArray[np.floating]) -> NDArray[np.int64]:
     weight = weight.reshape(-1, weight.shape[-1]).astype(np.float64)
     total = weight.cumsum(-1)
     before = np.concatenate([np.zeros((len(total), 1)), total[:, :-1]], axis=-1)
-    result: NDArray[np.int64] = np.minimum(
-        np.rint(before / total[:, -1:] * 2.0**32), 2.0**32 - 1
-    ).astype(np.int64)
-    return result
+    return cast(
+        NDArray[np.int64],
+        np.minimum(np.rint(before / total[:, -1:] * 2.0**32), 2.0**32 - 1).astype(np.int64),
+    )
 
 
 def _table(name: str, values: NDArray[np.integer]) -> str:

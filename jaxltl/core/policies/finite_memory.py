@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable, cast
 
 import numpy as np
 
@@ -138,14 +138,12 @@ class FiniteMemoryPolicy:
         if not isinstance(key, np.random.Generator):
             jax = sys.modules["jax"]  # the key is its own
             weight = jax.numpy.log(row)
-            chosen: Array = jax.random.categorical(key, weight, axis=-1).astype(np.int32)
-            return chosen
+            return cast(Array, jax.random.categorical(key, weight, axis=-1).astype(np.int32))
         total = np.asarray(row, np.float64).cumsum(-1)
         point = key.random(total.shape[:-1])[..., None] * total[..., -1:]
         # Rounding may give the total itself, which is the last action of positive weight.
         last = (total < total[..., -1:]).sum(-1)
-        result: Array = np.minimum((total <= point).sum(-1), last).astype(np.int32)
-        return result
+        return cast(Array, np.minimum((total <= point).sum(-1), last).astype(np.int32))
 
     def update(
         self, at: Progress, state: Array | int | str, label: Label | None = None
@@ -204,8 +202,7 @@ def _at(table: Array, *index: Array | int) -> Array:
     jax = sys.modules.get("jax")
     if jax is not None and any(isinstance(i, jax.Array) for i in index):
         table = jax.numpy.asarray(table)
-    found: Array = table[index]
-    return found
+    return cast(Array, table[index])
 
 
 @runtime_checkable

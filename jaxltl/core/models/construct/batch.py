@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -69,10 +71,9 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
         padded = pad_states(world, num_states, width)
         products.append(replace(lane, mdp=jax.tree.map(np.asarray, padded), letter=letter))
-    result: Product = to_jax(
-        jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products)
+    return cast(
+        Product, to_jax(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products))
     )
-    return result
 
 
 def _like_first(world: Model, number: int, first: MDP) -> MDP:
@@ -135,8 +136,7 @@ def as_stacked(model: Product) -> Product:
 
 def _stacked(models: Sequence[Product]) -> Product:
     xp, *models = namespace(*models)
-    result: Product = to_jax(jax.tree.map(lambda *x: xp.stack(x), *models))
-    return result
+    return cast(Product, to_jax(jax.tree.map(lambda *x: xp.stack(x), *models)))
 
 
 def num_worlds(model: Product) -> int:
@@ -311,8 +311,7 @@ def stack_observations(models: Product, observation: PyTree) -> jax.Array:
     if not np.isfinite(np.asarray(observation)).all():
         w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
         raise ValueError(f"world {w}: the observation in state {s} is not finite.")
-    result: jax.Array = observation
-    return result
+    return cast(jax.Array, observation)
 
 
 def training_counts(

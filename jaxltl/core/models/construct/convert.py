@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import jax
 import numpy as np
@@ -69,8 +69,7 @@ def to_sparse(model: Model) -> SparseMDP:
 
 def _distribution(initial: ArrayLike) -> np.ndarray:
     initial = np.asarray(initial, np.float64)
-    result: np.ndarray = initial / initial.sum()
-    return result
+    return cast(np.ndarray, initial / initial.sum())
 
 
 def _product(model: Product) -> SparseMDP:

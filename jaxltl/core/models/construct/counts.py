@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -453,8 +453,7 @@ def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
     """Empirical frequencies; rows with a zero use additive smoothing by one."""
     width = np.diff(start)
     more = np.repeat(np.minimum.reduceat(count, start[:-1]) == 0, width) + count.astype(np.float64)
-    result: NDArray[np.float64] = more / np.repeat(np.add.reduceat(more, start[:-1]), width)
-    return result
+    return cast(NDArray[np.float64], more / np.repeat(np.add.reduceat(more, start[:-1]), width))
 
 
 def _require_counts(counts: object) -> None:

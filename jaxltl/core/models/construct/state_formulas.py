@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from collections.abc import Collection
 
 import numpy as np
@@ -33,8 +35,7 @@ def _deadlocks(model: SparseMDP) -> np.ndarray:
     row = host.row_start[:-1]
     entry = host.entry_start[row]
     alone = (np.diff(host.row_start) == 1) & (host.entry_start[row + 1] - entry == 1)
-    result: np.ndarray = alone & (host.successor[entry] == np.arange(host.num_states))
-    return result
+    return cast(np.ndarray, alone & (host.successor[entry] == np.arange(host.num_states)))
 
 
 def states_satisfying(

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,7 @@ def over_cores(function: Callable[..., Result], *arguments: PyTree) -> Result:
     The function is pure and closes over no traced array. Rounding is that of ``vmap`` of the lanes
     of one core.
     """
-    result: Result = _call(function, None, jax.tree.map(jnp.asarray, arguments))
-    return result
+    return cast(Result, _call(function, None, jax.tree.map(jnp.asarray, arguments)))
 
 
 def num_cores() -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -284,10 +284,12 @@ def _placed(
 def _from_each(x: PyTree, sharding: NamedSharding) -> jax.Array:
     """An array over the devices of several processes, from each process's part."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-        result: jax.Array = jax.random.wrap_key_data(
-            _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
+        return cast(
+            jax.Array,
+            jax.random.wrap_key_data(
+                _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
+            ),
         )
-        return result
     numbers = np.asarray(x)
     return jax.make_array_from_callback(numbers.shape, sharding, lambda part: numbers[part])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -392,8 +392,7 @@ class _Halo(NamedTuple):
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
         owner, found = self.layout.place(successor)
         if self.asked is None:
-            result: np.ndarray = (owner * self.layout.size + found).astype(np.int32)
-            return result
+            return cast(np.ndarray, (owner * self.layout.size + found).astype(np.int32))
         for e in np.unique(owner[owner != d]):
             here = owner == e
             of_e = _within(self.asked[d], *self.layout.span(int(e)))

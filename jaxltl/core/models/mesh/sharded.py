@@ -7,7 +7,7 @@ first, then those received before a sweep by one exchange, of a halo or of all v
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -118,8 +118,7 @@ class ShardedMDP:
     @property
     def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
-        result: np.dtype = np.dtype(self.tables[0].probability.dtype)
-        return result
+        return cast(np.dtype, np.dtype(self.tables[0].probability.dtype))
 
     @property
     def label(self) -> jax.Array:
@@ -169,8 +168,7 @@ def over_devices(model: ShardedMDP, function: Callable[..., PyTree], *arguments:
 def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> jax.Array:
     """On a device: its own values and the received ones, by local place."""
     if model.rounds is None:
-        result: jax.Array = lax.all_gather(value, model.axis, tiled=True)
-        return result
+        return cast(jax.Array, lax.all_gather(value, model.axis, tiled=True))
     parts = [value]
     for index, pairs in zip(sent, model.rounds, strict=True):
         parts.append(lax.ppermute(kernels.gather(value, index), model.axis, pairs))
@@ -186,18 +184,18 @@ def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.
         if place is None:
             shape = (*available.shape, -1)
             ((successor, weight),) = tables
-            return kernels.stacked(
-                kernels.by_action(
-                    successor.reshape(shape), weight.reshape(shape), seen, term, combine
-                )
+            return kernels.by_action(
+                successor.reshape(shape), weight.reshape(shape), seen, term, combine
             )
         found = jnp.concatenate([_rows(table, seen, term, combine) for table in tables])
         return jnp.moveaxis(kernels.gather(found, place), 1, -1)
 
-    result: jax.Array = over_devices(
-        model, one, model.tables, model.place, model.sent, model.available, jnp.asarray(value)
+    return cast(
+        jax.Array,
+        over_devices(
+            model, one, model.tables, model.place, model.sent, model.available, jnp.asarray(value)
+        ),
     )
-    return result
 
 
 def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
@@ -205,13 +203,7 @@ def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels
     width = successor.shape[1]
     if width > kernels.UNROLL:
         return kernels.folded(successor, weight, seen, term, combine, axis=1)
-    return kernels.fold(
-        [successor[:, k] for k in range(width)],
-        [weight[:, k] for k in range(width)],
-        seen,
-        term,
-        combine,
-    )
+    return kernels.fold(kernels.columns(successor), kernels.columns(weight), seen, term, combine)
 
 
 @operators.greatest_predecessor.register
@@ -240,8 +232,7 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
             every = lax.all_to_all(
                 seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False
             )
-            result: jax.Array = every.max(axis=0)
-            return result
+            return cast(jax.Array, every.max(axis=0))
         found, first = seen[:size], size
         for index, pairs in zip(sent, model.rounds, strict=True):
             back = [(target, source) for source, target in pairs]
@@ -253,8 +244,9 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
     available, missing = model.available, quantity.ndim - model.available.ndim
     available = available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
     quantity = jnp.where(available, quantity, 0)
-    result: jax.Array = over_devices(model, one, model.tables, model.place, model.sent, quantity)
-    return result
+    return cast(
+        jax.Array, over_devices(model, one, model.tables, model.place, model.sent, quantity)
+    )
 
 
 @distinct_labels.register
@@ -264,8 +256,7 @@ def _(world: ShardedMDP) -> np.ndarray:
 
 @letters_by_state.register
 def _(world: ShardedMDP, letter: np.ndarray) -> jax.Array:
-    result: jax.Array = _looked_up(world.kind, letter)
-    return result
+    return cast(jax.Array, _looked_up(world.kind, letter))
 
 
 _looked_up = jax.jit(lambda kind, letter: kernels.gather(letter, kind))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from collections.abc import Callable, Sequence
 from functools import reduce
 
@@ -46,40 +48,32 @@ def fold(
     return reduce(combine, terms)
 
 
+def columns(table: jax.Array) -> list[jax.Array]:
+    """The entries along the last axis, an array each."""
+    return [table[..., k] for k in range(table.shape[-1])]
+
+
 def by_action(
     successor: jax.Array,
     weight: jax.Array,
     value: jax.Array,
     term: Term = jnp.multiply,
     combine: Term = jnp.add,
-) -> list[jax.Array]:
-    """The reduction :func:`fold` of each action, from tables ``[N, A, K]``: A arrays ``[N, ...]``."""
+) -> jax.Array:
+    """The reduction :func:`fold` of each action, from tables ``[N, A, K]``: ``[N, ..., A]``."""
     num_actions, width = successor.shape[1:]
-    if successor.size <= FEW:
-        found = folded(successor, weight, value, term, combine, axis=2)
-        return [found[:, a] for a in range(num_actions)]
-    if num_actions * width <= WRITTEN_OUT:
-        return [
-            fold(
-                [successor[:, a, k] for k in range(width)],
-                [weight[:, a, k] for k in range(width)],
-                value,
-                term,
-                combine,
-            )
+    large = successor.size > FEW
+    if large and num_actions * width <= WRITTEN_OUT:
+        each = [
+            fold(columns(successor[:, a]), columns(weight[:, a]), value, term, combine)
             for a in range(num_actions)
         ]
-    if width <= UNROLL:
-        found = fold(
-            [successor[..., k] for k in range(width)],
-            [weight[..., k] for k in range(width)],
-            value,
-            term,
-            combine,
-        )
+        return jnp.stack(each, axis=-1)
+    if large and width <= UNROLL:
+        found = fold(columns(successor), columns(weight), value, term, combine)
     else:
         found = folded(successor, weight, value, term, combine, axis=2)
-    return [found[:, a] for a in range(num_actions)]
+    return jnp.moveaxis(found, 1, -1)
 
 
 def folded(
@@ -108,13 +102,9 @@ def reduced(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
     """Reduction along an axis by one of NumPy's operations, or one with the neutral element 0."""
     if combine in _REDUCTIONS:
         return _REDUCTIONS[combine](terms, axis=axis)
-    result: jax.Array = lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
-    return result
-
-
-def stacked(columns: Sequence[jax.Array]) -> jax.Array:
-    """Columns stacked along a last axis."""
-    return jnp.stack(columns, axis=-1)
+    return cast(
+        jax.Array, lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
+    )
 
 
 def positive_hits(weight: jax.Array, inside: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import chex
 import jax
@@ -170,8 +170,7 @@ def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
         ahead = expectation(model, value.reshape(model.state_shape))
         return action_mean(policy, ahead).ravel()
 
-    result: jax.Array = jax.vmap(column, out_axes=-1)(jnp.eye(size, dtype=model.dtype))
-    return result
+    return jax.vmap(column, out_axes=-1)(jnp.eye(size, dtype=model.dtype))
 
 
 @singledispatch
@@ -203,8 +202,7 @@ def pushforward(model: Model, mass: jax.Array) -> jax.Array:
       [0.5, 2.5]
     """
     value = jax.ShapeDtypeStruct(model.state_shape, mass.dtype)
-    result: jax.Array = jax.linear_transpose(lambda v: expectation(model, v), value)(mass)[0]
-    return result
+    return cast(jax.Array, jax.linear_transpose(lambda v: expectation(model, v), value)(mass)[0])
 
 
 def _unknown(model: Model) -> str:
@@ -237,8 +235,7 @@ def is_representable(model: Model) -> jax.Array:
 
 @singledispatch
 def _representable(model: Model) -> jax.Array:
-    result: jax.Array = jnp.bool_(True)
-    return result
+    return cast(jax.Array, jnp.bool_(True))
 
 
 @_representable.register(MDP)
@@ -262,7 +259,7 @@ def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
 @combined.register
 def _(model: MDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
     weight = model.successor_probability
-    return kernels.stacked(kernels.by_action(model.successor, weight, value, term, combine))
+    return kernels.by_action(model.successor, weight, value, term, combine)
 
 
 @greatest_predecessor.register
@@ -384,8 +381,7 @@ def policy_distribution(model: Model, policy: Array) -> jax.Array:
             f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
             f"model has shape {pairs}."
         )
-    result: jax.Array = policy
-    return result
+    return cast(jax.Array, policy)
 
 
 class Policy(NamedTuple):
@@ -479,8 +475,7 @@ def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndar
         row = int(np.argmax(small))
         text = underflow_text(policy[row], policy.dtype)
         raise ValueError(f"the policy's weight of choice {row} {text}.")
-    result: np.ndarray = weight
-    return result
+    return cast(np.ndarray, weight)
 
 
 def require_weights(

@@ -8,7 +8,7 @@ transposed sweep gathers from predecessor lists, since XLA on a CPU runs scatter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -101,10 +101,10 @@ class ShardedSuccessorTable:
             pairs = zip(successor, probability, strict=True)
             return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
 
-        result: list[jax.Array] = over_devices(
-            self.model, one, self.successor, self.probability, self.model.sent, value
+        return cast(
+            list[jax.Array],
+            over_devices(self.model, one, self.successor, self.probability, self.model.sent, value),
         )
-        return result
 
 
 @brief
@@ -136,10 +136,7 @@ def _spread_out(model: ShardedMDP) -> ShardedSuccessorTable | None:
     if model.place is not None or num_actions * width > kernels.WRITTEN_OUT:
         return None
     successor, probability = (
-        [
-            [x.reshape(-1, num_actions, width)[:, a, k] for k in range(width)]
-            for a in range(num_actions)
-        ]
+        [kernels.columns(x.reshape(-1, num_actions, width)[:, a]) for a in range(num_actions)]
         for x in model.tables[0]
     )
     return ShardedSuccessorTable(model, successor, probability)
@@ -163,8 +160,7 @@ def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
     """``[N, A, K]`` as arrays ``[N]``, or as one ``[A, K, N]``."""
     if entries.size <= kernels.FEW:
         return jnp.moveaxis(entries, 0, -1)
-    _, num_actions, width = entries.shape
-    return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
+    return [kernels.columns(entries[:, a]) for a in range(entries.shape[1])]
 
 
 def predecessor_table(models: Sequence[Model]) -> PredecessorTable | None:
