@@ -128,10 +128,10 @@ def _inflow_terms(model: Model) -> jax.Array:
 def _visits(
     model: PyTree, policy: Array, discount: Array, start: Array, linear: PyTree
 ) -> tuple[jax.Array, jax.Array]:
-    visits, n = linear.transpose_counted(start)
+    visits, n = linear.counted(start, transposed=True)
     flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
     # One step of iterative refinement.
-    more, m = linear.transpose_counted(flow - visits)
+    more, m = linear.counted(flow - visits, transposed=True)
     return visits + more, n + m + 1
 
 

@@ -27,9 +27,8 @@ from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import (
     DENSE_LIMIT,
-    Inverse,
+    LinearSolver,
     inverse,
-    krylov_refined,
     norm,
     solve_linear,
 )
@@ -70,7 +69,7 @@ class ChainSystem(NamedTuple):
 
     def _solve(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
         if is_sharded(self.model):
-            return krylov_refined(matvec, b)
+            return solve_linear(matvec, b, patient=True)
         x = solve_linear(matvec, b, max_steps=_FAST_STEPS)
         size = norm(b.ravel())
         # The norm of the inverse, and so the relative error, is at least that of x over that of b.
@@ -89,7 +88,7 @@ class ChainSystem(NamedTuple):
             return x.reshape(b.shape)
         result = jax.ShapeDtypeStruct(b.shape, b.dtype)
         x = host_callback(_eliminated(transposed), result, self, b)
-        return _unless(jnp.all(jnp.isfinite(x)), x, lambda: krylov_refined(matvec, b))
+        return _unless(jnp.all(jnp.isfinite(x)), x, lambda: solve_linear(matvec, b, patient=True))
 
 
 def with_derivative(
@@ -98,7 +97,7 @@ def with_derivative(
     *,
     reward: jax.Array | float = 0,
     outside: jax.Array | float = 0,
-    inverse: Inverse | None = None,
+    inverse: LinearSolver | None = None,
 ) -> jax.Array:
     """The value of a policy, ``x = (r + P x)_pi`` in transient states, with its derivative."""
     # That of an optimum is the derivative of the policy that attains it (Danskin).

@@ -2,7 +2,7 @@
 
 Small systems are inverted by elimination, so that the number of expected steps does not matter; not
 by LAPACK, which serialises batches of small systems by its threads. Large systems are
-solved by Richardson iteration and BiCGSTAB (van der Vorst 1992).
+solved by BiCGSTAB (van der Vorst 1992) and Richardson iteration.
 """
 
 from __future__ import annotations
@@ -23,19 +23,15 @@ from jaxltl.core.models.ops.successor_tables import (
     ShardedSuccessorTable,
     SuccessorTable,
 )
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
+from jaxltl.core.values.engine.iterate import sequential_vmap
 
 Operator = Callable[[jax.Array], jax.Array]
 
 DENSE_LIMIT = 512  # states up to which a system is inverted
 _BLOCK = 32
 _REFINEMENTS = 2
-_KRYLOV_REFINEMENTS = 16
-_INNER_TOLERANCE = 1e-2  # relative residual of one system of these
-MOST_PRODUCTS = 20_000  # with the system, in one run of BiCGSTAB
-_GOOD_RATE = 0.7  # a contraction at least this fast needs no Krylov method
-_STRETCH = 64  # steps between two looks at the true residual
+MAX_PRODUCTS = 100_000
+_STRETCH = 128  # products between two looks at the true residual
 
 
 class System(NamedTuple):
@@ -86,93 +82,59 @@ class System(NamedTuple):
         return eye.at[jnp.broadcast_to(rows, target.shape), target].add(-self.scale * weight)
 
 
-class Inverse(NamedTuple):
-    """A system and its inverse ``float[N, N]``, by which it is solved with refinement."""
+class LinearSolver(NamedTuple):
+    """Solutions of a system and of its transpose, for values of any shape with N entries."""
 
     system: System
-    inverse: jax.Array
+    inverse: jax.Array | None  # ``float[N, N]``; None for the Krylov method
+    max_steps: jax.Array | int  # of the Krylov method, products with the system
 
-    def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The result of :meth:`solve`, and the number of products with the system."""
-        x = _refined(self.inverse, self.system.matvec, b.ravel())
-        return x.reshape(b.shape), jnp.int32(_REFINEMENTS)
-
-    def solve(self, b: jax.Array) -> jax.Array:
-        """x with ``(I - c P_w) x = b``, for values of any shape with N entries."""
-        return self.counted(b)[0]
-
-    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The result of :meth:`transpose_solve`, and the number of products."""
-        # Without refinement: the transposed product would be a scatter.
-        return (b.ravel() @ self.inverse).reshape(b.shape), jnp.int32(0)
-
-    def transpose_solve(self, b: jax.Array) -> jax.Array:
-        """The solution of the transposed system."""
-        return self.transpose_counted(b)[0]
-
-
-class Krylov(NamedTuple):
-    """A system solved by :func:`solve_linear`, with the interface of :class:`Inverse`."""
-
-    system: System  # the system
-    # relative residual; default as of :func:`solve_linear`
-    tolerance: jax.Array | float | None = None
-    max_steps: jax.Array | int = 100_000  # maximal number of products with the system
-
-    def solve(self, b: jax.Array) -> jax.Array:
-        """The solution of the system."""
-        return self.counted(b)[0]
-
-    def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The solution of the system, and the number of products."""
-        return self._counted(System.matvec, b)
-
-    def transpose_solve(self, b: jax.Array) -> jax.Array:
-        """The solution of the transposed system."""
-        return self.transpose_counted(b)[0]
-
-    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The solution of the transposed system, and the number of products."""
-        return self._counted(System.vecmat, b)
-
-    def _counted(
-        self, apply: Callable[[System, jax.Array], jax.Array], b: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        x, n = _krylov(
-            lambda table, given, x: apply(System(table, *given), x),
-            self.system.table,
-            self.system[1:],
-            b.ravel(),
-            (self.tolerance, self.max_steps),
-        )
+    def counted(self, b: jax.Array, *, transposed: bool = False) -> tuple[jax.Array, jax.Array]:
+        """The solution, and the number of products with the system."""
+        flat, n = b.ravel(), jnp.int32(0)
+        if self.inverse is None:
+            x, n = sequential_vmap(partial(_krylov, transposed), self.system, flat, self.max_steps)
+        elif transposed:  # without refinement: the transposed product would be a scatter
+            x = flat @ self.inverse
+        else:
+            x, n = self.inverse @ flat, n + _REFINEMENTS
+            for _ in range(_REFINEMENTS):
+                better = x + self.inverse @ (flat - self.system.matvec(x))
+                x = jnp.where(jnp.isfinite(better), better, x)
         return x.reshape(b.shape), n
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """x with ``(I - c P_w) x = b``."""
+        return self.counted(b)[0]
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        return self.counted(b, transposed=True)[0]
+
+
+def _krylov(
+    transposed: bool, system: System, b: jax.Array, max_steps: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    return counted_solution(system.vecmat if transposed else system.matvec, b, None, max_steps)
 
 
 def solver(
-    system: System, method: str = "auto", *, max_steps: jax.Array | int = 100_000
-) -> Inverse | Krylov:
+    system: System, method: str = "auto", *, max_steps: jax.Array | int = MAX_PRODUCTS
+) -> LinearSolver:
     """The solver of a system by method: direct (inversion), iterative, or auto by size."""
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     system = lax.stop_gradient(system)
     small = is_small(system.table, system.num_states)
     if method == "iterative" or (method == "auto" and not small):
-        return Krylov(system, max_steps=max_steps)
-    return Inverse(system, sequential_vmap(inverse, system.matrix()))
+        return LinearSolver(system, None, max_steps)
+    return LinearSolver(system, sequential_vmap(inverse, system.matrix()), max_steps)
 
 
 def is_small(table: SweepOperator, num_states: int) -> bool:
     """True if systems of `num_states` are inverted; sharded ones are not."""
     spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
-
-
-def _refined(inverse_: jax.Array, matvec: Operator, b: jax.Array) -> jax.Array:
-    x = inverse_ @ b
-    for _ in range(_REFINEMENTS):
-        better = x + inverse_ @ (b - matvec(x))
-        x = jnp.where(jnp.isfinite(better), better, x)
-    return x
 
 
 def inverse(matrix: jax.Array) -> jax.Array:
@@ -222,15 +184,17 @@ def _small_inverse(matrix: jax.Array) -> jax.Array:
 class Bicgstab(NamedTuple):
     """State of BiCGSTAB in the notation of van der Vorst (1992), arrays ``[N]``."""
 
-    # One iteration has two products with the system. `r` is the residual of x by recurrence.
+    # Each half of an iteration has one product with the system, of p and then of r. Plain steps
+    # are those of Richardson iteration: alpha and omega are 1, and p is r.
 
     x: jax.Array
-    r: jax.Array
+    r: jax.Array  # the residual of x by recurrence
     shadow: jax.Array
     p: jax.Array
     v: jax.Array
     rho: jax.Array
     alpha: jax.Array
+    plain: jax.Array
 
     @property
     def size(self) -> jax.Array:
@@ -238,51 +202,65 @@ class Bicgstab(NamedTuple):
         return norm(self.r)
 
     def first(self, image: jax.Array) -> Bicgstab:
-        """First half of an iteration, from the product with `p`; the next one is with `r`."""
-        alpha = _ratio(self.rho, dot(self.shadow, image))
+        """First half of an iteration, from the product with p."""
+        alpha = jnp.where(self.plain, 1, _ratio(self.rho, dot(self.shadow, image)))
         return self._replace(
             x=self.x + alpha * self.p, r=self.r - alpha * image, v=image, alpha=alpha
         )
 
     def second(self, image: jax.Array) -> Bicgstab:
-        """Second half of an iteration, from the product with `r`; the next one is with `p`."""
-        omega = _ratio(dot(image, self.r), dot(image, image))
+        """Second half of an iteration, from the product with r."""
+        omega = jnp.where(self.plain, 1, _ratio(dot(image, self.r), dot(image, image)))
         x, r = self.x + omega * self.r, self.r - omega * image
         rho = dot(self.shadow, r)
-        p = r + _ratio(rho * self.alpha, self.rho * omega) * (self.p - omega * self.v)
-        return self._replace(x=x, r=r, p=p, rho=rho)
+        beta = jnp.where(self.plain, 0, _ratio(rho * self.alpha, self.rho * omega))
+        return self._replace(x=x, r=r, p=r + beta * (self.p - omega * self.v), rho=rho)
 
 
-def start_bicgstab(x: jax.Array, r: jax.Array) -> Bicgstab:
-    """The state for an x with residual r."""
-    rho = dot(r, r)
-    return Bicgstab(x, r, r, r, jnp.zeros_like(r), rho, jnp.ones_like(rho))
+def bicgstab(
+    matvec: Operator,
+    b: jax.Array,
+    *,
+    tolerance: jax.Array | float,
+    max_steps: jax.Array | int,
+    plain: jax.Array | bool = False,
+    shadow: jax.Array | None = None,
+) -> tuple[Bicgstab, jax.Array]:
+    """BiCGSTAB for ``matvec(x) = b`` until the residual's norm is at most `tolerance`."""
+    shadow = b if shadow is None else shadow
+    zero, one = jnp.zeros_like(b), jnp.ones((), b.dtype)
+    start = Bicgstab(zero, b, shadow, b, zero, dot(shadow, b), one, jnp.asarray(plain))
+
+    def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
+        # One product in the program serves both halves.
+        k, n = carry
+        second = (n & 1) == 1
+        image = matvec(jnp.where(second, k.r, k.p))
+        return lax.cond(second, Bicgstab.second, Bicgstab.first, k, image), n + 1
+
+    def unfinished(carry: tuple[Bicgstab, jax.Array]) -> jax.Array:
+        k, n = carry
+        return (k.size > tolerance) & jnp.isfinite(k.size) & (n < max_steps)
+
+    return lax.while_loop(unfinished, body, (start, jnp.int32(0)))
 
 
-class _Search(NamedTuple):
-    """State of :func:`solve_linear`."""
+def random_shadow(b: jax.Array) -> jax.Array:
+    """A random vector for the recurrence of BiCGSTAB."""
+    # In a chain that seldom returns, residuals soon become orthogonal to the first one, and then
+    # the recurrence makes no progress; they do not become orthogonal to a random vector.
+    return jax.random.normal(jax.random.key(0), b.shape, b.dtype)
 
-    phase: jax.Array
-    z: jax.Array  # argument of the next product
-    krylov: Bicgstab
-    error: jax.Array  # norm of the residual
-    steps: jax.Array  # in this phase
-    forced: jax.Array  # whether the last phase was Richardson steps after a failure of BiCGSTAB
-    returning: jax.Array  # whether this product only gives the residual of the best x
-    best: jax.Array  # the x with the least true residual
-    best_error: jax.Array
+
+class _Progress(NamedTuple):
+    """State of :func:`counted_solution`."""
+
+    x: jax.Array
+    r: jax.Array  # the true residual of x
+    error: jax.Array  # its norm
+    plain: jax.Array  # whether BiCGSTAB did not halve it
     num_steps: jax.Array
-
-
-_RICHARDSON, _FIRST, _SECOND, _LOOK, _DONE = range(5)
-
-
-class _Goal(NamedTuple):
-    """Right-hand side, residual to reach, and maximal number of steps."""
-
-    b: jax.Array
-    target: jax.Array
-    most: jax.Array
+    ended: jax.Array
 
 
 def solve_linear(
@@ -290,175 +268,64 @@ def solve_linear(
     b: jax.Array,
     *,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 100_000,
+    max_steps: jax.Array | int = MAX_PRODUCTS,
+    patient: bool = False,
 ) -> jax.Array:
     """Solves ``matvec(x) = b`` where matvec is the identity minus an operator."""
-    # Richardson steps ``x + (b - matvec(x))`` while they contract well, then BiCGSTAB (van der
-    # Vorst 1992), restarted from the true residual at regular intervals. If BiCGSTAB does not halve
-    # it, Richardson steps follow, which converge whenever the operator is a contraction in some
-    # norm; they end when their rate shows that `max_steps` would not be enough.
-
-    def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
-        return matvec(x.reshape(b.shape)).ravel()
-
-    x, _ = _krylov(flat, None, (), b.ravel(), (tolerance, max_steps))
-    return x.reshape(b.shape)
-
-
-def _krylov(
-    matvec: Callable[..., jax.Array], table: PyTree, given: PyTree, b: jax.Array, limits: PyTree
-) -> tuple[jax.Array, jax.Array]:
-    """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made.
-
-    `limits` are the relative residual, or None, and the most steps.
-    """
-    tolerance, max_steps = limits
-    if tolerance is None:
-        tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
-    size = norm(b)
-    goal = _Goal(b, tolerance * size, jnp.asarray(max_steps, jnp.int32))
-
-    def step(table: PyTree, k: _Search, given: PyTree) -> _Search:
-        given, goal = given
-        image = matvec(table, given, k.z)
-        branches = [partial(f, goal) for f in (_richardson, _first, _second, _check_residual)]
-        k = lax.switch(k.phase, branches, k, image)
-        return k._replace(num_steps=k.num_steps + 1)
-
-    zero, none, no = jnp.zeros_like(b), jnp.int32(0), jnp.bool_(False)
-    start = _Search(
-        phase=jnp.int32(_RICHARDSON),
-        z=b,
-        krylov=start_bicgstab(zero, b),
-        error=size,
-        steps=none,
-        forced=no,
-        returning=no,
-        best=jnp.where(jnp.isfinite(size), zero, jnp.nan),
-        best_error=size,
-        num_steps=none,
-    )
-    last, n = iterate(
-        step,
-        lambda k, _: k.phase == _DONE,
-        (table, start, (given, goal)),
-        max_steps=max_steps,
-        lanes="mapped" if table is None else "in turn",
-    )
-    return last.best, n
-
-
-def _richardson(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
-    x, r = k.krylov.x + k.krylov.r, k.krylov.r - image
-    error = norm(r)
-    small = (error <= goal.target) | ~jnp.isfinite(error) | (k.forced & (k.steps >= _STRETCH))
-    # Richardson steps while they contract well, then BiCGSTAB from their iterate.
-    slow = ~k.forced & (error > _GOOD_RATE * k.error)
-    look = small & ~slow
-    after = jnp.where(look, _LOOK, jnp.where(slow, _FIRST, _RICHARDSON)).astype(jnp.int32)
-    return k._replace(
-        phase=after,
-        krylov=start_bicgstab(x, r),
-        error=error,
-        z=jnp.where(look, x, r),
-        steps=jnp.where(slow, 0, k.steps + 1),
-    )
-
-
-def _first(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
-    krylov = k.krylov.first(image)
-    return k._replace(krylov=krylov, phase=jnp.full_like(k.phase, _SECOND), z=krylov.r)
-
-
-def _second(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
-    krylov = k.krylov.second(image)
-    error = krylov.size
-    ended = (error <= goal.target / 2) | (k.steps >= _STRETCH) | ~jnp.isfinite(error)
-    return k._replace(
-        krylov=krylov,
-        error=error,
-        steps=k.steps + 1,
-        phase=jnp.where(ended, _LOOK, _FIRST).astype(jnp.int32),
-        z=jnp.where(ended, krylov.x, krylov.p),
-    )
-
-
-def _check_residual(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
-    """Computes the true residual of x, and returns to the best x after a failure."""
-    r = goal.b - image
-    error = norm(r)
-    better = error < k.best_error  # false for NaN
-    halved = error <= k.best_error / 2
-    best = jnp.where(better, k.krylov.x, k.best)
-    best_error = jnp.where(better, error, k.best_error)
-    # The number of further phases at this rate, if they are forced.
-    tiny = float(jnp.finfo(r.dtype).tiny)
-    pace = jnp.log(k.best_error / best_error)
-    stretches = jnp.log(best_error / jnp.maximum(goal.target, tiny)) / jnp.maximum(pace, tiny)
-    # The rate means nothing before information has passed from every state.
-    settled = k.num_steps > 4 * r.shape[0]
-    hopeless = settled & (stretches * _STRETCH > goal.most - k.num_steps)
-    stop = (best_error <= goal.target) | (k.forced & ~k.returning & (~better | hopeless))
-    returning = ~(better | k.returning | stop)
-    after = jnp.where(halved, _FIRST, jnp.where(returning, _LOOK, _RICHARDSON))
-    return k._replace(
-        phase=jnp.where(stop, _DONE, after).astype(jnp.int32),
-        steps=jnp.zeros_like(k.steps),
-        krylov=start_bicgstab(best, r),
-        error=error,
-        z=jnp.where(returning, best, r),
-        best=best,
-        best_error=best_error,
-        forced=jnp.where(returning, k.forced, ~halved),
-        returning=returning,
-    )
-
-
-def bicgstab(matvec: Operator, b: jax.Array, *, tolerance: float) -> tuple[jax.Array, jax.Array]:
-    """x with ``matvec(x) = b`` up to a relative residual, if that converges, and the products."""
 
     def flat(x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()
 
-    right = b.ravel()
-    # In a chain that seldom returns, residuals soon become orthogonal to the first one, and then
-    # the recurrence makes no progress; they do not become orthogonal to a random vector.
-    shadow = jax.random.normal(jax.random.key(0), right.shape, right.dtype)
-    start = start_bicgstab(jnp.zeros_like(right), right)._replace(
-        shadow=shadow, rho=dot(shadow, right)
+    return counted_solution(flat, b.ravel(), tolerance, max_steps, patient)[0].reshape(b.shape)
+
+
+def counted_solution(
+    matvec: Operator,
+    b: jax.Array,
+    tolerance: jax.Array | float | None,
+    max_steps: jax.Array | int,
+    patient: bool = False,
+) -> tuple[jax.Array, jax.Array]:
+    """:func:`solve_linear` for arrays ``[N]``, and the number of products."""
+    # BiCGSTAB (van der Vorst 1992), restarted from the true residual at regular intervals; late if
+    # `patient`, for chains with very many expected steps. If it does not halve the residual,
+    # Richardson steps follow, which converge whenever the operator is a contraction in some norm;
+    # they end when their rate shows that `max_steps` would not be enough.
+    stretch = most_products(b.size) if patient else _STRETCH
+    shadow = random_shadow(b) if patient else None
+    tiny = float(jnp.finfo(b.dtype).tiny)
+    size = norm(b)
+    target = size * (float(jnp.finfo(b.dtype).eps) ** 0.8 if tolerance is None else tolerance)
+
+    def body(k: _Progress) -> _Progress:
+        products = jnp.minimum(stretch, max_steps - k.num_steps)
+        inner, n = bicgstab(
+            matvec, k.r, tolerance=target / 2, max_steps=products, plain=k.plain, shadow=shadow
+        )
+        x, n = k.x + inner.x, k.num_steps + n + 1
+        r = b - matvec(x)
+        error = norm(r)
+        better = error < k.error  # false for NaN
+        x, r, error = (jnp.where(better, *pair) for pair in ((x, k.x), (r, k.r), (error, k.error)))
+        # The number of further stretches at this rate.
+        pace = jnp.log(k.error / error)
+        rest = jnp.log(error / jnp.maximum(target, tiny)) / jnp.maximum(pace, tiny)
+        # The rate means nothing before information has passed from every state.
+        hopeless = (n > 4 * b.size) & (rest * stretch > max_steps - n)
+        ended = (error <= target) | (k.plain & (~better | hopeless)) | (n >= max_steps)
+        return _Progress(x, r, error, ~(error <= k.error / 2), n, ended)
+
+    zero = jnp.where(jnp.isfinite(size), jnp.zeros_like(b), jnp.nan)
+    no = jnp.bool_(False)
+    last = lax.while_loop(
+        lambda k: ~k.ended, body, _Progress(zero, b, size, no, jnp.int32(0), ~(size > 0))
     )
-    goal, most = tolerance * norm(right), min(MOST_PRODUCTS, 8 * right.size + 64)
-
-    def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
-        k, n = carry
-        k = k.first(flat(k.p))
-        return k.second(flat(k.r)), n + 2
-
-    def unfinished(carry: tuple[Bicgstab, jax.Array]) -> jax.Array:
-        k, n = carry
-        return (k.size > goal) & jnp.isfinite(k.size) & (n < most)
-
-    k, n = lax.while_loop(unfinished, body, (start, jnp.int32(0)))
-    return k.x.reshape(b.shape), n
+    return last.x, last.num_steps
 
 
-def krylov_refined(matvec: Operator, b: jax.Array) -> jax.Array:
-    """x with ``matvec(x) = b`` as nearly as the dtype allows, by iterative refinement."""
-    goal = float(jnp.finfo(b.dtype).eps) ** 0.8 * norm(b.ravel())
-
-    def body(carry: PyTree) -> PyTree:
-        x, residual, _, n = carry
-        better = x + bicgstab(matvec, residual, tolerance=_INNER_TOLERANCE)[0]
-        residual = b - matvec(better)
-        return better, residual, norm(residual.ravel()), n + 1
-
-    def unfinished(carry: PyTree) -> jax.Array:
-        _, _, size, n = carry
-        result: jax.Array = (size > goal) & (n < _KRYLOV_REFINEMENTS)
-        return result
-
-    start = jnp.zeros_like(b), b, norm(b.ravel()), jnp.int32(0)
-    return lax.while_loop(unfinished, body, start)[0]
+def most_products(size: int) -> int:
+    """Products with a system of N states in one run of BiCGSTAB."""
+    return min(20_000, 8 * size + 64)
 
 
 def dot(x: jax.Array, y: jax.Array) -> jax.Array:

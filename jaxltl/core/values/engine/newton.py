@@ -20,12 +20,11 @@ from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import (
-    Bicgstab,
     System,
+    bicgstab,
     inverse,
     is_small,
     norm,
-    start_bicgstab,
 )
 
 # From the choices, their values, and parameters: the value and the weights of its derivative.
@@ -56,25 +55,19 @@ class Method(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """State of the search of a lane: the next argument of P, and its purpose."""
+    """State of the search of a lane."""
 
-    phase: jax.Array
-    z: jax.Array
+    z: jax.Array  # the value to be judged next
     value: jax.Array  # the best so far, with its image and the weights of the derivative there
     image: jax.Array
     weight: jax.Array  # [A, N], or [R]
     error: jax.Array
     done: jax.Array
-    newton: jax.Array  # whether z is a step of Newton's, to be judged
+    newton: jax.Array  # whether z is a step of Newton's
+    solved: jax.Array  # whether its linear system was solved
     plain: jax.Array  # sweeps to come before the next of Newton's
     pause: jax.Array
-    solved: jax.Array  # whether its linear system was solved
-    krylov: Bicgstab  # on the correction
-    target: jax.Array
-    inner: jax.Array
-
-
-_LOOK, _FIRST, _SECOND, _DIRECT = range(4)
+    num_steps: jax.Array
 
 
 def solve(
@@ -93,83 +86,97 @@ def solve(
     # monotone and convex also if its system was solved; if not, ever more sweeps come before the
     # next.
     # Elsewhere an exact step is no better than another.
-    newton = method.newton
-    small = method.monotone and is_small(table, value.shape[0])
-    over = table.choices
-
-    def step(table: SweepOperator, k: _Search, given: Backup) -> _Search:
-        over, ahead = table.choices, table.expectation(k.z)
-        branches = [partial(_look, over, method, given)]
-        if newton:
-            branches += [partial(_first, over, given), partial(_second, over, small, given)]
-        if newton and small:
-            branches += [partial(_direct, table, given)]
-        if len(branches) == 1:
-            return branches[0](k, ahead)
-        result: _Search = lax.switch(k.phase, branches, k, ahead)
-        return result
-
     zero = jnp.zeros_like(value)
-    weight: Quantity = over.spread(zero, backup.reward)
-    scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
+    weight: Quantity = table.choices.spread(zero, backup.reward)
+    over, none, no = table.choices, jnp.int32(0), jnp.bool_(False)
     start = _Search(
-        phase=jnp.int32(_LOOK),
         z=value,
         value=value,
         image=value,
         weight=over.packed(weight),
-        error=jnp.full_like(scalar, jnp.inf),
+        error=jnp.full_like(zero[0], jnp.inf),
         done=no,
         newton=no,
+        solved=no,
         plain=jnp.int32(first_sweeps),
         pause=none,
-        solved=no,
-        krylov=start_bicgstab(zero, zero),
-        target=scalar,
-        inner=none,
+        num_steps=none,
     )
     # Side by side wins where a row of lanes fills a vector unit, which doubles do not.
-    lanes = "side by side" if not newton and value.dtype.itemsize <= 4 else "in turn"
+    together = not method.newton and value.dtype.itemsize <= 4
     last, n = iterate(
-        step, lambda k, _: k.done, (table, start, backup), max_steps=max_steps, lanes=lanes
+        partial(_newton_step if method.newton else _sweep, method),
+        lambda k, _: k.done,
+        (table, start, (backup, jnp.asarray(max_steps, jnp.int32))),
+        max_steps=max_steps,
+        lanes="side by side" if together else "in turn",
     )
-    return last.value, last.image, n, last.weight
+    return last.value, last.image, last.num_steps if method.newton else n, last.weight
 
 
-def _look(over: Layout, method: Method, given: Backup, k: _Search, ahead: Quantity) -> _Search:
-    """Judges z by its image, and says what follows."""
-    image, weight = method.combine(over, action_values(over, given, ahead), given.extra)
-    done, error = method.judge(k.z, image, given.extra)
-    if not method.newton:
-        sweep = k.z + (1 - given.damping) * (image - k.z)
-        return k._replace(z=sweep, value=k.z, image=image, error=error, done=done)
-    weight = over.packed(weight)
+_Given = tuple[Backup, jax.Array]
+
+
+def _judged(
+    method: Method, table: SweepOperator, k: _Search, backup: Backup
+) -> tuple[jax.Array, Quantity, jax.Array, jax.Array]:
+    """The image of z, the weights of its derivative, and the judgement."""
+    values = action_values(table.choices, backup, table.expectation(k.z))
+    image, weight = method.combine(table.choices, values, backup.extra)
+    return image, weight, *method.judge(k.z, image, backup.extra)
+
+
+def _sweep(method: Method, table: SweepOperator, k: _Search, given: _Given) -> _Search:
+    image, _, done, error = _judged(method, table, k, given[0])
+    z = k.z + (1 - given[0].damping) * (image - k.z)
+    return k._replace(z=z, value=k.z, image=image, error=error, done=done)
+
+
+def _newton_step(method: Method, table: SweepOperator, k: _Search, given: _Given) -> _Search:
+    """Judges z, and makes a step of Newton's method or a sweep."""
+    (backup, most), over = given, table.choices
+    image, weight, done, error = _judged(method, table, k, backup)
     kept = ~k.newton | (error <= k.error / 2)  # false for NaN
     if method.monotone:
         kept |= k.solved & jnp.isfinite(error)
     value, image, weight, error = jax.tree.map(
-        partial(jnp.where, kept), (k.z, image, weight, error), (k.value, k.image, k.weight, k.error)
+        partial(jnp.where, kept),
+        (k.z, image, over.packed(weight), error),
+        (k.value, k.image, k.weight, k.error),
     )
-    change = image - value
+    change, num_steps = image - value, k.num_steps + 1
     pause = jnp.where(kept, jnp.where(k.newton, 0, k.pause), 2 * k.pause + 4)
     plain = jnp.where(kept, jnp.maximum(k.plain - 1, 0), pause)
-    sweeps = plain > 0
-    sweep = value + (1 - given.damping) * change
-    return k._replace(
-        phase=jnp.where(sweeps, _LOOK, _FIRST).astype(jnp.int32),
-        z=jnp.where(sweeps, sweep, change),
+    done = (done & kept) | (num_steps >= most)
+    products = jnp.minimum(_INNER, most - num_steps - 1)  # one more step judges the result
+    sweeps = (plain > 0) | done | (products < 2)
+
+    def swept() -> tuple[jax.Array, jax.Array, jax.Array]:
+        return (1 - backup.damping) * change, jnp.bool_(False), num_steps
+
+    def solved() -> tuple[jax.Array, jax.Array, jax.Array]:
+        system = System(table, over.unpacked(weight), backup.scale)
+        target = _EXACT * norm(change)
+        inner, n = bicgstab(system.matvec, change, tolerance=target, max_steps=products)
+        x, enough = inner.x, inner.size <= target
+        if method.monotone and is_small(table, change.size):
+            x = lax.cond(enough, lambda: x, lambda: inverse(system.matrix()) @ change)
+            enough = jnp.bool_(True)
+        return x, enough, num_steps + n
+
+    step, enough, num_steps = lax.cond(sweeps, swept, solved)
+    return _Search(
+        z=value + step,
         value=value,
         image=image,
         weight=weight,
         error=error,
-        done=done & kept,
+        done=done,
         newton=~sweeps,
+        solved=enough,
         plain=plain,
         pause=pause,
-        solved=jnp.zeros_like(done),
-        krylov=start_bicgstab(jnp.zeros_like(change), change),
-        target=_EXACT * norm(change),
-        inner=jnp.zeros_like(k.inner),
+        num_steps=num_steps,
     )
 
 
@@ -178,35 +185,3 @@ def action_values(over: Layout, given: Backup, ahead: Quantity) -> Quantity:
     return jax.tree.map(
         lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead
     )
-
-
-def _applied(over: Layout, given: Backup, k: _Search, ahead: Quantity) -> jax.Array:
-    weight: Quantity = over.unpacked(k.weight)
-    return k.z - given.scale * over.mean(weight, ahead)
-
-
-def _first(over: Layout, given: Backup, k: _Search, ahead: Quantity) -> _Search:
-    krylov = k.krylov.first(_applied(over, given, k, ahead))
-    return k._replace(krylov=krylov, z=krylov.r, phase=jnp.full_like(k.phase, _SECOND))
-
-
-def _second(over: Layout, small: bool, given: Backup, k: _Search, ahead: Quantity) -> _Search:
-    krylov = k.krylov.second(_applied(over, given, k, ahead))
-    size, inner = krylov.size, k.inner + 2
-    solved = size <= k.target
-    failed = ~solved & ((inner >= _INNER) | ~jnp.isfinite(size))
-    after = jnp.where(solved, _LOOK, jnp.where(failed, _DIRECT if small else _LOOK, _FIRST))
-    return k._replace(
-        phase=after.astype(jnp.int32),
-        krylov=krylov,
-        inner=inner,
-        solved=solved,
-        z=jnp.where(solved | failed, k.value + krylov.x, krylov.p),
-    )
-
-
-def _direct(table: SweepOperator, given: Backup, k: _Search, ahead: Quantity) -> _Search:
-    del ahead
-    matrix = System(table, table.choices.unpacked(k.weight), given.scale).matrix()
-    z = k.value + inverse(matrix) @ (k.image - k.value)
-    return k._replace(phase=jnp.full_like(k.phase, _LOOK), z=z, solved=jnp.ones_like(k.solved))

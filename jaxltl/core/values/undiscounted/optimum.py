@@ -38,7 +38,7 @@ from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
 from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
-from jaxltl.core.values.engine.linear import MOST_PRODUCTS, Inverse, System, is_small, solver
+from jaxltl.core.values.engine.linear import System, is_small, most_products, solver
 from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
@@ -73,7 +73,7 @@ def policy_reachability(
     )
     eliminable = method == "auto" and not is_sharded(model)
     if eliminable:  # Krylov steps stagnate in chains that take very long; then elimination follows
-        max_steps = jnp.minimum(max_steps, min(MOST_PRODUCTS, 8 * model.num_states + 64))
+        max_steps = jnp.minimum(max_steps, most_products(model.num_states))
     linear = solver(system, method, max_steps=max_steps)
 
     constant = lax.stop_gradient((model, policy))
@@ -86,7 +86,7 @@ def policy_reachability(
 
     start, n = linear.counted(one)
     found = m_matrix_error(rows, linear.solve, start, one, undecided)
-    if eliminable and not isinstance(linear, Inverse):
+    if eliminable and linear.inverse is None:
         # Without a proof the width is 1, which a loose tolerance admits.
         narrow = jnp.max(found[2] - found[1]) <= jnp.minimum(goal, 0.5)
         found = lax.cond(narrow, lambda: found, eliminated)
@@ -100,10 +100,10 @@ def policy_reachability(
         num_steps=n,
         # The error of elimination is rounding, so more steps would not help.
         status=status_code(
-            jnp.max(upper - lower) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
+            jnp.max(upper - lower) <= goal, jnp.isfinite(residual), linear.inverse is not None
         ),
     )
-    inverse = linear if isinstance(linear, Inverse) else None
+    inverse = None if linear.inverse is None else linear
     given = ChainSystem(model, policy, undecided)
     value = with_derivative(value, given, outside=one, inverse=inverse)
     solution = replace(lax.stop_gradient(solution), value=value, policy=policy)
@@ -160,124 +160,105 @@ def _qualitative(
 
 
 class _Search(NamedTuple):
-    """An optimal reachability problem; `sign` times probabilities are maximised."""
+    """An optimal reachability problem, as the maximum of ``y = sign * probability``."""
 
-    # `near` is the bound that a policy attains, the lower one of a maximum, and `far` the other.
-    # Both are rounded outwards: sums of nonnegative terms err by a share `slack` of them, and by
-    # `least` where products underflow.
+    # A policy attains the lower bound of y. Both bounds are rounded outwards: sums of terms of one
+    # sign err by a share `slack` of them, and by `underflow` where products underflow.
 
     model: ActionModel
     undecided: jax.Array
-    one: jax.Array
+    decided: jax.Array  # y elsewhere
     components: EndComponents | None
     goal: jax.Array  # half of the width
-
-    @property
-    def cheap(self) -> bool:
-        """True if sweeps under a fixed policy gather single states; a product gathers rows."""
-        return self.components is None and not isinstance(self.model, Product)
+    sign: jax.Array | int
 
     @property
     def slack(self) -> jax.Array | float:
         return rounding_unit(self.model)
 
-    @property
-    def least(self) -> jax.Array | float:
-        return underflow(self.model)
+    def choose(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The largest value of actions that leave the state's end component, and the action."""
+        allowed = self.model.available
+        if self.components is not None:
+            allowed &= ~self.components.inside
+        return action_argmax(expectation(self.model, y), allowed)
 
-    @property
-    def leaving(self) -> jax.Array:
-        available = self.model.available
-        result: jax.Array = (
-            available if self.components is None else available & ~self.components.inside
-        )
-        return result
+    def image(self, y: jax.Array) -> jax.Array:
+        return self.outside(_collapse(self.components, self.choose(y)[0]))
 
-    def best(self, sign: int, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value, action = action_argmax(sign * expectation(self.model, y), self.leaving)
-        return jnp.where(self.undecided, _collapse(self.components, sign * value), self.one), action
+    def outside(self, y: jax.Array) -> jax.Array:
+        return jnp.where(self.undecided, y, self.decided)
 
-    def beyond(self, sign: int, image: jax.Array) -> jax.Array:
-        """An image rounded upwards for sign 1, else downwards."""
-        rounded = image * (1 + sign * self.slack) + sign * self.least
-        return jnp.where(self.undecided, jnp.clip(rounded, 0, 1), self.one)
+    def rounded(self, image: jax.Array, end: int) -> jax.Array:
+        """An image rounded upwards, for `end` 1, or downwards, for -1."""
+        error = self.slack * jnp.abs(image) + underflow(self.model)
+        return self.outside(self.clipped(image + end * error))
 
-    def nearer(self, sign: int, near: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.maximum(sign * near, sign * self.beyond(-sign, image))
-
-    def closer(self, sign: int, far: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.minimum(sign * far, sign * self.beyond(sign, image))
+    def clipped(self, y: jax.Array) -> jax.Array:
+        return jnp.clip(y, jnp.minimum(self.sign, 0), jnp.maximum(self.sign, 0))
 
 
 class _Bounds(NamedTuple):
-    near: jax.Array
-    far: jax.Array
+    lower: jax.Array
+    upper: jax.Array
     failed: jax.Array  # whether the last guess was no bound
-    moved: jax.Array
-    rests: jax.Array  # whether a round gained less than rounding takes
+    ended: jax.Array
 
     @property
     def half(self) -> jax.Array:
-        return jnp.max(jnp.abs(self.far - self.near)) / 2
+        return jnp.max(self.upper - self.lower) / 2
 
 
-def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Search) -> _Bounds:
-    """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`."""
+def _tighter(finest: bool, table: None, bounds: _Bounds, search: _Search) -> _Bounds:
+    """One round: a sweep, and some under the greedy policy, for `lower`; some for `upper`."""
     # A value that the operator does not carry away from the optimum is a bound, because the fixed
-    # point is unique where end components are collapsed; so `far` is guessed, and where the guess
+    # point is unique where end components are collapsed; so `upper` is guessed, and where the guess
     # fails, plain interval iteration continues. Where the bounds are to be the finest, this continues
     # beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
-    near, far, failed, *_ = carry
-    image, action = search.best(sign, near)
-    close = jnp.bool_(finest) & (carry.half <= search.goal)
-    aim = jnp.where(close, carry.half / _FINER, search.goal)
-    settled = jnp.max(jnp.abs(image - near)) <= aim / 32
-    new_near = search.nearer(sign, near, image)
-    if search.cheap:
-        new_near = _followed(sign, search, new_near, action)
+    lower, upper, failed, _ = bounds
+    value, action = search.choose(lower)
+    image = search.outside(_collapse(search.components, value))
+    close = jnp.bool_(finest) & (bounds.half <= search.goal)
+    aim = jnp.where(close, bounds.half / _FINER, search.goal)
+    settled = jnp.max(jnp.abs(image - lower)) <= aim / 32
+    raised = jnp.maximum(lower, search.rounded(image, -1))
+    if search.components is None and not isinstance(search.model, Product):
+        # Sweeps under a policy gather single states; those of a product gather rows.
+        raised = _followed(search, raised, action)
 
-    def guess() -> tuple[jax.Array, jax.Array]:
-        # `near` moved by almost the tolerance; some sweeps give it its shape.
-        beyond = jnp.where(close, (far - new_near) / _FINER, sign * 1.8 * search.goal)
-        offered = jnp.clip(new_near + beyond, 0, 1)
-        offered = jnp.where(search.undecided, offered, search.one)
+    def lowered() -> tuple[jax.Array, jax.Array]:
+        # The guess is `raised` moved by almost the tolerance; some sweeps give it its shape.
+        guesses = settled & ~failed
+        beyond = jnp.where(close, (upper - raised) / _FINER, 1.8 * search.goal)
+        start = jnp.where(guesses, search.outside(search.clipped(raised + beyond)), upper)
 
         def sweep(_: int, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            return pair[1], search.beyond(sign, search.best(sign, pair[1])[0])
+            image = search.rounded(search.image(pair[1]), 1)
+            return pair[1], jnp.where(guesses, image, jnp.minimum(image, pair[1]))
 
-        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (offered, offered))
-        proven = jnp.all(sign * after <= sign * before)
-        return jnp.where(proven, search.closer(sign, far, after), far), ~proven
+        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (start, start))
+        proven = jnp.all(after <= before)
+        return jnp.where(proven, jnp.minimum(upper, after), upper), ~proven
 
-    def sweeps() -> tuple[jax.Array, jax.Array]:
-        step = lax.fori_loop(
-            0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far
-        )
-        return step, jnp.bool_(False)
-
-    gain = jnp.max(jnp.abs(new_near - near))
+    gain = jnp.max(raised - lower)
     rests = close & (gain <= search.slack / 8)
-    new_far, failed = lax.cond(
-        settled | rests, lambda: lax.cond(failed | ~settled, sweeps, guess), lambda: (far, failed)
-    )
-    far_gain = jnp.max(jnp.abs(new_far - far))
-    rests &= ~failed & (far_gain <= search.slack / 8)
-    return _Bounds(new_near, new_far, failed, (gain > 0) | (far_gain > 0) | failed, rests)
+    new, failed = lax.cond(settled | rests, lowered, lambda: (upper, failed))
+    drop = jnp.max(upper - new)
+    rests &= ~failed & (drop <= search.slack / 8)
+    moved = (gain > 0) | (drop > 0) | failed
+    found = _Bounds(raised, new, failed, ~moved)
+    return found._replace(ended=~moved | (rests if finest else found.half <= search.goal))
 
 
-def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
+def _followed(search: _Search, lower: jax.Array, action: jax.Array) -> jax.Array:
     onward = policy_operator(search.model, action)
 
     def sweep(_: int, y: jax.Array) -> jax.Array:
-        image = onward(y.ravel()).reshape(y.shape)
-        return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
+        image = search.outside(onward(y.ravel()).reshape(y.shape))
+        return jnp.maximum(y, search.rounded(image, -1))
 
-    result: jax.Array = lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
+    result: jax.Array = lax.fori_loop(0, _POLICY_SWEEPS, sweep, lower)
     return result
-
-
-def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
-    return (carry.rests if finest else carry.half <= search.goal) | ~carry.moved
 
 
 @jit("objective")
@@ -322,51 +303,45 @@ def _by_policy_iteration(
         rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
     )
     finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
-    found = solve_problem(problem, jnp.minimum(asked, finest), asked)
+    found, leaves = solve_problem(problem, jnp.minimum(asked, finest), asked)
     value, lower, upper = (
         jnp.where(open_, x, one) for x in (found.value, found.lower, found.upper)
     )
-    rest = found.residual, found.num_steps, found.status
-    return Solution(value, found.policy, lower, upper, *rest), found.leaves
+    return replace(found, value=value, lower=lower, upper=upper), leaves
 
 
 def _by_intervals(
     model: PyTree, sets: Sets, components: EndComponents | None, options: PyTree, *, objective: str
 ) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven."""
-    # The attained bound ("near") is the lower one of a maximum and the upper one of a minimum.
-    # Sweeps under its own greedy policy move it soundly and cheaply.
+    # Sweeps under its own greedy policy move the attained bound soundly and cheaply.
     (tolerance, max_steps, start), sign = options, 1 if objective == "max" else -1
-    undecided = ~(sets.one | sets.zero)
-    one = sets.one.astype(model.dtype)
+    undecided, one = ~(sets.one | sets.zero), sets.one.astype(model.dtype)
     goal = _half_width(model, tolerance)
-    search = _Search(model, undecided, one, components, goal)
-    top = jnp.where(undecided, 1, one)
-    low, high = one, top
-    if start is not None:
-        low, high = (jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
-    near, far = (low, high) if objective == "max" else (high, low)
-    finest, no = tolerance is None, jnp.bool_(False)
+    search = _Search(model, undecided, sign * one, components, goal, sign)
+    ends = (0, 1) if start is None else (jnp.clip(x, 0, 1) for x in start)
+    low, high = (jnp.where(undecided, x, one) for x in ends)
+    lower, upper = (low, high) if sign > 0 else (-high, -low)
+    no = jnp.bool_(False)
     bounds, n = iterate(
-        partial(_tighter, sign, finest),
-        partial(_ended, finest),
-        (None, _Bounds(near, far, no, ~no, no), search),
+        partial(_tighter, tolerance is None),
+        lambda bounds, _: bounds.ended,
+        (None, _Bounds(lower, upper, no, no), search),
         max_steps=_SWEEPS if max_steps is None else max_steps,
     )
-    near, far = bounds.near, bounds.far
+    lower, upper = bounds.lower, bounds.upper
     still = lax.stop_gradient(search)
-    action = still.best(sign, near)[1]
+    own, action = still.choose(lower)
     if components is not None:
-        own = action_argmax(expectation(still.model, near), still.leaving)[0]
         exits = undecided & (own >= _collapse(components, own))
         towards = attract(TracedGraph(model), exits, components.inside).action
         action = jnp.where(exits, action, towards)
-    lower, upper = (near, far) if objective == "max" else (far, near)
     value = (lower + upper) / 2
-    residual = jnp.max(jnp.abs(still.best(sign, value)[0] - value))
+    residual = jnp.max(jnp.abs(still.image(value) - value))
+    low, high = (lower, upper) if sign > 0 else (-upper, -lower)
     policy = jnp.where(undecided, action, sets.action)
     status = status_code(bounds.half <= goal, jnp.isfinite(residual))
-    return Solution(value, policy, lower, upper, residual, n, status)
+    return Solution(sign * value, policy, low, high, residual, n, status)
 
 
 def _collapse(components: EndComponents | None, value: jax.Array) -> jax.Array:

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -53,7 +54,15 @@ from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse
 from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import sequential_vmap
-from jaxltl.core.values.engine.linear import System, bicgstab, inverse, is_small, norm
+from jaxltl.core.values.engine.linear import (
+    System,
+    bicgstab,
+    inverse,
+    is_small,
+    most_products,
+    norm,
+    random_shadow,
+)
 
 _FORCING = 1e-2  # relative residual of a linear system
 _POOR = 0.5  # relative residual from which a solution is not used
@@ -105,21 +114,6 @@ _Progress = tuple[_Point, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array, 
 Tree = TypeVar("Tree")
 
 
-class Found(NamedTuple):
-    """Result of :func:`total_reward_by_sweeps` without derivatives."""
-
-    value: jax.Array  # value, lower, upper: ``float[S]``, 0 where it is infinite
-    lower: jax.Array
-    upper: jax.Array
-    policy: jax.Array  # ``int32[S]``, attains the bound on the safe side
-    leaves: jax.Array  # ``int32[S]``, the state with the action that gives the value
-    open: jax.Array  # open, finite: as in the problem
-    finite: jax.Array
-    residual: jax.Array  # residual, num_steps, status: as in a Solution
-    num_steps: jax.Array
-    status: jax.Array
-
-
 @jit("objective")
 def total_reward_by_sweeps(
     model: ActionModel,
@@ -138,26 +132,19 @@ def total_reward_by_sweeps(
     reward = jnp.where(model.available & earns, reward, 0)
     checked = None if policy is None else valid_policy(model, policy)
     weight = None if checked is None else checked.distribution
-    found: Found = sequential_vmap(
+    found, leaves, open_, finite = sequential_vmap(
         partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
     )
     chosen = found.policy if weight is None else weight
-    chain = ChainSystem(model, chosen, found.open, found.leaves)
-    value, finite = with_derivative(found.value, chain, reward=reward), found.finite & earns
+    chain = ChainSystem(model, chosen, open_, leaves)
+    value, finite = with_derivative(found.value, chain, reward=reward), finite & earns
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
     )
     none = status_code(earns, earns, valid=is_representable(model))
-    solution = Solution(
-        value=value,
-        policy=chosen,
-        lower=lower,
-        upper=upper,
-        residual=found.residual,
-        num_steps=found.num_steps,
-        status=jnp.maximum(found.status, none),
-    )
+    status = jnp.maximum(found.status, none)
+    solution = replace(found, value=value, policy=chosen, lower=lower, upper=upper, status=status)
     return refuse(solution, checked)
 
 
@@ -169,14 +156,15 @@ def _enclosed(
     tolerance: jax.Array | float,
     *,
     objective: str,
-) -> Found:
+) -> tuple[Solution, jax.Array, jax.Array, jax.Array]:
+    """The enclosure, where actions are taken, and where the value is not 0, and finite."""
     graph, rows = TracedGraph(model), dw.normalised_rows(model, policy)
     if policy is not None:
         problem = _of_policy(graph, rows, reward, target, policy)
     else:
         problem = (_largest if objective == "max" else _smallest)(graph, rows, reward, target)
     tolerance = jnp.asarray(tolerance, model.dtype)
-    return solve_problem(problem, tolerance, tolerance)
+    return *solve_problem(problem, tolerance, tolerance), problem.open, problem.finite
 
 
 # --- qualitative preprocessing ----------------------------------------------------------------
@@ -349,7 +337,15 @@ def _improved(
     if known[0].size:
         x, n = (known[0] @ change.ravel()).reshape(change.shape) / scale, jnp.int32(0)
     else:
-        x, n = bicgstab(matvec, wanted, tolerance=_FORCING)
+        right = wanted.ravel()
+        inner, n = bicgstab(
+            lambda x: matvec(x.reshape(wanted.shape)).ravel(),
+            right,
+            tolerance=_FORCING * norm(right),
+            max_steps=most_products(right.size),
+            shadow=random_shadow(right),
+        )
+        x = inner.x.reshape(wanted.shape)
     left = norm((wanted - matvec(x)).ravel())
     solved = left <= _POOR * norm(wanted.ravel())  # false for NaN
     x = lax.cond(
@@ -472,8 +468,14 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     return _Search(at, known, share, bounds, shares, gap, safe, residual, *steps)
 
 
-def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> Found:
-    """The enclosure of a problem, of width `tolerance` if possible; converged if it is `asked`."""
+def solve_problem(
+    problem: Problem, tolerance: jax.Array, asked: jax.Array
+) -> tuple[Solution, jax.Array]:
+    """The enclosure of a problem, of width `tolerance` if possible; converged if it is `asked`.
+
+    Values are 0 where they are infinite. The second result is the state with the action that gives
+    the value of each state, ``int32[S]``.
+    """
     rows, model = problem.rows, problem.model
     dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
     zero = dw.double_word(jnp.zeros(problem.open.shape, dtype))
@@ -524,18 +526,9 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
     narrow = _width(problem, upper - lower, upper) <= asked
     exhausted = k.ended | (_wide(problem, k) <= inner)
     status = status_code(narrow, jnp.all(jnp.isfinite(value)), jnp.all(both) & exhausted)
-    return Found(
-        value,
-        lower,
-        upper,
-        policy,
-        k.safe.leaves,
-        problem.open,
-        problem.finite,
-        k.residual,
-        jnp.maximum(k.num_steps, 0),
-        status,
-    )
+    num_steps = jnp.maximum(k.num_steps, 0)
+    solution = Solution(value, policy, lower, upper, k.residual, num_steps, status)
+    return solution, k.safe.leaves
 
 
 def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
