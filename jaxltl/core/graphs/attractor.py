@@ -7,14 +7,15 @@ in the transitions. Of a sparse model allowed actions are ``bool[R]``, and an ac
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple, Any
 
 import jax
 import numpy as np
 
 from jaxltl.core.array_types import Array
-from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
+from jaxltl.core.graphs.graph import Graph, on_graph
+from jaxltl.core.models.ops.array_namespace import jax_array
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
@@ -86,22 +87,17 @@ def attractor(
         exists = rule
     if chance not in ("some", "all"):
         raise ValueError(f"chance={chance!r}; choose some or all.")
-    graph = graph_of(model, goal, allowed, exists, among)
-    goal, allowed, exists, among = take(graph, (goal, allowed, exists, among))
-    result: Attractor = to_jax(
-        attract(graph, goal, allowed, rule=exists, chance=chance, among=among)
-    )
-    return result
+    return on_graph(partial(attract, chance=chance), model, goal, allowed, exists, among)
 
 
 def attract(
     graph: Graph,
     goal: Array,
     allowed: Array | None = None,
-    *,
     rule: Array | bool = True,
-    chance: str = "some",
     among: Array | None = None,
+    *,
+    chance: str = "some",
 ) -> Attractor:
     """:func:`attractor` on a graph, with a rule ``bool[S]`` or ``bool[]``, True for exists."""
     xp, shape = graph.xp, graph.state_shape
@@ -134,8 +130,7 @@ def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -
       >>> avoidable(fork, np.array([False, True, False])).tolist()
       [True, False, True]
     """
-    graph = graph_of(model, goal, allowed)
-    return jax_array(avoid(graph, *take(graph, (goal, allowed))))
+    return jax_array(on_graph(avoid, model, goal, allowed))
 
 
 def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
@@ -170,14 +165,11 @@ def almost_surely_reaching(
       >>> almost_surely_reaching(fork, np.array([False, True, False])).region.tolist()
       [False, True, False]
     """
-    graph = graph_of(model, goal, allowed, reaching)
-    goal, allowed, reaching = take(graph, (goal, allowed, reaching))
-    result: Attractor = to_jax(surely(graph, goal, allowed, reaching=reaching))
-    return result
+    return on_graph(surely, model, goal, allowed, reaching)
 
 
 def surely(
-    graph: Graph, goal: Array, allowed: Array | None = None, *, reaching: Attractor | None = None
+    graph: Graph, goal: Array, allowed: Array | None = None, reaching: Attractor | None = None
 ) -> Attractor:
     """:func:`almost_surely_reaching` on a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxltl.core.graphs.attractor import avoid, attract
-from jaxltl.core.graphs.graph import Graph, graph_of, take
+from jaxltl.core.graphs.graph import Graph, graph_of, on_graph, take
 from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, Array
@@ -59,9 +59,7 @@ def end_components(
       >>> end_components(fork, np.ones(3, bool)).inside.tolist()
       [[False, True], [True, False], [False, False]]
     """
-    graph = graph_of(model, region, allowed)
-    result: EndComponents = to_jax(components_within(graph, *take(graph, (region, allowed))))
-    return result
+    return on_graph(components_within, model, region, allowed)
 
 
 def components_within(graph: Graph, region: Array, allowed: Array | None = None) -> EndComponents:
@@ -77,9 +75,7 @@ def components_within(graph: Graph, region: Array, allowed: Array | None = None)
 
 def bottom_components(model: Model, allowed: jax.Array) -> EndComponents:
     """Bottom strongly connected components of the chain that takes all allowed actions."""
-    graph = graph_of(model, allowed)
-    result: EndComponents = to_jax(closed_components(graph, take(graph, allowed)))
-    return result
+    return on_graph(closed_components, model, allowed)
 
 
 def closed_components(graph: Graph, allowed: Array) -> EndComponents:

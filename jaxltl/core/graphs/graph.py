@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.models.ops.array_namespace import host_callback, is_traced, jit
+from jaxltl.core.models.ops.array_namespace import host_callback, is_traced, jit, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.product import Product, reads
@@ -120,6 +120,7 @@ class TracedGraph:
 
 struct.register(TracedGraph, ["model"])
 
+Result = TypeVar("Result")
 Graph: TypeAlias = Any  # a RowGraph with NumPy's arrays, or a TracedGraph with JAX's
 
 
@@ -186,6 +187,13 @@ def host_graph(model: MDP | DenseMDP | Product) -> RowGraph:
         on_entry=model.label_on == "entry",
         allowed=None if model.allowed is None else np.asarray(model.allowed),
     )
+
+
+def on_graph(function: Callable[..., Result], model: Model, *arguments: PyTree) -> Result:
+    """``function(graph, *arguments)`` for the graph of a model, as JAX's arrays."""
+    graph = graph_of(model, arguments)
+    result: Result = to_jax(function(graph, *take(graph, arguments)))
+    return result
 
 
 def take(graph: Graph, tree: PyTree) -> PyTree:
