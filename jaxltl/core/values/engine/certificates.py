@@ -15,19 +15,19 @@ from jaxltl.core.models.ops.operators import Policy
 from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.engine.validated import invalidated
 
 
 def rounding_unit(model: Model) -> jax.Array | float:
     """Rounding error of one backup, relative to the magnitude of its terms."""
     # A backup adds at most K products and takes a maximum or a mean over A actions. The sum of a
     # row may miss 1 by a rounding for each entry, since a model means its normalised rows.
-    terms = widest_row(model) + most_choices(model) + 4
-    return terms * float(jnp.finfo(model.dtype).eps)
+    return _terms(model) * float(jnp.finfo(model.dtype).eps)
 
 
 def underflow(model: Model) -> jax.Array | float:
     """Absolute error of one backup by products that underflow, where XLA flushes them to zero."""
-    return (widest_row(model) + most_choices(model) + 4) * float(jnp.finfo(model.dtype).tiny)
+    return _terms(model) * float(jnp.finfo(model.dtype).tiny)
 
 
 def most_choices(model: Model) -> jax.Array | int:
@@ -38,12 +38,14 @@ def most_choices(model: Model) -> jax.Array | int:
     return cast(ActionModel, model).num_actions
 
 
-def widest_row(model: Model) -> jax.Array | int:
-    """Maximal number of successors of a choice: static, for a sparse model ``int32[]``."""
+def _terms(model: Model) -> jax.Array | int:
+    """Maximal number of terms and choices of a backup."""
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):
-        return jnp.max(jnp.diff(jnp.asarray(world.entry_start)))
-    return cast(SuccessorModel, model).num_successors
+        widest: jax.Array | int = jnp.max(jnp.diff(jnp.asarray(world.entry_start)))
+    else:
+        widest = cast(SuccessorModel, model).num_successors
+    return widest + most_choices(model) + 4
 
 
 def backup_error(unit: jax.Array | float, *sizes: jax.Array) -> jax.Array:
@@ -190,15 +192,7 @@ def refuse(solution: Solution, checked: Policy | None) -> Solution:
     code = jnp.where(checked.representable, Status.INVALID_POLICY, Status.INVALID)
     valid = checked.valid & checked.representable
 
-    def where(good: jax.Array, bad: float) -> jax.Array:
-        return jnp.where(valid, good, jnp.asarray(bad, good.dtype))
-
-    return replace(
-        solution,
-        value=where(solution.value, jnp.nan),
-        policy=jnp.where(valid, solution.policy, checked.given),
-        lower=where(solution.lower, -jnp.inf),
-        upper=where(solution.upper, jnp.inf),
-        residual=where(solution.residual, jnp.nan),
-        status=jnp.where(valid, solution.status, code).astype(jnp.int32),
-    )
+    policy = jnp.where(valid, solution.policy, checked.given)
+    reason = jnp.where(valid, Status.CONVERGED, code)
+    result: Solution = invalidated(replace(solution, policy=policy), reason)
+    return result

@@ -38,44 +38,30 @@ def solution_from_enclosure(
     model: Model, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
     """A solution in the shapes and precision of a model, with bounds rounded outwards."""
-    low, high = found.lower, found.upper
+    value, low, high, policy = found.value, found.lower, found.upper, found.row
     status = status_between(low, high, tolerance, relative=relative)
-    policy, shape = found.row, model.state_shape
-    if sparse is not None and not is_sparse(model):
-        policy = np.asarray(sparse.action)[found.row]
-    policy = policy.astype(np.int32).reshape(shape)
-    parts: dict[str, Array] = {
-        "value": found.value.reshape(shape),
-        "policy": policy,
-        "lower": low.reshape(shape),
-        "upper": high.reshape(shape),
-        "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds),
-        "status": np.int32(status),
-    }
-    method = found.method
-    if is_sparse(model):
-        return Solution(**parts, method=method)
-    dtype = np.dtype(model.dtype)
-    exact = low == high
-    low, high = (
-        np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
-        for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf)))
-    )
-    low = np.maximum(low, 0)
-    if not relative:
-        high = np.minimum(high, 1)
-    # XLA flushes subnormal numbers to zero.
-    tiny = np.finfo(dtype).tiny
-    low = np.where(low < tiny, 0, low).astype(dtype).reshape(shape)
-    high = np.where(high > 0, np.maximum(high, tiny), high).astype(dtype).reshape(shape)
-    parts |= {
-        "value": np.clip(parts["value"].astype(dtype), low, high),
-        "lower": low,
-        "upper": high,
-        "residual": np.asarray(found.residual, dtype),
-    }
-    return Solution(**to_jax(parts), method=method)
+    dtype = np.dtype(np.float64)
+    if not is_sparse(model):
+        policy = policy if sparse is None else np.asarray(sparse.action)[policy]
+        dtype, exact = np.dtype(model.dtype), low == high
+        low, high = (
+            np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
+            for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf)))
+        )
+        # XLA flushes subnormal numbers to zero.
+        tiny = np.finfo(dtype).tiny
+        low = np.where(low < tiny, 0, low).astype(dtype)
+        high = np.where(high > 0, np.maximum(high, tiny), high).astype(dtype)
+        high = high if relative else np.minimum(high, 1)
+        value = np.clip(value.astype(dtype), low, high)
+    parts: list[Array] = [
+        *(x.reshape(model.state_shape) for x in (value, policy.astype(np.int32), low, high)),
+        np.asarray(found.residual, dtype)[()],
+        np.int32(found.rounds),
+        np.int32(status),
+    ]
+    solution = Solution(*(parts if is_sparse(model) else to_jax(parts)))
+    return replace(solution, method=found.method)
 
 
 def complement_event(solution: Solution) -> Solution:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -11,6 +12,7 @@ from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.interval.robust_values import RobustValues
+from jaxltl.core.sparse.solvers.average_reward import AverageReward
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import Solution, Status, require_states
 
@@ -59,20 +61,7 @@ def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndar
             f"the reward of state {state}, choice {row - int(model.row_start[state])} "
             f"is {earned[row]}; make it finite."
         )
-    if all(
-        x is None or (np.asarray(x) >= 0).all()
-        for x in (given.state, given.choice, given.transition)
-    ):
-        return earned, earned
-    sizes = {
-        name: None if x is None else np.abs(np.asarray(x))
-        for name, x in (
-            ("state", given.state),
-            ("choice", given.choice),
-            ("transition", given.transition),
-        )
-    }
-    return earned, choice_reward(model, Rewards(**sizes))
+    return earned, choice_reward(model, jax.tree.map(np.abs, given))
 
 
 def nonnegative_reward(
@@ -152,13 +141,16 @@ def safe_mean(share: np.ndarray, bound: ArrayLike, *, up: bool, highest: float =
 
 
 def safe_ends(
-    model: Model, found: Solution | Enclosure | RobustValues, *, highest: float = np.inf
+    model: Model,
+    found: Solution | Enclosure | RobustValues | AverageReward,
+    *,
+    highest: float = np.inf,
 ) -> tuple[float, float]:
     """Enclosure of the mean over the initial distribution, from `lower` and `upper`."""
-    share = np.asarray(model.initial, np.float64)
+    share = np.asarray(model.initial, np.float64).ravel()
     start = np.flatnonzero(share)
     low, high = (
-        safe_mean(share[start], x[start], up=up, highest=highest)
+        safe_mean(share[start], np.asarray(x).ravel()[start], up=up, highest=highest)
         for x, up in ((found.lower, False), (found.upper, True))
     )
     return low, high

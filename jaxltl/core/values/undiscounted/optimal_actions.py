@@ -28,9 +28,9 @@ from jaxltl.core.values.engine.certificates import rounding_unit
 from jaxltl.core.values.engine.host_solution import complement_event, solution_from_enclosure
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
-    Question,
     attained_by_ties,
     conserving_rows,
+    enclose,
     on_actions,
     rows_of_model,
 )
@@ -192,7 +192,7 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
         return None
     sparse = rows_of_model(problem.model)
     host = sparse.host
-    found = Question.of(problem.target, None, problem.objective).solve(host, 1e-12)
+    found = enclose(host, problem.target, problem.objective, 1e-12)
     keeps = conserving_rows(host, problem.objective, found)
     decided = found.lower == found.upper
     slower = attained_by_ties(host, problem.objective, found)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import NamedTuple
 
 import jax
@@ -148,20 +148,10 @@ def _task_performance(
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
     found = _summarize(model, value, lower, upper, tolerance)
-    unknown: dict[str, PyTree] = {
-        "mean": jnp.nan,
-        "lower": 0,
-        "upper": 1,
-        "worst": jnp.nan,
-        "worst_lower": 0,
-        "worst_upper": 1,
-        "value": jnp.nan,
-        "status": Status.INVALID,
-    }
+    nan, worst_state = jnp.nan, found.worst_state
+    unknown: list[PyTree] = [nan, 0, 1, nan, 0, 1, worst_state, nan, Status.INVALID]
     result: Performance = jax.tree.map(
-        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
-        found,
-        replace(found, **unknown),
+        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)), found, Performance(*unknown)
     )
     return result
 
@@ -304,22 +294,16 @@ def task_performances(
     if policies.shape == shape[1:]:
         policies = jnp.broadcast_to(policies, shape)
     require_shape("policies", policies, shape)
+    parts: list[PyTree] = [None] * num_worlds(models)
     if models.automaton.has_final_states:
         found = _batched(models, policies, tolerance, batch=batch)
-    else:
-        parts = [_on_host(models, policies, w, tolerance) for w in range(num_worlds(models))]
-        found = to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
-    status = np.asarray(found.status)
-    for w in np.flatnonzero(status == Status.INVALID):
-        require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
-    redone = np.flatnonzero((status != Status.CONVERGED) & (status != Status.INVALID))
-    if not redone.size or not models.automaton.has_final_states:
-        return found
-    columns = jax.tree.map(np.array, found)
-    for w in redone:
-        again = _on_host(models, policies, int(w), tolerance)
-        jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, again)
-    result: Performance = to_jax(columns)
+        parts = [jax.tree.map(itemgetter(w), found) for w in range(len(parts))]
+    for w, part in enumerate(parts):
+        if part is not None and part.status == Status.INVALID:
+            require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
+        elif part is None or part.status != Status.CONVERGED:
+            parts[w] = _on_host(models, policies, w, tolerance)
+    result: Performance = to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
     return result
 
 
@@ -334,7 +318,7 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
         some, chosen = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
         found = jax.block_until_ready(_together(some, chosen, tolerance))
         parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], found))
-    result: Performance = to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+    result: Performance = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     return result
 
 

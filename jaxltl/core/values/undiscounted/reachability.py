@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, Unpack, cast
+from typing import Unpack, cast
 
 import jax
 import numpy as np
@@ -183,16 +183,17 @@ def _on_host(
 ) -> Solution:
     """The probabilities by the sparse engine."""
     sparse = rows_of_model(model)
-    question = Question.of(target, stay, objective)
     # An optimum of a small model is as close as possible in any case, for its ties.
     exact = stay is None and not is_sparse(model) and (tolerance is None or policy is None)
     asked, fine = _tolerances(model, tolerance, exact=exact)
     host, depth = sparse.host, 0
     if policy is not None:
         host, _, depth = induced_chain(model, sparse, policy)
-    found = question.solve(host, fine, depth)
+    found = enclose(host, target, objective, fine, stay=stay, depth=depth)
     if policy is None and stay is None and not is_sparse(model):
-        found = replace(found, row=_fastest(host, question, found))
+        found = replace(
+            found, row=_fastest(host, np.asarray(target, bool).ravel(), objective, found)
+        )
     return with_given_policy(
         solution_from_enclosure(model, sparse, found, asked, relative=isinstance(asked, Relative)),
         policy,
@@ -238,29 +239,24 @@ def row_of_action(sparse: SparseMDP, action: Array) -> Integers:
     return sparse.host.first_choice(chosen)[1]
 
 
-class Question(NamedTuple):
-    """A reachability question about sparse rows."""
-
-    target: Booleans
-    stay: Booleans | None
-    objective: str
-
-    @classmethod
-    def of(cls, target: Booleans, stay: Booleans | None, objective: str) -> Question:
-        """The question with flat arrays."""
-        stay = None if stay is None else np.asarray(stay, bool).ravel()
-        return cls(np.asarray(target, bool).ravel(), stay, objective)
-
-    def solve(self, mdp: HostMDP, tolerance: float, depth: int = 0) -> Enclosure:
-        """The enclosure on sparse rows."""
-        return solver.reachability(
-            mdp,
-            self.target,
-            maximize=self.objective == "max",
-            stay=self.stay,
-            tolerance=tolerance,
-            depth=depth,
-        )
+def enclose(
+    mdp: HostMDP,
+    target: Array,
+    objective: str,
+    tolerance: float,
+    *,
+    stay: Array | None = None,
+    depth: int = 0,
+) -> Enclosure:
+    """The enclosure on sparse rows."""
+    return solver.reachability(
+        mdp,
+        np.asarray(target, bool).ravel(),
+        maximize=objective == "max",
+        stay=None if stay is None else np.asarray(stay, bool).ravel(),
+        tolerance=tolerance,
+        depth=depth,
+    )
 
 
 # --- ties -----------------------------------------------------------------------------------------
@@ -314,18 +310,18 @@ def _backup_unit(mdp: HostMDP) -> float:
     return (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
 
 
-def _fastest(mdp: HostMDP, question: Question, found: Enclosure) -> Integers:
+def _fastest(mdp: HostMDP, target: Booleans, objective: str, found: Enclosure) -> Integers:
     """The rows of the policy with the least expected time to decide, among those that attain."""
     if mdp.num_states > QUICK_LIMIT:
         return found.row
-    good = conserving_rows(mdp, question.objective, found)
+    good = conserving_rows(mdp, objective, found)
     undecided = found.lower != found.upper
     good[found.row[undecided]] = True
     decided = ~undecided
-    if question.objective == "max":
+    if objective == "max":
         one = found.lower == 1
         good |= one[mdp.state] & ~mdp.support.some_successor_in(~one)
-        decided &= ~one | question.target
+        decided &= ~one | target
     return fastest_rows(mdp, good, decided, found.row)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
@@ -30,7 +29,7 @@ from jaxltl.core.sparse.solvers.shortest_path import with_exits
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import Chain, induced_chain, status_between
-from jaxltl.core.values.engine.state_quantities import safe_mean
+from jaxltl.core.values.engine.state_quantities import safe_ends
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.reachability import on_rows, rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import (
@@ -231,19 +230,16 @@ class StepAnalysis:
     def probability(self, policy: Array) -> tuple[float, float, float]:
         """Satisfaction probability from the initial distribution: value, lower and upper bound."""
         found = satisfaction_probability(self.model, policy, tolerance=_CLOSE)
-        return self.mean(jax.tree.map(lambda x: np.asarray(x).ravel(), found), 1.0)
+        return self.mean(found, 1.0)
 
     def mean(
         self, found: Enclosure | AverageReward | Solution, highest: float = np.inf
     ) -> tuple[float, float, float]:
         """Value, lower and upper bound of the mean over the initial distribution."""
         share = np.asarray(self.model.initial, np.float64).ravel()
+        low, high = safe_ends(self.model, found, highest=highest)
         start = np.flatnonzero(share)
-        low, high = (
-            safe_mean(share[start], np.asarray(x)[start], up=up, highest=highest)
-            for x, up in ((found.lower, False), (found.upper, True))
-        )
-        middle = float(share[start] @ np.asarray(found.value)[start] / share[start].sum())
+        middle = share[start] @ np.asarray(found.value).ravel()[start] / share.sum()
         return float(np.clip(middle, low, high)), low, high
 
     # --- rounds of acceptance ---------------------------------------------------------------------

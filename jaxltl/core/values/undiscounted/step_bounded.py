@@ -6,6 +6,7 @@ Solved in double precision; bounds include all rounding.
 from __future__ import annotations
 
 import math
+from typing import TypeGuard
 
 import numpy as np
 
@@ -29,11 +30,18 @@ from jaxltl.core.values.engine.state_quantities import (
 from jaxltl.core import validation
 
 
-def _refuse_steps(by_step: bool) -> None:
+def _has_intervals(
+    model: Model, nature: str | None, by_step: bool = False
+) -> TypeGuard[IntervalMDP]:
+    """True for a model with intervals; raises ValueError for an option that is not for the model."""
+    if not isinstance(model, IntervalMDP):
+        refuse_nature(nature)
+        return False
     if by_step:
         raise ValueError(
             "by_step is not for models with intervals; solve for each number of steps."
         )
+    return True
 
 
 def next_probability(
@@ -58,9 +66,8 @@ def next_probability(
       >>> found.value.tolist(), found.policy.tolist()
       ([0.25, 1.0], [0, 2])
     """
-    if isinstance(model, IntervalMDP):
+    if _has_intervals(model, nature):
         return robust.robust_next_probability(model, target, objective=objective, nature=nature)
-    refuse_nature(nature)
     model, operation = _problem(model, objective)
     mdp, target = model.host, state_mask(model, target, "target")
     # One step of "until" in which the target counts only once it is entered.
@@ -117,12 +124,10 @@ def bounded_reachability(
       >>> bounded_reachability(model, [False, True], 3).value.tolist()
       [0.875, 1.0]
     """
-    if isinstance(model, IntervalMDP):
-        _refuse_steps(by_step)
+    if _has_intervals(model, nature, by_step):
         return robust.robust_bounded_reachability(
             model, target, num_steps, stay=stay, objective=objective, nature=nature
         )
-    refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
     target = state_mask(model, target, "target")
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
@@ -160,12 +165,10 @@ def cumulative_reward(
       >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
       [1.75, 0.0]
     """
-    if isinstance(model, IntervalMDP):
-        _refuse_steps(by_step)
+    if _has_intervals(model, nature, by_step):
         return robust.robust_cumulative_reward(
             model, reward, num_steps, objective=objective, nature=nature
         )
-    refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
     rewards = *finite_reward(model, reward), np.zeros(model.num_states)
     found = host.total(model.host, rewards, num_steps, operation, by_step)
@@ -204,12 +207,10 @@ def instantaneous_reward(
       >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
       [0.125, 0.0]
     """
-    if isinstance(model, IntervalMDP):
-        _refuse_steps(by_step)
+    if _has_intervals(model, nature, by_step):
         return robust.robust_instantaneous_reward(
             model, reward, num_step, objective=objective, nature=nature
         )
-    refuse_nature(nature)
     model, operation = _problem(model, objective, num_step)
     zero = np.zeros(model.num_rows)
     rewards = zero, zero, state_reward(model, reward)
