@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, reduce
 from hashlib import sha256
+from operator import mul
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from jaxltl.core.array_types import Integers
 from jaxltl.io.drn.body import Names
 
 # Far above the needs of models; they prevent short texts from exhausting the memory.
-_MOST_TERMS, MOST_DEPTH, MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
+_MOST_TERMS, MOST_POWER, _MOST_BITS = 10_000, 1_000, 20_000
 
 # The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.
 Polynomial = dict[tuple[int, ...], Fraction]
@@ -51,6 +52,44 @@ class RationalFunction:
         """Exact value at a point; raises ZeroDivisionError at a pole."""
         above, below = (_value(factors, point) for factors in self._factors)
         return above / below
+
+    def __add__(self, other: RationalFunction) -> RationalFunction:
+        if self.denominator == other.denominator:
+            return RationalFunction(_sum(self.numerator, other.numerator), self.denominator)
+        return RationalFunction(
+            _sum(
+                _times(self.numerator, other.denominator), _times(other.numerator, self.denominator)
+            ),
+            _times(self.denominator, other.denominator),
+        )
+
+    def __neg__(self) -> RationalFunction:
+        return RationalFunction({k: -c for k, c in self.numerator.items()}, self.denominator)
+
+    def __sub__(self, other: RationalFunction) -> RationalFunction:
+        return self + -other
+
+    def __mul__(self, other: RationalFunction) -> RationalFunction:
+        return RationalFunction(
+            _times(self.numerator, other.numerator), _times(self.denominator, other.denominator)
+        )
+
+    def __truediv__(self, other: RationalFunction) -> RationalFunction:
+        if not other.numerator:
+            raise Malformed("divided by zero")
+        above, below = other.denominator, other.numerator
+        if len(below) == 1 and not any(next(iter(below))):  # by a number
+            ((powers, number),) = below.items()
+            above, below = {q: c / number for q, c in above.items()}, {powers: Fraction(1)}
+        return self * RationalFunction(above, below)
+
+    def __pow__(self, exponent: int) -> RationalFunction:
+        terms = max(len(self.numerator), len(self.denominator))
+        if (terms - 1) * abs(exponent) > MOST_POWER:
+            raise Malformed("too large")
+        one = {(0,) * len(next(iter(self.denominator))): Fraction(1)}
+        result = reduce(mul, [self] * abs(exponent), RationalFunction(one, one))
+        return result if exponent >= 0 else RationalFunction(one, one) / result
 
     @cached_property
     def _factors(self) -> tuple[list[Term], list[Term]]:
@@ -269,25 +308,18 @@ class Malformed(ValueError):
     """Syntax error in a rational function; the message completes "it is ..."."""
 
 
-def constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
-    """Constant polynomial."""
-    return {(0,) * len(parameters): Fraction(value)} if value else {}
-
-
 def number(parameters: tuple[str, ...], value: Fraction | int) -> RationalFunction:
     """Constant rational function."""
-    return RationalFunction(constant(parameters, value), constant(parameters, 1))
+    powers = (0,) * len(parameters)
+    return RationalFunction({powers: Fraction(value)} if value else {}, {powers: Fraction(1)})
 
 
 def parameter(parameters: tuple[str, ...], name: str) -> RationalFunction:
     """One of the parameters as a rational function."""
+    if name not in parameters:
+        raise Malformed(f"malformed at {name[:20]!r}")
     powers = tuple(int(x == name) for x in parameters)
-    return RationalFunction({powers: Fraction(1)}, constant(parameters, 1))
-
-
-def power(base: RationalFunction, exponent: int, one: RationalFunction) -> RationalFunction:
-    """Exact power of a rational function, with an exponent of at least 0."""
-    return reduce(multiply, [base] * exponent, one)
+    return RationalFunction({powers: Fraction(1)}, number(parameters, 1).denominator)
 
 
 def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:
@@ -301,11 +333,11 @@ def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:
 
 def _checked(polynomial: Polynomial) -> Polynomial:
     result = {powers: c for powers, c in polynomial.items() if c}
-    if len(result) > _MOST_TERMS or any(max(powers, default=0) > MOST_POWER for powers in result):
-        raise Malformed("too large")
-    if any(
-        max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
-        for c in result.values()
+    bits = (x.bit_length() for c in result.values() for x in (c.numerator, c.denominator))
+    if (
+        len(result) > _MOST_TERMS
+        or any(max(powers, default=0) > MOST_POWER for powers in result)
+        or max(bits, default=0) > _MOST_BITS
     ):
         raise Malformed("too large")
     return result
@@ -327,30 +359,3 @@ def _times(a: Polynomial, b: Polynomial) -> Polynomial:
             powers = tuple(i + j for i, j in zip(p, q, strict=True))
             result[powers] = result.get(powers, Fraction(0)) + c * d
     return _checked(result)
-
-
-def add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    """Exact sum of rational functions."""
-    if a.denominator == b.denominator:
-        return RationalFunction(_sum(a.numerator, b.numerator), a.denominator)
-    return RationalFunction(
-        _sum(_times(a.numerator, b.denominator), _times(b.numerator, a.denominator)),
-        _times(a.denominator, b.denominator),
-    )
-
-
-def multiply(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    """Exact product of rational functions."""
-    return RationalFunction(_times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
-
-
-def divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    """Exact quotient of rational functions; raises Malformed for a divisor of zero."""
-    if not b.numerator:
-        raise Malformed("divided by zero")
-    if len(b.numerator) == 1 and not any(next(iter(b.numerator))):  # by a number
-        ((powers, number),) = b.numerator.items()
-        b = RationalFunction(
-            {powers: Fraction(1)}, {q: c / number for q, c in b.denominator.items()}
-        )
-    return multiply(a, RationalFunction(b.denominator, b.numerator))

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
+from lark import Lark, Token
+from lark.exceptions import UnexpectedInput
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.language.expressions import Expression
@@ -18,25 +21,15 @@ from jaxltl.core.programs.build import MAX_STATES, build_rows
 from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
 from jaxltl.io.files import read_bytes
 from jaxltl.io.parametric_model import (
-    MOST_DEPTH,
     MOST_POWER,
     Malformed,
     ParametricModel,
     RationalFunction,
-    add,
-    divide,
-    multiply,
     number,
     parameter,
-    power,
 )
 from jaxltl.io.prism.program import Constants, is_program, read_program
 from jaxltl.io.tokens import Block, Text, as_fraction, numbered, refuse
-
-_TOKEN = re.compile(
-    r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
-    r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))"
-)
 
 
 def read_parametric(
@@ -83,11 +76,11 @@ def read_parametric(
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
     index_of_text = {b"0": 0}
-    functions = [number(header.parameters, 0)]
+    functions, parser = [number(header.parameters, 0)], _parser(header.parameters)
     placeholders: dict[str, RationalFunction] = {}
     for place, text in header.placeholders.items():
         try:
-            placeholders[place.decode()] = _parsed(text, header.parameters, placeholders)
+            placeholders[place.decode()] = _parsed(text, parser, placeholders)
         except Malformed as error:
             refuse(
                 name,
@@ -100,7 +93,7 @@ def read_parametric(
         indices = numbered(texts, index_of_text)
         for text in list(index_of_text)[len(functions) :]:
             try:
-                functions.append(_parsed(text, header.parameters, placeholders))
+                functions.append(_parsed(text, parser, placeholders))
             except Malformed as error:
                 expected = f"a function of {', '.join(header.parameters) or 'no parameter'}"
                 raise block.error(
@@ -139,95 +132,64 @@ def _starts(owner: Integers, size: int) -> Integers:
 
 # --- functions ------------------------------------------------------------------------------
 
+_GRAMMAR = r"""
+    ?start: product | start "+" product -> add | start "-" product -> sub
+    ?product: sign | product "*" sign -> mul | product "/" sign -> truediv
+    ?sign: power | "+" sign | "-" sign -> neg
+    ?power: atom | atom ("^" | "**") POWER -> pow
+    ?atom: NUMBER -> number | NAME -> name | "(" start ")"
+    POWER: /[^-+*\/()^\s]+/
+    NUMBER: /(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?/
+    NAME: /[A-Za-z_][\w.\[\]]*/
+    %ignore /\s+/
+"""
+
+
+def _parser(parameters: tuple[str, ...]) -> Lark:
+    """The parser of rational functions of some parameters."""
+
+    def exact(children: list[str]) -> RationalFunction:
+        value = as_fraction(children[0].encode())
+        if value is None:
+            raise Malformed(f"malformed at {children[0][:20]!r}")
+        return number(parameters, value)
+
+    def power(children: tuple[RationalFunction, str]) -> RationalFunction:
+        base, exponent = children
+        if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > MOST_POWER:
+            raise Malformed(f"no whole power up to {MOST_POWER}")
+        return base ** int(exponent)
+
+    actions = SimpleNamespace(
+        add=lambda c: c[0] + c[1],
+        sub=lambda c: c[0] - c[1],
+        mul=lambda c: c[0] * c[1],
+        truediv=lambda c: c[0] / c[1],
+        neg=lambda c: -c[0],
+        pow=power,
+        number=exact,
+        name=lambda c: parameter(parameters, str(c[0])),
+    )
+    return Lark(_GRAMMAR, parser="lalr", transformer=actions)
+
 
 def _parsed(
-    text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
+    text: bytes, parser: Lark, placeholders: Mapping[str, RationalFunction]
 ) -> RationalFunction:
     try:
         string = text.decode()
+        if not string.startswith("$"):
+            return parser.parse(string)  # type: ignore[return-value]
     except UnicodeDecodeError:
         raise Malformed("not UTF-8") from None
-    if string.startswith("$"):
-        if string not in placeholders:
-            raise Malformed("no placeholder that is defined before")
-        return placeholders[string]
-    tokens, place = [], 0
-    while place < len(string):
-        match = _TOKEN.match(string, place)
-        if match is None:
-            raise Malformed(f"malformed at {string[place : place + 20]!r}")
-        tokens.append(match[0].strip())
-        place = match.end()
-    reader = _Reader(tokens, parameters)
-    result = reader.sum(0)
-    if reader.place < len(tokens):
-        raise Malformed(f"malformed at {tokens[reader.place][:20]!r}")
-    return result
-
-
-@dataclass
-class _Reader:
-    """Recursive-descent parser of rational functions."""
-
-    tokens: list[str]
-    parameters: tuple[str, ...]
-    place: int = 0
-
-    def next(self) -> str:
-        return self.tokens[self.place] if self.place < len(self.tokens) else ""
-
-    def take(self) -> str:
-        self.place += 1
-        return self.tokens[self.place - 1] if self.place <= len(self.tokens) else ""
-
-    def sum(self, depth: int) -> RationalFunction:
-        if depth > MOST_DEPTH:
-            raise Malformed("nested too deeply")
-        result = self.product(depth)
-        while self.next() in ("+", "-"):
-            sign = self.take()
-            other = self.product(depth)
-            result = add(
-                result, other if sign == "+" else multiply(number(self.parameters, -1), other)
-            )
-        return result
-
-    def product(self, depth: int) -> RationalFunction:
-        result = self.power(depth)
-        while self.next() in ("*", "/"):
-            combine: Callable[..., RationalFunction] = multiply if self.take() == "*" else divide
-            result = combine(result, self.power(depth))
-        return result
-
-    def power(self, depth: int) -> RationalFunction:
-        sign = 1
-        while self.next() in ("+", "-"):
-            sign = -sign if self.take() == "-" else sign
-        result = self.atom(depth)
-        if self.next() in ("^", "**"):
-            self.take()
-            exponent = self.take()
-            if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > MOST_POWER:
-                raise Malformed("no whole power up to 1000")
-            terms = max(len(result.numerator), len(result.denominator))
-            if (terms - 1) * int(exponent) > MOST_POWER:
-                raise Malformed("too large")
-            result = power(result, int(exponent), number(self.parameters, 1))
-        return result if sign == 1 else multiply(number(self.parameters, -1), result)
-
-    def atom(self, depth: int) -> RationalFunction:
-        token = self.take()
-        if token == "(":
-            result = self.sum(depth + 1)
-            if self.take() != ")":
-                raise Malformed("without a closing bracket")
-            return result
-        if token in self.parameters:
-            return parameter(self.parameters, token)
-        value = as_fraction(token.encode())
-        if value is None:
-            raise Malformed(f"malformed at {token[:20]!r}" if token else "cut")
-        return number(self.parameters, value)
+    except UnexpectedInput as error:
+        if getattr(error, "token", Token("", "")).type == "$END":
+            raise Malformed("cut") from None
+        at = string[error.pos_in_stream or 0 :][:20]
+        raise Malformed(f"malformed at {at!r}") from None
+    if string not in placeholders:
+        raise Malformed("no placeholder that is defined before")
+    return placeholders[string]
 
 
 # --- programs -------------------------------------------------------------------------------
@@ -270,6 +232,12 @@ def _of_program(
     )
 
 
+_OPERATORS: dict[str, Callable[..., RationalFunction]] = {
+    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv,
+    "neg": operator.neg,
+}  # fmt: skip
+
+
 class _Functions:
     """Rational functions of expressions over some parameters."""
 
@@ -288,19 +256,12 @@ class _Functions:
         if e.operator == "name":
             return parameter(self.parameters, str(e.value))
         if e.operator == "pow":
-            return self._power(*e.operands)
-        if e.operator not in ("+", "-", "*", "/", "neg"):
+            base, exponent = e.operands
+            value = exponent.value
+            if not (exponent.is_literal and isinstance(value, int) and abs(value) <= MOST_POWER):
+                raise Malformed(f"no power with an integer up to {MOST_POWER}")
+            return self.function(base) ** value
+        if e.operator not in _OPERATORS:
             raise Malformed(f"no rational function, because of {e.operator}")
         parts = [self.function(x) for x in e.operands]
-        if e.operator in ("-", "neg"):  # of the last operand
-            parts[-1] = multiply(number(self.parameters, -1), parts[-1])
-        if e.operator == "/":
-            return divide(*parts)
-        return reduce(multiply if e.operator == "*" else add, parts)
-
-    def _power(self, base: Expression, exponent: Expression) -> RationalFunction:
-        value, one = exponent.value, number(self.parameters, 1)
-        if not (exponent.is_literal and isinstance(value, int) and abs(value) <= MOST_POWER):
-            raise Malformed(f"no power with an integer up to {MOST_POWER}")
-        found = power(self.function(base), abs(value), one)
-        return found if value >= 0 else divide(one, found)
+        return -parts[0] if e.operator == "neg" else reduce(_OPERATORS[e.operator], parts)
