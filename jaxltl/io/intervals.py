@@ -9,12 +9,12 @@ import numpy as np
 
 from jaxltl.core.models.interval import NEAR
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.io.tokens import Block, Text, as_double, bytes_of, edges
+from jaxltl.io.tokens import Block, Text, as_double, edges
 
 EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
-_SIGN = bytes_of(b"[,]\n")
 _TO_BLANKS = bytes.maketrans(b"[,]", b"   ")
-_SHAPE = re.compile(rb"(?:\[,\]\n|\n)*+")
+_NUMBER = rb"[\x00-\x09\x0b-\x20]*[^][,\x00-\x20]+[\x00-\x09\x0b-\x20]*"  # tokens end at any blank
+_LINES = re.compile(rb"(?:(?:\[%b,%b\]|[^][,\x00-\x20]+)\n)*+" % (_NUMBER, _NUMBER))
 # Line of a state or an action with bracketed rewards.
 _REWARDS = re.compile(
     rb"^([ \t]*(?:state|action)[ \t]+\S+[ \t]*\[)"
@@ -58,59 +58,36 @@ def joined_brackets(block: Block, column: int, lines: Booleans | None = None) ->
 
 def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     """Lower and upper bounds of tokens ``p`` or ``[l, u]``: ``float64[...]`` twice."""
-    numbers = _numbers(block, token)
-    if numbers is None:
-        low, high = 0, token.size  # bisection for the first malformed token
-        while high - low > 1:
-            middle = (low + high) // 2
-            fits = _numbers(block, token[low:middle]) is not None
-            low, high = (middle, high) if fits else (low, middle)
-        raise block.error(int(token[low]), EXPECTED)
-    lower = numbers.floats(numbers.first[:-1], EXPECTED)
-    upper = lower
-    if (numbers.count > 1).any():
-        upper = numbers.floats(numbers.first[1:] - 1, EXPECTED)
+    joined = block.joined(token)
+    ends = (block.end[token] - block.start[token] + 1).cumsum()
+    joined[ends - 1] = ord("\n")
+    text = joined.tobytes()
+    if _LINES.fullmatch(text) is None:
+        tokens = text.split(b"\n")
+        bad = next(i for i, x in enumerate(tokens) if not _LINES.fullmatch(x + b"\n"))
+        raise block.error(int(token[bad]), EXPECTED)
+    data = np.frombuffer(text.translate(_TO_BLANKS), np.uint8)
+    is_pair = joined[np.append(0, ends[:-1])] == ord("[")
+    first = np.concatenate([[0], (1 + is_pair).cumsum()])
+    line = block.line[np.searchsorted(block.first, token, "right") - 1]
+    numbers = Block(block.text, data, *edges(data), first, line)
+    lower = numbers.floats(first[:-1], EXPECTED)
+    upper = numbers.floats(first[1:] - 1, EXPECTED) if is_pair.any() else lower
     block.require((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR), token, EXPECTED)
     return lower, upper
-
-
-def _numbers(block: Block, token: Integers) -> Block | None:
-    """One line per token with its one or two numbers; None if a token is malformed."""
-    length = block.end[token] - block.start[token] + 1
-    joined = block.joined(token)
-    joined[length.cumsum() - 1] = ord("\n")
-    begin = length.cumsum() - length
-    opened = joined[begin] == ord("[")
-    if (
-        _SHAPE.fullmatch(joined[_SIGN[joined]].tobytes()) is None
-        or opened.sum() != (joined == ord("[")).sum()
-        or ((joined[begin + length - 2] == ord("]")) != opened).any()
-    ):
-        return None
-    comma = joined == ord(",")
-    data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
-    start, end = edges(data)
-    count = np.diff(np.searchsorted(start, np.append(begin, data.size)))
-    # Each comma must have one number on either side.
-    of = np.searchsorted(start, np.flatnonzero(comma))
-    first = np.concatenate([[0], count.cumsum()])
-    if (count != 1 + opened).any() or (of != first[1:][opened] - 1).any():
-        return None
-    line = block.line[np.searchsorted(block.first, token, "right") - 1]
-    return Block(block.text, data, start, end, first, line)
 
 
 def point_rewards(text: Text) -> Text:
     """Replaces point intervals in rewards, ``[[1, 1], 0]``, by numbers, ``[1, 0]``."""
 
     def changed(match: re.Match[bytes]) -> bytes:
-        return match[1] + _POINT.sub(lambda point: _number(text, match, point), match[2]) + match[3]
+        return match[1] + _POINT.sub(lambda point: _point(text, match, point), match[2]) + match[3]
 
     data = _REWARDS.sub(changed, text.data[text.begin : text.stop])
     return Text(text.name, data, 0, len(data), text.line)
 
 
-def _number(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes:
+def _point(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes:
     lower, upper = point[1].strip(), point[2].strip()
     if lower == upper or (as_double(lower) == as_double(upper) and as_double(lower) is not None):
         return lower
