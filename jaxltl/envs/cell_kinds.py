@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
+
 COLORS = ("red", "yellow", "white", "purple", "black")
 OBJECTS: Mapping[str, Mapping[str, int]] = {
     "o1": {"red": 5, "black": 4},
@@ -30,8 +32,7 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
         for inside in COLORS
         if inside not in (around, "black")
     ]
-    if not 0 <= num <= len(pairs):
-        raise ValueError(f"num={num}; there are colours for 0 to {len(pairs)} objects.")
+    num = validation.integer("num", num, most=len(pairs))
     return {f"o{i + 1}": {a: 5, b: 4} for i, (a, b) in enumerate(pairs[:num])}
 
 
@@ -42,10 +43,8 @@ def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
         if name in kinds:
             raise ValueError(f"{name!r} is both an object and an obstacle; rename one of them.")
         for color, count in counts.items():
-            if color not in COLORS:
-                raise ValueError(f"{name}: {color!r} is no colour; use {', '.join(COLORS)}.")
-            if count < 0:
-                raise ValueError(f"{name}: {count} cells of {color}; give 0 or more.")
+            validation.choice(f"{name}: color", color, COLORS)
+            validation.integer(f"{name}: {color}", count)
         row = tuple(int(counts.get(color, 0)) for color in COLORS)
         if sum(row) != 9:
             raise ValueError(f"{name}: {dict(counts)} are {sum(row)} cells; a patch has 9.")
@@ -94,16 +93,10 @@ def codes_of(kinds: Kinds) -> NDArray[np.int64]:
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
 
 
-def check_margin(margin: int) -> None:
-    """Raises ValueError unless a margin is at least 1."""
-    if margin < 1:
-        raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
-
-
 def check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
     """Validated colours ``int32[rows, columns]`` with at least one cell inside the margin."""
     array = np.asarray(colors)
-    check_margin(margin)
+    validation.integer("margin", margin, least=1)
     if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":
         raise ValueError(
             f"colors have shape {array.shape} and type {array.dtype}; pass integers [rows, "

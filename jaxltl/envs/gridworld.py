@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.protocols import Array
@@ -51,8 +52,7 @@ def gridworld(
     """
     cells = parse_map(text)
     rows, columns = cells.shape
-    if not 0 <= slip <= 1:
-        raise ValueError(f"slip={slip}; it must be a probability in [0, 1].")
+    slip = validation.fraction("slip", slip)
     label, propositions = _labels(cells, legend, wall)
     is_wall = (cells == wall).ravel()
     stays = is_wall | _holds_one_of(absorbing, label, propositions, "absorbing")

@@ -127,15 +127,13 @@ def lqr(
     bounds = np.broadcast_to(np.asarray(low, float), m), np.broadcast_to(np.asarray(high, float), m)
     if not (bounds[0] <= bounds[1]).all():
         raise ValueError(f"low={low!r}, high={high!r}; low must be at most high.")
-    if horizon < 1:
-        raise ValueError(f"horizon={horizon}; it must be at least 1.")
+    horizon = validation.integer("horizon", horizon, least=1)
     if scale is None:
         _, offset = _least_squares(a, b, q, r, x, horizon)
         scale = float(offset @ offset) or 1.0
-    if not scale > 0:
-        raise ValueError(f"scale={scale}; it must be positive.")
+    validation.require_in_range("scale", scale, validation.Range(0, open_below=True))
     # NumPy's, so that the optimum is that of these numbers and not of their nearest in float32.
-    return LQR(a, b, q, r, *bounds, x, np.asarray(scale), horizon=int(horizon))
+    return LQR(a, b, q, r, *bounds, x, np.asarray(scale), horizon=horizon)
 
 
 def _check_definite(q: np.ndarray, r: np.ndarray) -> None:

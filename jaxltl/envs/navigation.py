@@ -322,6 +322,12 @@ def reward(world: Navigation, state: State) -> jax.Array:
     return jnp.where(labels(world, state)[..., 0], 1, strip)
 
 
+def check_task(task: object) -> None:
+    """Raises ValueError unless a task is one of the four."""
+    if np.ndim(task) or task not in TASKS:  # type: ignore[arg-type]
+        raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
+
+
 def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.Array]:
     """The objective J and cost Z of trajectories in one of the four tasks, ``float[...]`` each.
 
@@ -337,8 +343,7 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
     >>> [v.tolist() for v in both]  # a distance of 1, and twice in the goal
     [[30.0], [-2.0]]
     """
-    if task not in TASKS:
-        raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
+    check_task(task)
     goal, obstacle = jnp.moveaxis(labels(world, state), -1, 0)
     visited = goal.any(-1)
     if task in (1, 4):
@@ -434,17 +439,15 @@ def evaluator(
     """
     network = policy_network(world) if network is None else network
     _check_fits(world, network)
-    if num_trajectories < 1:
-        raise ValueError(f"num_trajectories={num_trajectories}; give at least 1.")
+    num_trajectories = validation.integer("num_trajectories", num_trajectories, least=1)
     if callable(task):
         score = as_partial(task)
     else:
-        if np.ndim(task) or task not in TASKS:
-            raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
+        check_task(task)
         absorbing = task == 1 if absorbing is None else absorbing
         score = jax.tree_util.Partial(_table_4, struct.Static(int(task)))
     absorbing = absorbing is not None and validation.boolean("absorbing", absorbing)
-    settings = struct.Static((int(num_trajectories), absorbing))
+    settings = struct.Static((num_trajectories, absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
 
 

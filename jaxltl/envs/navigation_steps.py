@@ -74,8 +74,7 @@ def as_environment(
     >>> float(made.reward), float(made.cost)
     (30.0, -1.0)
     """
-    if np.ndim(task) or task not in nav.TASKS:
-        raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
+    nav.check_task(task)
     stays = task == 1 if absorbing is None else validation.boolean("absorbing", absorbing)
     settings = _Settings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float))

@@ -79,10 +79,13 @@ def make_network(
             f"sizes={sizes!r}; give the inputs, the hidden layers and the outputs, at least 1 "
             "each, such as '2-10-1'."
         )
-    for place, name in (("hidden", hidden), ("output", output)):
-        if name not in ACTIVATIONS:
-            raise ValueError(f"{place}={name!r}; choose among {', '.join(ACTIVATIONS)}.")
-    return Network(numbers, hidden, output, validation.boolean("biases", biases))
+    names = list(ACTIVATIONS)
+    return Network(
+        numbers,
+        validation.choice("hidden", hidden, names),
+        validation.choice("output", output, names),
+        validation.boolean("biases", biases),
+    )
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:

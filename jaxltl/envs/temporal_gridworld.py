@@ -37,7 +37,6 @@ from jaxltl.envs.cell_kinds import (
     Kinds,
     Placement,
     categories,
-    check_margin,
     codes_of,
     filled,
     make_kinds,
@@ -149,7 +148,7 @@ def _grid(function: str, appearance: Appearance) -> _Grid:
     shape, margin = appearance.get("shape", (10, 10)), appearance.get("margin", 1)
     objects = appearance.get("objects", OBJECTS)
     kinds = make_kinds(objects, appearance.get("obstacles", OBSTACLES))
-    check_margin(margin)
+    validation.integer("margin", margin, least=1)
     if len(shape) != 2 or min(shape) < 1:
         raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
     return _Grid(shape, kinds, len(objects), margin, _blank(shape, appearance.get("slip", 0.0)))
@@ -238,8 +237,7 @@ def random_worlds(
     [(6, 8), (6, 8)]
     """
     shape, kinds, num_objects, margin, blank = _grid("random_worlds", appearance)
-    if num_obstacles < 0:
-        raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
+    num_obstacles = validation.integer("num_obstacles", num_obstacles)
     automaton, step = _on_kinds(task, kinds)
     family = _Family(blank, kinds, automaton, step)
     num_kinds = len(kinds) - num_objects

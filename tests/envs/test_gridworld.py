@@ -94,7 +94,7 @@ def test_maps_of_words_and_of_characters():
         (" \n ", {}, "the map is empty"),
         ("ab\nabc", {}, "map row 2 has 3 cells, row 1 has 2: 'abc'"),
         ("a b\na", {}, "map row 2 has 1 cells, row 1 has 2"),
-        ("ab", {"slip": 1.5}, "slip=1.5; it must be a probability"),
+        ("ab", {"slip": 1.5}, "slip=1.5; it must be at least 0 and at most 1"),
         ("ab", {"slip": -0.1}, "slip=-0.1"),
         ("ab", {"slip": float("nan")}, "slip=nan"),
         ("ab\naz", {"legend": {"a": [], "b": []}}, r"cell 'z' \(row 2, column 2\) is not in"),

@@ -252,7 +252,7 @@ def test_a_small_network_with_biases_comes_within_a_millionth():
         ({"control_cost": [[0]]}, "control_cost must be symmetric and positive definite"),
         ({"low": 1, "high": 0}, "low=1, high=0; low must be at most high"),
         ({"horizon": 0}, "horizon=0; it must be at least 1"),
-        ({"scale": 0.0}, "scale=0.0; it must be positive"),
+        ({"scale": 0.0}, "scale=0.0; it must be above 0"),
     ],
 )
 def test_bad_worlds_are_refused(arguments, message):

@@ -326,7 +326,7 @@ def test_bad_evaluations_are_refused():
         nav.scores(WORLD, random_states(WORLD, 3), "reach")
     with pytest.raises(ValueError, match="has 62 observations"):
         evaluator(WORLD, 1, make_network("60-2"))
-    with pytest.raises(ValueError, match="num_trajectories=0; give at least 1"):
+    with pytest.raises(ValueError, match="num_trajectories=0; it must be at least 1"):
         evaluator(WORLD, num_trajectories=0)
     with pytest.raises(ValueError, match="62-30-30-2 with biases has 2882 parameters"):
         evaluator(WORLD)(jnp.zeros(2880), jax.random.key(0))

@@ -100,7 +100,7 @@ def test_bad_sizes_are_refused(sizes):
 
 def test_unknown_activations_are_refused():
     for place in ("hidden", "output"):
-        with pytest.raises(ValueError, match=f"{place}='swish'; choose among relu"):
+        with pytest.raises(ValueError, match=f"{place}='swish'; choose one of relu"):
             make_network("2-1", **{place: "swish"})
     assert set(ACTIVATIONS) == set(PLAIN)
 

@@ -354,7 +354,7 @@ def test_another_wall():
         ("..\n...", {}, "map row 2 has 3 cells"),
         ("##", {}, "all cells of the map are walls"),
         ("a?", {"legend": {"a": []}}, r"cell '\?' \(row 1, column 2\) is not in the legend"),
-        ("..", {"slip": 1.5}, "slip=1.5; it must be a probability"),
+        ("..", {"slip": 1.5}, "slip=1.5; it must be at least 0 and at most 1"),
         (
             ".#\n..",
             {"system_start": (0, 1)},

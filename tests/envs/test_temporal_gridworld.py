@@ -188,7 +188,7 @@ def test_many_objects_differ():
     kinds = many_objects(16)
     assert len({tuple(sorted(x.items())) for x in kinds.values()}) == 16
     assert {name: kinds[name] for name in ("o1", "o2", "o3")} == tg.OBJECTS
-    with pytest.raises(ValueError, match="num=17; there are colours for 0 to 16 objects"):
+    with pytest.raises(ValueError, match="num=17; it must be at most 16"):
         many_objects(17)
 
 
@@ -238,7 +238,7 @@ def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
             r"seed 5: in 3 placements on 10 x 10",
         ),
         (lambda: tg.random_world(5, shape=(3, 3), max_tries=3), "the objects had no room"),
-        (lambda: tg.random_world(5, num_obstacles=-1), "num_obstacles=-1; give 0 or more"),
+        (lambda: tg.random_world(5, num_obstacles=-1), "num_obstacles=-1; it must be at least 0"),
         (lambda: tg.random_world(5, shape=(0, 3)), r"shape=\(0, 3\)"),
         (lambda: tg.make_world({"o9": [(1, 1)]}, 0), "'o9' is no kind of cell; there are o1, o2"),
         (lambda: tg.make_world({"o1": [(0, 3)]}, 0), r"o1 in cell \(0, 3\) is outside"),
@@ -255,10 +255,10 @@ def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
         (lambda: tg.make_world({}, 0, margin=0), "margin=0"),
         (lambda: tg.make_world({}, 0, slip=1.5), "slip=1.5"),
         (lambda: tg.make_world({}, 0, objects={"a": {"red": 4}}), "are 4 cells; a patch has 9"),
-        (lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}), "'blue' is no colour; use red"),
+        (lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}), "a: color='blue'; choose one of red"),
         (
             lambda: tg.make_world({}, 0, objects={"a": {"red": 10, "black": -1}}),
-            "-1 cells of black",
+            "black=-1; it must be at least 0",
         ),
         (
             lambda: tg.make_world({}, 0, objects={"a": {"black": 9}}),
