@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyArrowPatch
+from matplotlib.patches import Circle, FancyArrowPatch, Patch, Rectangle
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
@@ -58,20 +58,26 @@ def automaton(
     graph = drawing.arrange(
         table.delta, int(table.initial), doomed, texts, _places(table, texts, layout)
     )
-    figure, axes = canvas(graph, _notes(table, texts, graph.size[0]) if names else [])
-    for edge in graph.edges:
-        draw_edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
-    for label in graph.labels:
-        draw_label(axes, label, MUTED if doomed[label.key[1]] else INK)
+    figure, axes = draw_graph(
+        graph,
+        _notes(table, texts, graph.size[0]) if names else [],
+        lambda key: _edge_color(table, key, doomed),
+        lambda key: MUTED if doomed[key[1]] else INK,
+    )
     draw_start(axes, graph.position[int(table.initial)])
     final = table.final if table.has_final_states else doomed & False
     for q, center in enumerate(graph.position):
-        draw_state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
+        draw_state(axes, center, str(q), final=bool(final[q]), doomed=bool(doomed[q]))
     return figure
 
 
-def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
-    """A figure for a graph with lines of notes below."""
+def draw_graph(
+    graph: drawing.Graph,
+    lines: Sequence[str],
+    edge_color: Callable[[drawing.Key], str],
+    label_color: Callable[[drawing.Key], str],
+) -> tuple[Figure, Axes]:
+    """Draws the edges and labels of a graph, with lines of notes below."""
     width, height = graph.size
     # As wide as the notes, at 8 points a character of a monospaced font.
     full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
@@ -91,6 +97,10 @@ def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
             family="monospace",
             parse_math=False,
         )
+    for edge in graph.edges:
+        draw_edge(axes, edge.curve, edge_color(edge.key))
+    for label in graph.labels:
+        draw_label(axes, label, label_color(label.key))
     return figure, axes
 
 
@@ -244,11 +254,21 @@ def draw_start(axes: Axes, center: NDArray[np.float64]) -> None:
 
 
 def draw_state(
-    axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool
+    axes: Axes,
+    center: NDArray[np.float64],
+    text: str,
+    *,
+    final: bool = False,
+    doomed: bool = False,
+    square: bool = False,
 ) -> None:
-    """Draws a state: a circle with a text, double if final, grey if rejecting."""
+    """Draws a state: a circle, double if final, grey if rejecting; or a square."""
     line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
-    axes.add_patch(Circle(tuple(center), drawing.RADIUS, fc=fill, ec=line, lw=1.3, zorder=5))
+    half = drawing.RADIUS * 0.9
+    shape: Patch = Circle(tuple(center), drawing.RADIUS, fc=fill)
+    if square:
+        shape = Rectangle(tuple(center - half), 2 * half, 2 * half, fc=FAINT)
+    axes.add_patch(shape).set(ec=line, lw=1.3, zorder=5)
     if final:
         inner = drawing.RADIUS - 0.05
         axes.add_patch(Circle(tuple(center), inner, fc="none", ec=line, lw=1, zorder=5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -21,9 +22,6 @@ from jaxltl.plot.style import (
     MUTED,
     SERIES,
     blank,
-    bottom_labels,
-    legend_below,
-    panel_rows,
     plain_axes,
     settle,
 )
@@ -87,12 +85,7 @@ def _curve(
 ) -> None:
     x = np.arange(1, rows.shape[1] + 1) if steps is None else np.asarray(steps)
     rows = np.where(np.isfinite(rows), rows, np.nan)
-    middle = np.nanmedian(rows, axis=0) if len(rows) > 1 else rows[0]
-    if len(rows) > 1:
-        axes.fill_between(
-            x, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=color, alpha=0.18, lw=0
-        )
-    axes.plot(x, middle, color=color, lw=1.6)
+    _median_and_range(axes, x, rows, color, 0.18)
     positive = rows[rows > 0]
     if positive.size and np.nanmin(rows) > 0 and positive.max() > 100 * positive.min():
         axes.set_yscale("log")
@@ -123,7 +116,8 @@ def bands(
       >>> len(bands({"small": {"reward": {"PPO": band, "CPO": band}, "cost": {"CPO": band}}}).axes)
       2
     """
-    figure, panels = panel_rows(rows, "bands", (3.6, 1.9))
+    columns = {column for row in rows.values() for column in row}
+    figure, panels = _rows_of_panels(rows, "bands", (3.6, 1.9), [label] * len(columns))
     names = list(dict.fromkeys(n for row in rows.values() for cell in row.values() for n in cell))
     for (row, column), axes in panels.items():
         for name, (x, mean, spread) in rows[row][column].items():
@@ -133,8 +127,7 @@ def bands(
             axes.plot(place, middle, color=color, lw=1.4, label=name)
         if limits and column in limits.get(row, {}):
             axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
-    bottom_labels(panels, [label] * len(panels))
-    legend_below(
+    _legend_below(
         figure, [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))], names
     )
     return figure
@@ -207,7 +200,7 @@ def lines(
       >>> len(lines({"one": {"value": (runs, np.ones(10)), "cost": (runs, None)}}).axes)
       2
     """
-    figure, panels = panel_rows(rows, "lines", (2.1, 1.5))
+    figure, panels = _rows_of_panels(rows, "lines", (2.1, 1.5), labels)
     for (row, column), axes in panels.items():
         runs, reference = rows[row][column]
         several = np.asarray(runs, float)
@@ -219,8 +212,7 @@ def lines(
         )
         if reference is not None:
             axes.plot(np.asarray(reference, float), color=SERIES[1], lw=1.3, ls="--")
-    bottom_labels(panels, labels)
-    legend_below(
+    _legend_below(
         figure, [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")], names
     )
     return figure
@@ -257,9 +249,7 @@ def guarantees(
     count = np.asarray(samples, float)
     for i, (name, bound) in enumerate(bounds.items()):
         runs, color = np.atleast_2d(np.asarray(bound, float)), SERIES[i % len(SERIES)]
-        axes.plot(count, np.median(runs, 0), color=color, lw=1.6, marker="o", ms=3, label=name)
-        if len(runs) > 1:
-            axes.fill_between(count, runs.min(0), runs.max(0), color=color, alpha=0.15, lw=0)
+        _median_and_range(axes, count, runs, color, 0.15, marker="o", ms=3, label=name)
     if reference is not None:
         axes.axhline(reference, color=MUTED, lw=1, ls="--", label="no policy has more")
     axes.set_xscale("log")
@@ -322,6 +312,65 @@ def paths(
     ends = [
         Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (("o", INK), ("s", SERIES[1]))
     ]
-    legend_below(figure, [*handles, *ends], [*boxes, "first", "last"])
+    _legend_below(figure, [*handles, *ends], [*boxes, "first", "last"])
     settle(figure)
     return figure
+
+
+# --- shared parts ---------------------------------------------------------------------------
+
+
+def _rows_of_panels(
+    rows: Mapping[str, Mapping[str, object]],
+    name: str,
+    size: tuple[float, float],
+    labels: Sequence[str],
+) -> tuple[Figure, dict[tuple[str, str], Axes]]:
+    """Empty panels by the titles of row and column, with a label below each column."""
+    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+    if not columns:
+        raise ValueError(f"{name}: nothing to show; give at least one row with a panel.")
+    figure = blank(size[0] * len(columns), size[1] * len(rows) + 0.5)
+    grid = figure.subplots(len(rows), len(columns), squeeze=False)
+    panels = {}
+    for (i, j), axes in np.ndenumerate(grid):
+        row, column = list(rows)[i], columns[j]
+        plain_axes(axes)
+        if i == 0:
+            axes.set_title(column, fontsize=9.5, color=INK, loc="left")
+        if j == 0:
+            axes.set_ylabel(row, fontsize=9.5, color=INK)
+        if i == len(rows) - 1 and j < len(labels):
+            axes.set_xlabel(labels[j], fontsize=8.5, color=MUTED)
+        axes.set_visible(column in rows[row])
+        if column in rows[row]:
+            panels[row, column] = axes
+    return figure, panels
+
+
+def _median_and_range(
+    axes: Axes,
+    x: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    color: str,
+    alpha: float,
+    **style: Any,
+) -> None:
+    if len(rows) > 1:
+        low, high = np.nanmin(rows, axis=0), np.nanmax(rows, axis=0)
+        axes.fill_between(x, low, high, color=color, alpha=alpha, lw=0)
+    middle = np.nanmedian(rows, axis=0) if len(rows) > 1 else rows[0]
+    axes.plot(x, middle, color=color, lw=1.6, **style)
+
+
+def _legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[str]) -> None:
+    """Draws a legend in one row below the axes."""
+    figure.legend(
+        handles,
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )

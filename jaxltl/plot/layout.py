@@ -66,9 +66,6 @@ class Box(NamedTuple):
     def holds(self, points: Points) -> int:
         return int(np.sum(np.all(np.abs(points - self.center) < self.half, axis=1)))
 
-    def overlaps(self, other: Box) -> bool:
-        return bool(self.overlapped(np.array([other]))[0])
-
     def overlapped(self, others: Points) -> NDArray[np.bool_]:
         """``bool[B]`` for boxes ``float[B, 2, 2]``."""
         return np.all((np.abs(others[:, 0] - self.center) - others[:, 1]) < self.half, axis=1)

@@ -10,17 +10,15 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from jaxltl.plot import layout as drawing
-from jaxltl.plot.automata import canvas, draw_edge, draw_label, draw_start, draw_state
+from jaxltl.plot.automata import draw_graph, draw_start, draw_state
 from jaxltl.plot.board import STEPS, Board
 from jaxltl.plot.maps import grid
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, blank, plain_axes, write
+from jaxltl.plot.style import ACCENT, INK, MUTED, blank, plain_axes
 
 if TYPE_CHECKING:
     from jaxltl.core.models.protocols import PyTree
@@ -62,7 +60,7 @@ def model(model: PyTree) -> Figure:
         raise ValueError("model: a game on a product is not drawn; give the game of its world.")
     if (cells := map_of(inner)) is not None:
         return grid(cells, wall=_WALL)
-    return _graph(inner, None if system is None else np.asarray(system), None, None)
+    return _graph(inner, None if system is None else np.asarray(system))
 
 
 def solution(
@@ -104,30 +102,28 @@ def solution(
         if is_product:
             raise ValueError("solution: the product's world has no map; read the values.")
         return _graph(world, None, values, given if given.dtype.kind in "iu" else None)
-    is_known = given.dtype.kind in "iu" or given.shape[values.ndim :] == (len(STEPS),)
-    policy = given if is_known else None
     inside = (cells != _WALL).ravel()
-    if not is_product:
-        return grid(
-            cells,
-            np.where(inside, values, np.nan),
-            _arrows(policy, inside),
-            limits=_limits(values),
-            wall=_WALL,
-        )
-    several = [q for q in range(values.shape[1]) if np.ptp(values[inside, q]) > 0] or [0]
-    chosen = several[:_MOST_PANELS] if memories is None else [int(q) for q in memories]
-    if not chosen or not all(0 <= q < values.shape[1] for q in chosen):
-        raise ValueError(f"memories={memories}; give some of 0 to {values.shape[1] - 1}.")
-    names = model.automaton.state_names or ("",) * values.shape[1]
-    titles = [
-        textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
-        for q in chosen
-    ]
-    arrows = None if policy is None else np.stack([_arrows(policy[:, q], inside) for q in chosen])  # type: ignore[misc]
+    # One panel for each memory state.
+    panels = values.reshape(len(values), -1)
+    chosen, titles = [0], [""]
+    if is_product:
+        several = [q for q in range(panels.shape[1]) if np.ptp(panels[inside, q]) > 0] or [0]
+        chosen = several[:_MOST_PANELS] if memories is None else [int(q) for q in memories]
+        if not chosen or not all(0 <= q < panels.shape[1] for q in chosen):
+            raise ValueError(f"memories={memories}; give some of 0 to {panels.shape[1] - 1}.")
+        names = model.automaton.state_names or ("",) * panels.shape[1]
+        titles = [
+            textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
+            for q in chosen
+        ]
+    chances = np.eye(len(STEPS))[given] if given.dtype.kind in "iu" else given.astype(float)
+    arrows = None
+    if chances.shape[values.ndim :] == (len(STEPS),):
+        by_memory = chances.reshape(*panels.shape, len(STEPS))
+        arrows = np.stack([np.where(inside[:, None], by_memory[:, q], np.nan) for q in chosen])
     return grid(
         cells,
-        np.stack([np.where(inside, values[:, q], np.nan) for q in chosen]),
+        np.stack([np.where(inside, panels[:, q], np.nan) for q in chosen]),
         arrows,
         titles=titles,
         limits=_limits(values),
@@ -138,13 +134,6 @@ def solution(
 def _limits(values: np.ndarray) -> tuple[float, float] | None:
     """The limits [0, 1] for probabilities, else None."""
     return (0.0, 1.0) if values.size and values.min() >= 0 and values.max() <= 1 else None
-
-
-def _arrows(policy: np.ndarray | None, inside: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    if policy is None:
-        return None
-    chance = np.eye(4)[policy] if policy.dtype.kind in "iu" else policy.astype(float)
-    return np.where(inside[:, None], chance, np.nan)
 
 
 def _strip(found: Solution) -> Figure:
@@ -305,10 +294,9 @@ def _arrows_of(world: PyTree) -> Iterator[_Arrow]:
 
 def _graph(
     world: PyTree,
-    system: NDArray[np.bool_] | None,
-    values: np.ndarray | None,
-    policy: NDArray[np.int64] | None,
-    region: NDArray[np.bool_] | None = None,
+    system: NDArray[np.bool_] | None = None,
+    values: np.ndarray | None = None,
+    policy: NDArray[np.int64] | None = None,
 ) -> Figure:
     count = world.num_states
     if count > MOST_STATES:
@@ -332,38 +320,20 @@ def _graph(
     starts = np.flatnonzero(np.asarray(world.initial) > 0)
     first = int(starts[0]) if starts.size else 0
     graph = drawing.arrange(delta, first, np.zeros(count, bool), rows)
-    figure, axes = canvas(graph, _notes(world, values))
     taken = {
         (x.source, x.target) for x in arrows if policy is not None and policy[x.source] == x.number
     }
-    for edge in graph.edges:
-        draw_edge(axes, edge.curve, ACCENT if edge.key[:2] in taken else INK)
-    for label in graph.labels:
-        draw_label(axes, label, INK)
+    figure, axes = draw_graph(
+        graph,
+        _notes(world, values),
+        lambda key: ACCENT if key[:2] in taken else INK,
+        lambda key: INK,
+    )
     if len(starts) == 1:
         draw_start(axes, graph.position[first])
     for s, center in enumerate(graph.position):
-        if system is not None and not system[s]:
-            _square(axes, center, str(s), region is not None and bool(region[s]))
-        else:
-            draw_state(axes, center, str(s), region is not None and bool(region[s]), False)
+        draw_state(axes, center, str(s), square=system is not None and not system[s])
     return figure
-
-
-def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> None:
-    half = drawing.RADIUS * 0.9
-    axes.add_patch(
-        Rectangle(
-            tuple(center - half),
-            2 * half,
-            2 * half,
-            fc=GOOD if good else FAINT,
-            ec=INK,
-            lw=1.3,
-            zorder=5,
-        )
-    )
-    write(axes, center, text, 11, INK, va="center_baseline", zorder=6)
 
 
 def _notes(world: PyTree, values: np.ndarray | None) -> list[str]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LinearSegmentedColormap
@@ -148,19 +147,6 @@ def scale_bar(
     bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
 
 
-def legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[str]) -> None:
-    """Draws a legend in one row below the axes."""
-    figure.legend(
-        handles,
-        names,
-        loc="outside lower center",
-        ncols=len(names),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-    )
-
-
 class MapOptions(TypedDict, total=False):
     """Rarely needed options of maps; the help of each function describes those that it takes."""
 
@@ -184,36 +170,3 @@ def plain_axes(axes: Axes) -> None:
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(FAINT)
-
-
-def panel_rows(
-    rows: Mapping[str, Mapping[str, object]], name: str, size: tuple[float, float]
-) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Empty panels by the titles of row and column."""
-    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    if not columns:
-        raise ValueError(f"{name}: nothing to show; give at least one row with a panel.")
-    figure = blank(size[0] * len(columns), size[1] * len(rows) + 0.5)
-    grid = figure.subplots(len(rows), len(columns), squeeze=False)
-    found = {}
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            axes = grid[i, j]
-            plain_axes(axes)
-            if i == 0:
-                axes.set_title(column, fontsize=9.5, color=INK, loc="left")
-            if j == 0:
-                axes.set_ylabel(row, fontsize=9.5, color=INK)
-            if column in rows[row]:
-                found[row, column] = axes
-            else:
-                axes.set_visible(False)
-    return figure, found
-
-
-def bottom_labels(panels: Mapping[tuple[str, str], Axes], labels: Sequence[str]) -> None:
-    """Labels the axes of the last row of panels."""
-    last, columns = list(panels)[-1][0], list(dict.fromkeys(column for _, column in panels))
-    for column, label in zip(columns, labels, strict=False):
-        if (last, column) in panels:
-            panels[last, column].set_xlabel(label, fontsize=8.5, color=MUTED)
