@@ -255,7 +255,10 @@ def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
         (lambda: tg.make_world({}, 0, margin=0), "margin=0"),
         (lambda: tg.make_world({}, 0, slip=1.5), "slip=1.5"),
         (lambda: tg.make_world({}, 0, objects={"a": {"red": 4}}), "are 4 cells; a patch has 9"),
-        (lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}), "a: color='blue'; choose one of red"),
+        (
+            lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}),
+            "a: color='blue'; choose one of red",
+        ),
         (
             lambda: tg.make_world({}, 0, objects={"a": {"red": 10, "black": -1}}),
             "black=-1; it must be at least 0",
