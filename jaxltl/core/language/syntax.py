@@ -83,12 +83,8 @@ class Module:
     @property
     def names(self) -> set[str]:
         """The variables and parameters that the commands read or assign."""
-        found: set[str] = set()
-        for c in self.commands:
-            found |= c.assigned
-            for e in c.expressions:
-                names_in(e, found)
-        return found
+        read = (names_in(e) for c in self.commands for e in c.expressions)
+        return set[str]().union(*read, *(c.assigned for c in self.commands))
 
 
 @dataclass(frozen=True)
@@ -218,8 +214,10 @@ class Program:
     @property
     def types(self) -> dict[str, Type]:
         """The type of each variable and parameter."""
-        found: dict[str, Type] = {v.name: v.type for v in self.variables}
-        return found | dict.fromkeys(self.parameters, "double")
+        return {
+            **{v.name: v.type for v in self.variables},
+            **dict.fromkeys(self.parameters, "double"),
+        }
 
     @property
     def has_intervals(self) -> bool:

@@ -233,9 +233,10 @@ class Search:
                 continue
             local = np.full(size, -1)
             local[chosen[0][low:high] - begin] = chosen[1][low:high]
-            width = np.where(local < 0, 1, table.width[local])[row]
+            width = np.where(local < 0, 1, table.width[local])
             entry = table.start[local[row]]
             if width.max() > 1:
+                width = width[row]
                 entry = concatenated_ranges(entry, width)
                 again = np.arange(row.size).repeat(width)
                 row, target = row[again], [one[again] for one in target]

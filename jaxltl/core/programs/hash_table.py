@@ -96,13 +96,9 @@ class HashTable:
         """Room for keys at a load of at most one half."""
         if 2 * size <= self.slots.size:
             return
-        capacity = self.slots.size
-        while capacity < 4 * size:
-            capacity *= 2
-        self.keys = [
-            np.concatenate([k[: self.size], np.zeros(capacity // 2 - self.size, np.uint64)])
-            for k in self.keys
-        ]
+        capacity = 1 << (4 * size - 1).bit_length()
+        room = np.zeros(capacity // 2 - self.size, np.uint64)
+        self.keys = [np.concatenate([k[: self.size], room]) for k in self.keys]
         self.slots = np.full(capacity, -1, np.int32)
         self._place_all()
 

@@ -141,8 +141,8 @@ class ModuleCode:
             table = np.stack(weights, 1)
             self._check_weights(code.command, weights, read)
         else:
-            kept = np.ones((size, outcomes), bool)
-            table = np.broadcast_to(code.fixed, (size, outcomes))
+            table = np.ones((size, 1)) * code.fixed
+            kept = table > 0
         values = iter(code.right(read))
         change = [np.zeros((size, outcomes), np.uint64) for _ in range(self.layout.num_words)]
         for k, fields in enumerate(code.targets):
@@ -258,9 +258,13 @@ class LocalTable:
             part = (words[word] >> np.uint64(shift)) & np.uint64((1 << width) - 1)
             key |= part.astype(np.int64) << place
             place += width
-        new = np.unique(key[number[key] < 0])
-        number[new] = np.arange(self.size, self.size + new.size)
-        return number[key]
+        index: Integers = number[key]
+        new = key[index < 0]
+        if new.size:
+            new = np.unique(new)
+            number[new] = np.arange(self.size, self.size + new.size)
+            index = number[key]
+        return index
 
 
 def _joined(old: Choices, more: Choices) -> Choices:

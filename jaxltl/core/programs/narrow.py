@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice, product
+from itertools import product
 from math import prod
 from typing import Any
 
@@ -28,7 +28,8 @@ _Choices = tuple[list[tuple[int, Updates]], dict[int, list[Updates]]]
 class Narrow:
     """States that were expanded one by one, and their choices; lists of Python's numbers."""
 
-    known: dict[int, int]  # the number of each state, in order
+    keys: list[int]
+    known: dict[int, int]  # the number of each state
     row_count: list[int] = field(default_factory=list)  # of states that are expanded
     column: list[int] = field(default_factory=list)
     entry_count: list[int] = field(default_factory=list)
@@ -38,7 +39,7 @@ class Narrow:
     def words(self, layout: Layout) -> Words:
         """The states as packed words."""
         return tuple(
-            np.array([k >> (64 * w) & _WORD for k in self.known], np.uint64)
+            np.array([k >> (64 * w) & _WORD for k in self.keys], np.uint64)
             for w in range(layout.num_words)
         )
 
@@ -62,7 +63,7 @@ def search_narrow(
     keys = [0] * initial[0].size
     for w, word in enumerate(initial):
         keys = [k | x << (64 * w) for k, x in zip(keys, word.tolist(), strict=True)]
-    found = Narrow({k: i for i, k in enumerate(keys)})
+    found = Narrow(keys, {k: i for i, k in enumerate(keys)})
     try:
         modules = [
             _Module(generate(m, code.actions, layout), i, code, parts)
@@ -71,22 +72,19 @@ def search_narrow(
     except Unsupported:
         return found
     most = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
-    level = keys
-    while 0 < len(level) < most and len(found.known) <= max_states:
-        size = len(found.known)
-        lists: list[list[Any]] = [found.row_count, found.column, found.entry_count]
-        lists += [found.successor, found.weight]
-        marks = [len(x) for x in lists]
+    lists: list[list[Any]] = [keys, found.row_count, found.column, found.entry_count]
+    lists += [found.successor, found.weight]
+    while 0 < len(level := keys[len(found.row_count) :]) < most and len(keys) <= max_states:
+        marks = list(map(len, lists))
         try:
             for key in level:
                 _expand(key, modules, parts, found)
         except (Unsupported, ArithmeticError, ValueError):
-            for key in list(islice(found.known, size, None)):
+            for key in keys[marks[0] :]:
                 del found.known[key]
             for items, mark in zip(lists, marks, strict=True):
                 del items[mark:]
             break
-        level = list(islice(reversed(found.known), len(found.known) - size))[::-1]
     return found
 
 
@@ -157,7 +155,12 @@ def _joint(together: list[list[Updates]]) -> list[Updates]:
 def _add(key: int, column: int, updates: Updates, found: Narrow) -> None:
     known = found.known
     for change, probability in updates:
-        found.successor.append(known.setdefault(key + change, len(known)))
+        target = key + change
+        number = known.get(target)
+        if number is None:
+            number = known[target] = len(found.keys)
+            found.keys.append(target)
+        found.successor.append(number)
         found.weight.append(probability)
     found.column.append(column)
     found.entry_count.append(len(updates))

@@ -136,15 +136,15 @@ def _require_name(program: Program, kind: str, name: str, known: Iterable[str]) 
 
 def _require_simulated(program: Program) -> None:
     """Raises ValueError for what has no simulation."""
-    text = ""
     if program.kind == "smg":
         text = "an smg is not simulated; build the model, for model_environment."
     elif program.has_intervals:
         text = "a program with intervals of probabilities is not simulated; give numbers."
     elif program.parameters:
         text = f"a program whose constant {program.parameters[0]} has no value is not simulated; give it."
-    if text:
-        raise ValueError(f"{program.source.name!r}: {text}")
+    else:
+        return
+    raise ValueError(f"{program.source.name!r}: {text}")
 
 
 # --- functions of the environment -----------------------------------------------------------------
@@ -332,23 +332,22 @@ def _require_32_bits(ends: _Ends, place: int, shown: object) -> None:
 
 def _ends(e: Expression, ranges: dict[str, _Ends], known: dict[int, _Ends]) -> _Ends:
     """Bounds of an expression by interval arithmetic."""
-    if (found := known.get(id(e))) is None:
-        parts = [_ends(x, ranges, known) for x in e.operands]
-        found = known[id(e)] = _node_ends(e, parts, ranges)
-        _require_32_bits(found, e.place, e)
-    return found
-
-
-def _node_ends(e: Expression, parts: list[_Ends], ranges: dict[str, _Ends]) -> _Ends:
     if e.operator == "name":
         return ranges[str(e.value)]
-    if e.operator == "literal":
-        value = float(e.value) if isinstance(e.value, bool | int | float) else 0.0
-        return value, value, type(e.value) is int
-    parts = parts[e.operator == "?:" :]
+    if id(e) not in known:
+        parts = [_ends(x, ranges, known) for x in e.operands]
+        known[id(e)] = _node_ends(e, parts[e.operator == "?:" :])
+        _require_32_bits(known[id(e)], e.place, e)
+    return known[id(e)]
+
+
+def _node_ends(e: Expression, parts: list[_Ends]) -> _Ends:
     lows, highs, whole = [p[0] for p in parts], [p[1] for p in parts], all(p[2] for p in parts)
     sizes = [max(abs(low), abs(high)) for low, high, _ in parts]
     match e.operator:
+        case "literal":
+            value = float(e.value) if isinstance(e.value, bool | int | float) else 0.0
+            return value, value, type(e.value) is int
         case "floor" | "ceil" | "round":
             return lows[0] - (not whole), highs[0] + (not whole), True
         case "neg":

@@ -99,6 +99,11 @@ class _Slot:
     actions: tuple[str, ...]
     selected: dict[str, int]
 
+    def differing(self, other: _Slot) -> list[str]:
+        """The selectors of both slots that have another value."""
+        both = self.selected.keys() & other.selected.keys()
+        return [v for v in both if self.selected[v] != other.selected[v]]
+
 
 def _slot(names: tuple[str, ...], commands: Sequence[Command], actions: tuple[str, ...]) -> _Slot:
     values: dict[str, set[int]] = {}
@@ -130,14 +135,10 @@ def _chains(program: Program, live: Sequence[Sequence[Command]]) -> Iterator[lis
 
 def _orbit(run: Sequence[_Slot]) -> list[Orbit]:
     """The orbit of some slots; none if a selector does not name each of them."""
-    selectors = {v for a, b in pairwise(run) for v in _differing(a, b)}
+    selectors = {v for a, b in pairwise(run) for v in a.differing(b)}
     values = {v: tuple(s.selected[v] for s in run if v in s.selected) for v in sorted(selectors)}
     named = all(len(set(x)) == len(x) == len(run) for x in values.values())
     return [Orbit(tuple(s.names for s in run), values)] if named else []
-
-
-def _differing(a: _Slot, b: _Slot) -> list[str]:
-    return [v for v in a.selected.keys() & b.selected.keys() if a.selected[v] != b.selected[v]]
 
 
 def _exchange(a: _Slot, b: _Slot) -> _Exchange | None:
@@ -147,9 +148,8 @@ def _exchange(a: _Slot, b: _Slot) -> _Exchange | None:
     for one, other in pairs:
         if names.setdefault(one, other) != other or names.setdefault(other, one) != one:
             return None
-    values = {
-        v: {a.selected[v]: b.selected[v], b.selected[v]: a.selected[v]} for v in _differing(a, b)
-    }
+    ends = [(v, a.selected[v], b.selected[v]) for v in a.differing(b)]
+    values = {v: {first: last, last: first} for v, first, last in ends}
     return _Exchange(names, values)
 
 
