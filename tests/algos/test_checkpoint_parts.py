@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxltl.algos.common import _checkpoint_parts as parts
+from jaxltl.algos.common import checkpoint as parts
 
 
 def written(path, array, cuts):
@@ -21,14 +21,14 @@ def written(path, array, cuts):
         with path.with_name(name).open("wb") as file:
             np.savez(file, x=array[tuple(map(slice, begin, end))])
         pieces.append((begin, end, name, "x"))
-    return parts.Stored(list(array.shape), str(array.dtype), pieces)
+    return parts._Stored(list(array.shape), str(array.dtype), pieces)
 
 
 @pytest.mark.parametrize("cuts", [((3,), ()), ((1, 2, 5), (2,)), ((), ())])
 def test_any_block_is_read_from_any_pieces(tmp_path, cuts):
     array = np.random.default_rng(0).normal(size=(7, 4))
     stored = written(tmp_path / "run.npz", array, cuts)
-    with parts.Parts(tmp_path / "run.npz") as found:
+    with parts._Parts(tmp_path / "run.npz") as found:
         np.testing.assert_array_equal(found.read(stored), array)
         for a, b in itertools.combinations(range(8), 2):
             np.testing.assert_array_equal(found.read(stored, (slice(a, b),)), array[a:b])
@@ -42,7 +42,7 @@ def test_only_the_parts_that_are_needed_are_read(tmp_path):
     stored = written(tmp_path / "run.npz", array, ((2, 4), ()))
     (tmp_path / stored.pieces[0][2]).unlink()
     (tmp_path / stored.pieces[1][2]).write_bytes(b"PK of no use")
-    with parts.Parts(tmp_path / "run.npz") as found:
+    with parts._Parts(tmp_path / "run.npz") as found:
         np.testing.assert_array_equal(found.read(stored, (slice(4, 6),)), array[4:])
         with pytest.raises(ValueError, match=r"its part 'run.npz.part-0-x' is missing"):
             found.read(stored)
@@ -55,7 +55,7 @@ def test_what_lies_beside_a_file_is_its_own_alone(tmp_path):
     begun, others = tmp_path / ".a[1].npz.part-0-x.tmp", tmp_path / "a1.npz.part-0-x"
     for path in (*mine, begun, others):
         path.touch()
-    assert parts.parts_of(tmp_path / "a[1].npz") == mine
-    assert parts.unfinished(tmp_path / "a[1].npz") == [begun]
-    parts.remove([*mine, begun, tmp_path / "not there"])
+    assert parts._parts_of(tmp_path / "a[1].npz") == mine
+    assert parts._unfinished(tmp_path / "a[1].npz") == [begun]
+    parts._unlink([*mine, begun, tmp_path / "not there"])
     assert list(tmp_path.iterdir()) == [others]

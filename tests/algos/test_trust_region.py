@@ -18,7 +18,7 @@ from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams, learner
 from jaxltl.algos.trust_region import policies as nets
-from jaxltl.algos.trust_region._step import (
+from jaxltl.algos.trust_region.learner import (
     Case,
     Dual,
     cpo_step,

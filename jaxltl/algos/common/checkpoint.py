@@ -21,22 +21,25 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import glob
 import hashlib
 import inspect
 import json
 import os
+import secrets
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos.common import _checkpoint_parts as parts
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.models.ops.array_namespace import to_jax
+
 
 _GIVEN = "given"  # the fingerprint's name in the file
 _PARTS = "parts"  # name of the index of arrays in other files
@@ -52,10 +55,10 @@ def save(
     first process writes the file last.
     """
     path, named = Path(path), [(name, _data(leaf)) for name, leaf in _named(state)]
-    apart = {name: leaf for name, leaf in named if parts.is_apart(leaf)}
-    before = parts.parts_of(path)
-    stored = parts.write(path, apart, atomic_write) if apart else {}
-    if jax.process_index() and any(parts.is_shared(leaf) for _, leaf in named):
+    apart = {name: leaf for name, leaf in named if _is_apart(leaf)}
+    before = _parts_of(path)
+    stored = _write_parts(path, apart) if apart else {}
+    if jax.process_index() and any(_is_shared(leaf) for _, leaf in named):
         return
     arrays: dict[str, PyTree] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
     arrays |= {name: np.asarray(leaf) for name, leaf in named if name not in apart}
@@ -64,7 +67,7 @@ def save(
     with atomic_write(path) as file:
         np.savez(file, **arrays)
     kept = {file for x in stored.values() for *_, file, _ in x.pieces}
-    parts.remove([part for part in before if part.name not in kept])
+    _unlink([part for part in before if part.name not in kept])
 
 
 def remove(path: str | os.PathLike[str]) -> None:
@@ -73,7 +76,7 @@ def remove(path: str | os.PathLike[str]) -> None:
     A missing file is no error.
     """
     path = Path(path)
-    parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
+    _unlink([path, *_parts_of(path), *_unfinished(path)])
 
 
 def load(
@@ -89,14 +92,14 @@ def load(
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
         or other hyperparameters.
     """
-    with parts.Parts(path) as others:
+    with _Parts(path) as others:
         try:
             # An open file of our own is closed even where a damaged archive is given up.
             with open(path, "rb") as file:
                 arrays: dict[str, PyTree] = read_arrays(file)
             before = json.loads(str(arrays.pop(_GIVEN)))
             stored = json.loads(str(arrays.pop(_PARTS, "{}")))
-            arrays |= {name: parts.Stored(*x) for name, x in stored.items()}
+            arrays |= {name: _Stored(*x) for name, x in stored.items()}
             leaves = [
                 _loaded(str(path), name, leaf, arrays.get(name), others)
                 for name, leaf in _named(like)
@@ -113,7 +116,7 @@ class _Another(Exception):
     """An array of another learner or problem."""
 
 
-def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: parts.Parts) -> PyTree:
+def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: _Parts) -> PyTree:
     """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
     if found is None or not _fits(found, expected):
@@ -125,18 +128,18 @@ def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: parts.Par
     if isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1:
 
         def block(index: tuple[slice, ...] | None) -> np.ndarray:
-            stored = isinstance(found, parts.Stored)
+            stored = isinstance(found, _Stored)
             return others.read(found, index) if stored else found[index or ()]
 
         value = jax.make_array_from_callback(tuple(found.shape), expected.sharding, block)
     else:
-        value = to_jax(others.read(found) if isinstance(found, parts.Stored) else found)
+        value = to_jax(others.read(found) if isinstance(found, _Stored) else found)
     if expected is not leaf:
         value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
     return value
 
 
-def _fits(found: np.ndarray | parts.Stored, expected: jax.Array) -> bool:
+def _fits(found: np.ndarray | _Stored, expected: jax.Array) -> bool:
     shape = expected.shape
     if shape[:1] == (0,):
         shape = (*found.shape[:1], *shape[1:])
@@ -253,3 +256,128 @@ def _constant(value: object) -> str:
 def _type(value: object) -> str:
     kind = value if isinstance(value, type) else type(value)
     return f"{kind.__module__}.{kind.__qualname__}"
+
+
+# --- arrays over several processes ----------------------------------------------------------
+
+# A part has a new name each time it is written. One process writes the file that names the parts
+# last, when all processes have written theirs, and the previous parts stay until then. So whenever a
+# process dies, that file and the parts that it names are complete.
+
+
+def _is_shared(x: object) -> bool:
+    """True if an array lies on the devices of several processes."""
+    return isinstance(x, jax.Array) and not x.is_fully_addressable
+
+
+def _is_apart(x: object) -> bool:
+    """True if an array lies on the devices of several processes and is not replicated."""
+    return isinstance(x, jax.Array) and _is_shared(x) and not x.is_fully_replicated
+
+
+class _Stored(NamedTuple):
+    """An array in parts: bounds, file and name in the file of each of its `pieces`."""
+
+    shape: list[int]
+    dtype: str
+    pieces: list[tuple[list[int], list[int], str, str]]
+
+
+def _write_parts(path: Path, arrays: Mapping[str, PyTree]) -> dict[str, _Stored]:
+    """Writes this process's part of arrays, and waits until the others have written theirs."""
+    from jax.experimental.multihost_utils import process_allgather
+
+    token = np.frombuffer(secrets.token_bytes(8), np.uint32)
+    mine = {
+        _piece_name(array, shard.index): np.asarray(shard.data)
+        for array, x in enumerate(arrays.values())
+        for shard in x.addressable_shards
+        if shard.replica_id == 0
+    }
+    if mine:
+        with atomic_write(_part(path, jax.process_index(), token)) as file:
+            np.savez(file, allow_pickle=False, **mine)
+    tokens = np.asarray(process_allgather(token))  # when it is back all have written
+    names = [_part(path, process, x).name for process, x in enumerate(tokens)]
+    return {
+        name: _Stored(
+            list(x.shape),
+            str(x.dtype),
+            [
+                (
+                    *_ends(shard.index, x.shape),
+                    names[shard.device.process_index],
+                    _piece_name(array, shard.index),
+                )
+                for shard in x.global_shards
+                if shard.replica_id == 0
+            ],
+        )
+        for array, (name, x) in enumerate(arrays.items())
+    }
+
+
+def _part(path: Path, process: int, token: np.ndarray) -> Path:
+    return path.with_name(f"{path.name}.part-{process}-{token.tobytes().hex()}")
+
+
+def _parts_of(path: Path) -> list[Path]:
+    """All parts in the directory of a file, named by it or not."""
+    return sorted(path.parent.glob(f"{glob.escape(path.name)}.part-*"))
+
+
+def _unfinished(path: Path) -> list[Path]:
+    """Temporary files that killed processes left of a file and of its parts."""
+    return sorted(path.parent.glob(f".{glob.escape(path.name)}.*"))
+
+
+def _unlink(paths: list[Path]) -> None:
+    """Removes files, those that are there."""
+    for path in paths:
+        path.unlink(missing_ok=True)
+
+
+class _Parts(contextlib.ExitStack):
+    """The parts of a file, read on demand, each piece once, and closed in the end."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self._beside = Path(path)
+        self._files, self._pieces = dict[str, Any](), dict[tuple[str, str], np.ndarray]()
+
+    def read(self, stored: _Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
+        """A block of an array, or all of it, from its pieces; ValueError if a part is missing or damaged."""
+        begin, end = _ends(index or (), stored.shape)
+        found = np.zeros([b - a for a, b in zip(begin, end, strict=True)], stored.dtype)
+        for first, last, file, name in stored.pieces:
+            low, high = np.maximum(begin, first), np.minimum(end, last)
+            if (low < high).all():
+                found[_block(low, high, begin)] = self._piece(file, name)[_block(low, high, first)]
+        return found
+
+    def _piece(self, file: str, name: str) -> np.ndarray:
+        if (file, name) not in self._pieces:
+            try:
+                if file not in self._files:
+                    opened = self.enter_context(self._beside.with_name(file).open("rb"))
+                    self._files[file] = np.load(opened, allow_pickle=False)
+                self._pieces[file, name] = self._files[file][name]
+            except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
+                what = "missing" if isinstance(error, FileNotFoundError) else "damaged"
+                raise ValueError(f"its part {file!r} is {what}.") from None
+        return self._pieces[file, name]
+
+
+def _ends(index: tuple[slice, ...], shape: Sequence[int]) -> tuple[list[int], list[int]]:
+    """First and last indices of a block; axes that are not named are whole."""
+    index = (*index, *(slice(None),) * (len(shape) - len(index)))
+    each = [x.indices(int(n)) for x, n in zip(index, shape, strict=True)]
+    return [x[0] for x in each], [x[1] for x in each]
+
+
+def _block(low: Iterable[int], high: Iterable[int], first: Iterable[int]) -> tuple[slice, ...]:
+    return tuple(slice(int(a - c), int(b - c)) for a, b, c in zip(low, high, first, strict=True))
+
+
+def _piece_name(array: int, index: tuple[slice, ...]) -> str:
+    return f"{array}-" + "-".join(str(x.start or 0) for x in index)

@@ -249,7 +249,7 @@ class State(RunState):
     Attributes:
       moves: ``int32[]``, moves made, at most 2^31 - 1; further steps make none.
       position: ``int32[]``, the current state of the game.
-      counts: ``int32[S, A, K]``, observations of each transition; in a deterministic game at most 1.
+      counts: ``int32[S, A, K]``, observations of each transition.
       reward: ``float[S, A, K]``, observed rewards; ``R_max / (1 - discount)`` elsewhere.
       known_at: ``int32[S, A]``, moves after which a pair became known; -1 before.
       num_known: ``int32[]``, known pairs.
