@@ -27,7 +27,7 @@ from jaxltl.core.automata.table import (
 )
 from jaxltl.core.sparse.graph.components import strong_components
 
-Condition: TypeAlias = tuple[Any, ...]  # see `holds`
+Condition: TypeAlias = tuple[Any, ...]  # see `residual`
 Part: TypeAlias = frozenset[int]  # of the transitions or colors that can recur together
 
 MAX_COLORS = 62  # the bits of a set of colors
@@ -36,16 +36,7 @@ MAX_SUBSETS = 20_000  # parts examined for one tree before it is given up
 
 def holds(condition: Condition, colors: int) -> bool:
     """True if a condition holds of the set of colors that occur infinitely often."""
-    match condition[0]:
-        case "true" | "false":
-            return bool(condition[0] == "true")
-        case "inf" | "fin":
-            return bool((colors >> condition[1] & 1) == (condition[0] == "inf"))
-        case "and":
-            return all(holds(part, colors) for part in condition[1:])
-        case "or":
-            return any(holds(part, colors) for part in condition[1:])
-    raise ValueError(f"holds: unknown condition {condition[0]!r}. Use true false inf fin and or.")
+    return residual(condition, ~colors, colors) == ("true",)
 
 
 def polarities(condition: Condition) -> tuple[int, int]:
@@ -66,23 +57,24 @@ def polarities(condition: Condition) -> tuple[int, int]:
 
 def residual(condition: Condition, absent: int, present: int) -> Condition:
     """The condition if some colors never recur and others always do, without constants below."""
-    if condition[0] in ("inf", "fin"):
-        recurs, never = present >> condition[1] & 1, absent >> condition[1] & 1
+    operator, *parts = condition
+    if operator in ("true", "false"):
+        return condition
+    if operator in ("inf", "fin"):
+        recurs, never = present >> parts[0] & 1, absent >> parts[0] & 1
         if not recurs and not never:
             return condition
-        return ("true" if bool(recurs) == (condition[0] == "inf") else "false",)
-    if condition[0] in ("true", "false"):
-        return condition
-    neutral, absorbing = ("true",), ("false",)
-    if condition[0] == "or":
-        neutral, absorbing = absorbing, neutral
-    parts = [residual(part, absent, present) for part in condition[1:]]
+        return ("true" if bool(recurs) == (operator == "inf") else "false",)
+    if operator not in ("and", "or"):
+        raise ValueError(f"unknown condition {operator!r}. Use true false inf fin and or.")
+    neutral, absorbing = (("true",), ("false",)) if operator == "and" else (("false",), ("true",))
+    parts = [residual(part, absent, present) for part in parts]
     if absorbing in parts:
         return absorbing
     parts = [part for part in parts if part != neutral]
     if len(parts) < 2:
         return parts[0] if parts else neutral
-    return (condition[0], *parts)
+    return (operator, *parts)
 
 
 def parity_condition(num_priorities: int, first: int = 0) -> Condition:

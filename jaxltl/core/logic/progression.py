@@ -24,6 +24,22 @@ MAX_CUBES = 60
 _TEMPORAL = frozenset("XFGURWM")
 
 
+def encode(nodes: Iterable[Formula], diagrams: Diagrams, of: dict[Formula, int]) -> None:
+    """Adds the diagrams of Boolean formulas, operands first, to those of propositions and others."""
+    for node in nodes:
+        # From the last operand to the first, so that the top variables are added last.
+        operands = [of[operand] for operand in reversed(node.operands) if operand in of]
+        match node.operator:
+            case "true" | "false":
+                of[node] = TRUE if node.operator == "true" else FALSE
+            case "!":
+                of[node] = diagrams.negation(operands[0])
+            case "&":
+                of[node] = reduce(lambda rest, f: diagrams.both(f, rest), operands)
+            case "|":
+                of[node] = reduce(lambda rest, f: diagrams.either(f, rest), operands)
+
+
 class Progression:
     """Diagrams of formulas in negation normal form, and their successors under letters.
 
@@ -44,30 +60,15 @@ class Progression:
         self.variables = [node for node in self.nodes if node.operator == "ap"]
         self.variables += [node for node in self.nodes if node.operator in _TEMPORAL]
         self.diagram_of: dict[Formula, int] = {}
-        self._encode()
+        for i, variable in enumerate(self.variables):
+            self.diagram_of[variable] = self.diagrams.node(i, FALSE, TRUE)
+        encode(self.nodes, self.diagrams, self.diagram_of)
         self.class_of, self.representative = self._classes(letters, propositions)
         held = [
             {name for name, holds in zip(propositions, letters[i], strict=True) if holds}
             for i in self.representative
         ]
         self.after: list[Callable[[int], int]] = [self._step(letter) for letter in held]
-
-    def _encode(self) -> None:
-        diagrams, of = self.diagrams, self.diagram_of
-        for i, variable in enumerate(self.variables):
-            of[variable] = diagrams.node(i, FALSE, TRUE)
-        for node in self.nodes:
-            # From the last operand to the first, so that the top variables are added last.
-            operands = [of[operand] for operand in reversed(node.operands)]
-            match node.operator:
-                case "true" | "false":
-                    of[node] = TRUE if node.operator == "true" else FALSE
-                case "!":
-                    of[node] = diagrams.negation(operands[0])
-                case "&":
-                    of[node] = reduce(lambda rest, f: diagrams.both(f, rest), operands)
-                case "|":
-                    of[node] = reduce(lambda rest, f: diagrams.either(f, rest), operands)
 
     def _classes(
         self, letters: NDArray[np.bool_], propositions: Sequence[str]

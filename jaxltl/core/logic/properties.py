@@ -15,7 +15,7 @@ from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
-from jaxltl.core.logic.property_tokens import ExpressionStream, Token
+from jaxltl.core.logic.property_tokens import Token, TokenStream
 from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
@@ -166,7 +166,7 @@ _Content = TypeVar("_Content")
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
-class _Parser(ExpressionStream):
+class _Parser(TokenStream):
     """Recursive-descent parser; each method reads the construct of its name."""
 
     def __init__(self, text: str, known: Definitions) -> None:

@@ -57,12 +57,14 @@ def _tokens(text: str) -> list[Token]:
 
 
 class TokenStream:
-    """The tokens of a text, and the place in them."""
+    """The tokens of a text, the place in them, and the names that are defined so far."""
 
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.tokens = _tokens(text)
-        self.place = 0
+    def __init__(self, text: str, known: Definitions) -> None:
+        self.text, self.known = text, known
+        self.tokens, self.place = _tokens(text), 0
+        self.starts = [token.start for token in self.tokens]
+        self.names = dict(known.names)
+        self.labels: dict[str, Comparison] = {}  # that the text defines
 
     @property
     def token(self) -> Token:
@@ -118,10 +120,18 @@ class TokenStream:
         return sign * value
 
     def plain_number(self) -> Fraction:
-        text = self.token.text
-        self.require(self.token.kind == "number", "a number")
-        exponent = re.split("[eE]", text)[1:] or ["0"]
-        short = len(text) <= _MAX_DIGITS and abs(int(exponent[0])) <= _MAX_DIGITS
+        """A number, or an expression of constants."""
+        start, before = self.token, self.place
+        follows = self.tokens[min(self.place + 1, len(self.tokens) - 1)].text
+        is_plain = start.kind == "number" and follows not in ("+", "-", "*", "^")
+        if not is_plain and (start.kind in ("number", "word") or start.text == "("):
+            value = self.expression(ADDITIVE)
+            if value.is_literal and not isinstance(value.value, bool):
+                return Fraction(str(value.value))
+            self.place = before
+        self.require(start.kind == "number", "a number")
+        exponent = re.split("[eE]", start.text)[1:] or ["0"]
+        short = len(start.text) <= _MAX_DIGITS and abs(int(exponent[0])) <= _MAX_DIGITS
         self.require(short, f"a number of at most {_MAX_DIGITS} digits")
         return Fraction(self.take().text)
 
@@ -131,16 +141,7 @@ class TokenStream:
         self.require(value.denominator == 1, "a whole number of steps", start)
         return int(value)
 
-
-class ExpressionStream(TokenStream):
-    """Tokens with the names that are defined so far."""
-
-    def __init__(self, text: str, known: Definitions) -> None:
-        super().__init__(text)
-        self.known = known
-        self.names = dict(known.names)
-        self.labels: dict[str, Comparison] = {}  # that the text defines
-        self.starts = [token.start for token in self.tokens]
+    # --- declarations and expressions ---
 
     def declaration(self) -> None:
         """A constant, a formula or a label."""
@@ -181,19 +182,6 @@ class ExpressionStream(TokenStream):
             raise self.error(_expected(error.message), token) from None
         self.place = bisect.bisect_left(self.starts, parser.end)
         return found
-
-    def plain_number(self) -> Fraction:
-        """A number, or an expression of constants."""
-        follows = self.tokens[min(self.place + 1, len(self.tokens) - 1)].text
-        if self.token.kind == "number" and follows not in ("+", "-", "*", "^"):
-            return super().plain_number()
-        start, before = self.token, self.place
-        if start.kind in ("number", "word") or start.text == "(":
-            value = self.expression(ADDITIVE)
-            if value.is_literal and not isinstance(value.value, bool):
-                return Fraction(str(value.value))
-            self.place = before
-        return super().plain_number()
 
     def reward_name(self) -> str:
         """A name in quotes, or the number of a reward structure from 1."""

@@ -34,7 +34,9 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
 
 def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
     """Hoeffding interval (1963, thm. 1) for fixed n: ``k / n -+ sqrt(log(2 / failure) / (2 n))``."""
-    return around(frequency(count, total), hoeffding_deviation(total, failure))
+    with np.errstate(divide="ignore"):
+        deviation = np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
+    return around(frequency(count, total), deviation)
 
 
 def anytime(count: Integers, total: Integers, failure: float) -> Ends:
@@ -51,13 +53,6 @@ def anytime(count: Integers, total: Integers, failure: float) -> Ends:
 def frequency(count: Integers, total: Integers) -> Floats:
     """``count / total``, and 0 where nothing was tried."""
     return np.asarray(count, np.float64) / np.maximum(total, 1)
-
-
-def hoeffding_deviation(total: Integers, failure: float) -> Floats:
-    """Hoeffding's deviation of a frequency at failure probability `failure`."""
-    with np.errstate(divide="ignore"):
-        deviation: Floats = np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
-    return deviation
 
 
 def around(center: Floats, deviation: Floats) -> Ends:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,15 @@ from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
-from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformulas
+from jaxltl.core.logic.labels import is_boolean
+from jaxltl.core.logic.ltl import (
+    Formula,
+    negation_normal_form,
+    parse_ltl,
+    proposition_text,
+    subformulas,
+)
+from jaxltl.core.logic.progression import encode
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
@@ -502,35 +509,20 @@ def _named(
     names = sides[0] + sides[1]
     if len(set(names)) < len(names):
         return None
-    place = {name: i for i, name in enumerate(names)}
+    if not all(map(is_boolean, formulas)):
+        return None
     guards = _Guards(list(range(len(names))))
-    read = [_diagram(formula, place, guards) for formula in formulas]
+    of = {Formula("ap", proposition=name): guards.proposition(i) for i, name in enumerate(names)}
+    for formula in formulas:
+        encode(subformulas(negation_normal_form(formula)), guards, of)
+    read = [of[negation_normal_form(formula)] for formula in formulas]
     for s in range(system.size):
         taken = FALSE
         for guard in (read[a] for a in action[row_start[s] : row_start[s + 1]]):
-            if guard is None or guards.num_paths(guard) > _LONGEST or guards.both(taken, guard):
+            if guards.num_paths(guard) > _LONGEST or guards.both(taken, guard):
                 return None
             taken = guards.either(taken, guard)
         if taken != TRUE:
             return None
-    texts = [guards.text([str(i) for i in range(len(names))], x or FALSE, "t") for x in read]
+    texts = [guards.text([str(i) for i in range(len(names))], x, "t") for x in read]
     return _Labels(sides[0], sides[1], [texts[a] for a in action])
-
-
-def _diagram(formula: Formula, place: dict[str, int], guards: _Guards) -> int | None:
-    """The diagram of a Boolean formula; None for other operators."""
-    found: dict[Formula, int] = {}
-    for node in subformulas(formula):
-        parts = [found[x] for x in node.operands]
-        match node.operator:
-            case "ap":
-                found[node] = guards.proposition(place[node.proposition])
-            case "true" | "false":
-                found[node] = guards.constant(node.operator == "true")
-            case "!":
-                found[node] = guards.negation(parts[0])
-            case "&" | "|":
-                found[node] = reduce(guards.both if node.operator == "&" else guards.either, parts)
-            case _:
-                return None
-    return found[formula]
