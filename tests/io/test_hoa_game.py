@@ -81,8 +81,8 @@ def test_it_reads_what_the_file_says():
     assert (found.inputs, found.outputs) == (("r", "s"), ("g",))
     # In state 0 the inputs are !r and r, in state 1 they are !s and s; s then wins.
     assert set(model.action_names) == {"!r", "r", "!s", "s", "g", "!g", "true"}
-    assert model.valuation["state"].tolist() == [0, 1, 0, 0, 1, 1]
-    assert np.asarray(found.game.system).tolist() == [False] * 2 + [True] * 4
+    assert model.valuation["state"].tolist() == [0, 0, 0, 1, 1, 1]
+    assert np.asarray(found.game.system).tolist() == [False, True, True] * 2
     assert np.asarray(model.initial).tolist() == [1, 0, 0, 0, 0, 0]
     assert realizable(ARBITER)  # it grants at once, so that s is never asked for
     assert not realizable(ARBITER.replace("Start: 0", "Start: 1"))

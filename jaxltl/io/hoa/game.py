@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
+from jaxltl.core.automata.table import explore
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
@@ -193,6 +194,7 @@ class _Split:
 
 
 _Entry = tuple[int, int]  # a state, with the priority of the edge by which it is entered
+_Node = tuple[int, int | tuple[int, ...]]  # an entry, or a state with residuals of its guards
 
 
 class _Reader:
@@ -261,46 +263,48 @@ class _Reader:
         return np.array([v in held for v in self.guards.variable], bool)
 
     def _made(self, moves: list[dict[_Entry, int]], incomplete: bool) -> HoaGame:
-        start = int(self.header.start)
-        seen, stack = {start}, [start]
-        while stack:
-            new = {q for q, _ in moves[stack.pop()]} - seen
-            seen |= new
-            stack += new
-        # Remove unreachable states.
-        moves = [to if q in seen else {} for q, to in enumerate(moves)]
         entries = sorted({entry for to in moves for entry in to})
-        if all(q != start for q, _ in entries):  # visited once, so its priority is irrelevant
-            entries = sorted([*entries, (start, max(p for _, p in entries))])
-        split = _Split(self.guards, len(self.inputs))
-        classes = [split.of(tuple(to.values())) if to else {} for to in moves]
-        size = sum(len(classes[q]) for q, _ in entries)
-        size += sum(len(to) * len(c) for to, c in zip(moves, classes, strict=True))
-        if size > MAX_MOVES:
-            raise _TooMany
-        # The environment's states precede the system's, both in the order of the automaton.
-        number = {entry: i for i, entry in enumerate(entries)}
-        first = len(entries) + np.concatenate([[0], np.cumsum([len(c) for c in classes])])
-        rows = [
-            [(i, self._text(guard)) for i, guard in enumerate(classes[q].values(), int(first[q]))]
-            for q, _ in entries
-        ]
-        for to, parts in zip(moves, classes, strict=True):
-            targets = [number[entry] for entry in to]
-            for rest in parts:
-                pairs = zip(targets, rest, strict=True)
-                rows.append([(t, self._text(guard)) for t, guard in pairs if guard != FALSE])
-        state = np.array([q for q, _ in entries] + [q for q, c in enumerate(classes) for _ in c])
-        priority = np.array([p for _, p in entries])
-        largest = int(priority.max())
-        neutral = np.full(
-            len(rows) - priority.size, largest
-        )  # neutral priority of the system's states
-        model = _model(rows, {
-            "state": np.where(incomplete & (state == len(moves) - 1), -1, state),
-            "priority": largest + largest % 2 - np.append(priority, neutral),
-        }, next(i for i, (q, _) in enumerate(entries) if q == start))  # fmt: skip
-        game = make_game(model, np.arange(len(rows)) >= len(entries))
+        start = int(self.header.start), max(p for _, p in entries)
+        # The first visit is one among many, so that its priority is irrelevant.
+        start = next((entry for entry in entries if entry[0] == start[0]), start)
+        split, size = _Split(self.guards, len(self.inputs)), 0
+
+        def step(node: _Node) -> list[tuple[_Node, int]]:
+            nonlocal size
+            q, residuals = node
+            found: list[tuple[_Node, int]]
+            if isinstance(residuals, tuple):
+                found = [(x, g) for x, g in zip(moves[q], residuals, strict=True) if g != FALSE]
+            else:
+                classes = split.of(tuple(moves[q].values()))
+                found = [((q, rest), guard) for rest, guard in classes.items()]
+            size += len(found)
+            if size > MAX_MOVES:
+                raise _TooMany
+            return found
+
+        order, rows, guards = explore(start, step)
+        state = np.array([q for q, _ in order])
+        system = np.array([isinstance(x, tuple) for _, x in order])
+        largest = max(x for _, x in order if isinstance(x, int))
+        # The system's states have the neutral priority.
+        priority = np.array([x if isinstance(x, int) else largest for _, x in order])
+        texts = [self._text(guard) for guard in np.concatenate(guards).tolist()]
+        number = {text: i for i, text in enumerate(dict.fromkeys(texts))}
+        model = make_sparse(
+            np.cumsum([0, *map(len, rows)]),
+            np.arange(len(texts) + 1),
+            np.concatenate(rows),
+            np.ones(len(texts)),
+            initial=np.arange(len(order)) == 0,
+            action=np.array([number[text] for text in texts]),
+            action_names=tuple(number),
+            valuation={
+                "state": np.where(incomplete & (state == len(moves) - 1), -1, state),
+                "priority": largest + largest % 2 - priority,
+            },
+        )
+        game = make_game(model, system)
         return HoaGame(game, objective_of(game), self.inputs, self.outputs)
 
     def _text(self, guard: int) -> str:
@@ -315,24 +319,6 @@ class _Reader:
             names = [proposition_text(name) for name in self.names]
             self.texts[guard] = self.guards.text(names, guard, "true")
         return self.texts[guard]
-
-
-def _model(
-    rows: list[list[tuple[int, str]]], valuation: dict[str, Integers], start: int
-) -> SparseMDP:
-    """Deterministic sparse model from the moves of each state."""
-    moves = [move for row in rows for move in row]
-    number = {text: i for i, text in enumerate(dict.fromkeys(text for _, text in moves))}
-    return make_sparse(
-        np.cumsum([0, *map(len, rows)]),
-        np.arange(len(moves) + 1),
-        np.array([target for target, _ in moves]),
-        np.ones(len(moves)),
-        initial=np.arange(len(rows)) == start,
-        action=np.array([number[text] for _, text in moves]),
-        action_names=tuple(number),
-        valuation=valuation,
-    )
 
 
 def _disjunction(cubes: Sequence[Sequence[str]], true: str) -> str:
