@@ -14,8 +14,6 @@ MAX_CANDIDATES = 200_000  # pairs of states that may be merged
 MAX_ROUNDS = 12  # of comparisons with one state of each class
 MERGE_WORK = 1_200_000  # pair transitions of the products that prove or refute merges: about .6 s
 WINDOW = 1000  # merges that a counterexample is tried on
-KNOWN = 20_000  # pairs of a merge and a counterexample to others that are tried first
-UNREAD = 1 << 30  # above all priorities
 TURNS = 4  # of a cycle before its priorities are read, and while they are
 
 DIFFERENT = ((EVEN, ODD), (ODD, EVEN))
@@ -48,29 +46,20 @@ def _differing(table: Table, pairs: Integers) -> Booleans | None:
     return may(both.edges, len(both.states), DIFFERENT)[both.number[pairs]]
 
 
-def merged(table: Table, order: int, work: int, words: list[Word]) -> tuple[Table, int]:
+def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
     """The table with states of one language merged, one after another, where the whole allows it.
 
-    The `words` that refute merges of a table with the same language are tried first, and new ones
-    are appended.
+    `work` limits the pair transitions of the products that decide; what is left is returned.
     """
     same = language_classes(table)
     if same is None or (np.bincount(same) ** 2).sum() > MAX_CANDIDATES:
         return table, work
-    columns, place_of = distinct_columns(*table[:2])
+    columns, _ = distinct_columns(*table[:2])
     few = Table(table.delta[:, columns], table.priority[:, columns], int(table.initial))
     target = np.arange(len(same))
     kept, gone = _candidates(few, same, order)
-    if words and len(kept):
-        fine, count = np.ones(len(kept), bool), KNOWN // min(len(kept), WINDOW)
-        known = [(place_of[prefix], place_of[cycle]) for prefix, cycle in words[-count:]]
-        fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], known)
-        kept, gone = kept[fine], gone[fine]
-    together = 1  # merges that are tried at once
     while len(kept) and work > 0:
-        trial = target.copy()
-        for one, two in _independent(kept, gone, together):
-            trial[target == two] = one
+        trial = np.where(target == gone[0], kept[0], target)
         small = Table(trial[few.delta], few.priority, int(trial[few.initial]))
         both = product([few, small], max_size=MAX_PAIRS)
         if both is None:
@@ -79,32 +68,15 @@ def merged(table: Table, order: int, work: int, words: list[Word]) -> tuple[Tabl
         work -= size * (few.delta.shape[1] // 4 + 4) + 1000
         found = next(loops(both.edges, size, DIFFERENT), None)
         if found is None:
-            few, target, together = small, trial, 2 * together
+            few, target = small, trial
             fine = (target[kept] == kept) & (target[gone] == gone)
-        elif together > 1:
-            together = 1
-            continue
         else:
-            fine = np.ones(len(kept), bool)
             word = word_through(both.edges, size, *found)
-            fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], [word])
+            fine = np.ones(len(kept), bool)
+            fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], word)
             fine[0] = False
-            words.append((columns[word[0]], columns[word[1]]))
         kept, gone = kept[fine], gone[fine]
     return Table(target[table.delta], table.priority, int(target[table.initial])), work
-
-
-def _independent(kept: Integers, gone: Integers, count: int) -> list[tuple[int, int]]:
-    """The first of some merges, none of which touches a state that another removes."""
-    chosen: list[tuple[int, int]] = []
-    stay: set[int] = set()
-    leave: set[int] = set()
-    for one, two in zip(kept[: 50 * count].tolist(), gone[: 50 * count].tolist(), strict=True):
-        if one not in leave and two not in leave and two not in stay:
-            chosen.append((one, two))
-            stay.add(one)
-            leave.add(two)
-    return chosen[:count]
 
 
 def _candidates(table: Table, same: Integers, order: int) -> tuple[Integers, Integers]:
@@ -117,20 +89,16 @@ def _candidates(table: Table, same: Integers, order: int) -> tuple[Integers, Int
     return kept[ranks], gone[ranks]
 
 
-def _agreeing(table: Table, kept: Integers, gone: Integers, words: list[Word]) -> Booleans:
-    """The merges, each alone, with which words seem to have the verdicts that they have without."""
-    reads = max(len(prefix) + len(cycle) * 2 * TURNS for prefix, cycle in words)
-    letters = np.array([np.append(p, np.resize(c, reads - len(p))) for p, c in words])
-    begin = np.array([len(p) + len(c) * TURNS for p, c in words])
+def _agreeing(table: Table, kept: Integers, gone: Integers, word: Word) -> Booleans:
+    """The merges, each alone, with which a word seems to have the verdict that it has without."""
+    prefix, cycle = word
+    letters = np.concatenate([prefix, np.tile(cycle, 2 * TURNS)])
     kept, gone = np.append(table.initial, kept), np.append(table.initial, gone)  # first: none
-    state = np.where(gone == table.initial, kept, table.initial)[None].repeat(len(words), axis=0)
-    least = np.full(state.shape, UNREAD)
-    delta, priority, width = table.delta.ravel(), table.priority.ravel(), table.delta.shape[1]
-    for step, letter in enumerate(letters.T[:, :, None]):
-        place = state * width + letter
-        if step >= begin.min():
-            late = np.where(begin <= step, 0, UNREAD)[:, None]
-            np.minimum(least, priority[place] + late, out=least)
-        state = delta[place]
-        np.copyto(state, kept, where=state == gone)
-    return np.asarray((least % 2 == least[:, :1] % 2)[:, 1:].all(axis=0))
+    state = np.where(gone == table.initial, kept, table.initial)
+    least = table.priority.max() + np.ones_like(state)
+    for step, letter in enumerate(letters):
+        if step >= len(prefix) + len(cycle) * TURNS:
+            least = np.minimum(least, table.priority[state, letter])
+        state = table.delta[state, letter]
+        state = np.where(state == gone, kept, state)
+    return np.asarray((least % 2 == least[0] % 2)[1:])

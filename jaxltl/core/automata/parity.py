@@ -16,7 +16,7 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
 from jaxltl.core.automata.merging import MERGE_WORK, language_classes, merged
-from jaxltl.core.automata.products import EVEN, ODD, Word, states_that_may
+from jaxltl.core.automata.products import EVEN, ODD, states_that_may
 from jaxltl.core.automata.table import Table, components, distinct_columns, quotient
 
 ORDERS = (1, -1)  # similar states first, different ones first
@@ -46,10 +46,9 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
     columns, inverse = distinct_columns(*table[:2])
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
     every, work = np.arange(len(table.delta)), MERGE_WORK
-    words: list[Word] = []
     best: tuple[Table, Integers] | None = None
     for order in ORDERS if thorough else (None,):  # another order may merge more, if one merges any
-        small, base, work = _reduced(few, every, order, work, words)
+        small, base, work = _reduced(few, every, order, work)
         if best is None or len(small.delta) < len(best[0].delta):
             best = small, base
         if work <= 0 or len(small.delta) == len(few.delta) or is_weak(small):
@@ -61,7 +60,7 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
 
 
 def _reduced(
-    few: Table, base: Integers, order: int | None, work: int, words: list[Word]
+    few: Table, base: Integers, order: int | None, work: int
 ) -> tuple[Table, Integers, int]:
     """The table after the steps that make it smaller, merging states in an order if one is given."""
     while True:
@@ -77,7 +76,7 @@ def _reduced(
         if len(few.delta) < size:
             continue
         if order is not None:
-            table, work = merged(few, order, work, words)
+            table, work = merged(few, order, work)
             few, old = quotient(table)
             base = base[old]
         if len(few.delta) == size:
