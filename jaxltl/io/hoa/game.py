@@ -266,7 +266,7 @@ class _Reader:
         entries = sorted({entry for to in moves for entry in to})
         start = int(self.header.start), max(p for _, p in entries)
         # The first visit is one among many, so that its priority is irrelevant.
-        start = next((entry for entry in entries if entry[0] == start[0]), start)
+        begin: _Node = next((entry for entry in entries if entry[0] == start[0]), start)
         split, size = _Split(self.guards, len(self.inputs)), 0
 
         def step(node: _Node) -> list[tuple[_Node, int]]:
@@ -283,7 +283,7 @@ class _Reader:
                 raise _TooMany
             return found
 
-        order, rows, guards = explore(start, step)
+        order, rows, guards = explore(begin, step)
         state = np.array([q for q, _ in order])
         system = np.array([isinstance(x, tuple) for _, x in order])
         largest = max(x for _, x in order if isinstance(x, int))
