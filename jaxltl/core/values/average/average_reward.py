@@ -10,7 +10,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
@@ -31,9 +30,6 @@ from jaxltl.core.values.engine.state_quantities import (
     reduction_for,
 )
 from jaxltl.core.values.engine.validated import validated
-
-
-Fractions = npt.NDArray[np.object_]
 
 
 @validated()
@@ -108,7 +104,7 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
 
     The value of ``liminf (r_1 + ... + r_n) / n`` under optimal play (Ehrenfeucht and
     Mycielski 1979), by policy iteration with gains and biases (Cochet-Terrasson and Gaubert 2006)
-    in rational arithmetic.
+    in exact arithmetic, on integers with the rewards' common denominator.
 
     Args:
       game: a deterministic Game; any other model is the game in which the system always moves.
@@ -152,8 +148,10 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
             "mean_payoff is for deterministic games, and some move of this one has several "
             "successors; use minimax_value with a discount near 1, or remove chance."
         )
-    policy, gain, num_steps, done = _mean_iteration(_graph(form, reward), max_steps)
-    value, lower, upper = _as_floats(gain, np.dtype(game.dtype))
+    graph, scale = _graph(form, reward)
+    policy, gain, num_steps, done = _mean_iteration(graph, max_steps)
+    exact = [Fraction(int(p), int(q) * scale) for p, q in zip(*gain, strict=True)]
+    value, lower, upper = _as_floats(exact, np.dtype(game.dtype))
     shape = game.state_shape
     if not done:
         lower, upper = np.full_like(value, -np.inf), np.full_like(value, np.inf)
@@ -169,30 +167,43 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
 
 
 class _Graph(NamedTuple):
-    """A deterministic game over flat states."""
+    """A deterministic game over flat states, with integer rewards."""
 
     successor: Integers  # int[S, A]
-    weight: Fractions  # [S, A]
+    weight: Integers  # int64[S, A], or Python's integers where these are too small
     available: Booleans
     system: Booleans
 
 
 class _Biases(NamedTuple):
-    """Gains g and biases v with ``T(v + t g) = v + (t + 1) g`` for large t, exactly."""
+    """``T(v + t g) = v + (t + 1) g`` for large t, exactly."""
 
-    gain: Fractions
-    bias: Fractions
+    # g is ``numerator / denominator`` in lowest terms, `rank` orders the gains, and `bias` is the
+    # denominator times v.
+
+    numerator: Integers
+    denominator: Integers
+    rank: Integers
+    bias: Integers
 
 
-def _graph(game: Game, reward: jax.Array) -> _Graph:
+def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
+    """The game's graph with its rewards times a common denominator, which is returned."""
     columns = [np.asarray(_only_successor(game, a)) for a in range(game.num_actions)]
     available = np.asarray(game.available).reshape(-1, game.num_actions)
     values = np.where(available, np.asarray(reward, float).reshape(available.shape), 0)
     if not np.isfinite(values).all():
         s, a = np.argwhere(~np.isfinite(values))[0]
         raise ValueError(f"the reward of state {s}, action {a} is {values[s, a]}; make it finite.")
-    weight = np.vectorize(Fraction, otypes=[object])(values)
-    return _Graph(np.stack(columns, -1), weight, available, np.asarray(game.system).ravel())
+    distinct, place = np.unique(values, return_inverse=True)
+    exact = [Fraction(x) for x in distinct.tolist()]
+    scale = max(x.denominator for x in exact)  # powers of two
+    whole = [int(x * scale) for x in exact]
+    # A bias is a sum over a path, times a denominator; sums of slack are longer by a factor S.
+    small = 2 * len(values) ** 2 * max(map(abs, whole)) < _most_bias(len(values))
+    weight = np.array(whole, np.int64 if small else object)[place.reshape(values.shape)]
+    system = np.asarray(game.system).ravel()
+    return _Graph(np.stack(columns, -1), weight, available, system), scale
 
 
 @jit()
@@ -204,13 +215,23 @@ def _only_successor(game: Game, action: int) -> jax.Array:
     return slot
 
 
-def _mean_iteration(graph: _Graph, max_steps: int) -> tuple[Integers, Fractions, int, bool]:
+def _most_bias(num_states: int) -> int:
+    """The largest bias with which no sum can leave the range of int64."""
+    return 2**61 // (8 * num_states)
+
+
+def _mean_iteration(
+    graph: _Graph, max_steps: int
+) -> tuple[Integers, tuple[Integers, Integers], int, bool]:
     """Optimal strategies of both players, the gains, the steps, and whether they are optimal."""
     states = np.arange(len(graph.system))
     policy = graph.available.argmax(-1)
-    old = inner = _Biases(0 * graph.weight[:, 0], 0 * graph.weight[:, 0])
+    zero = np.zeros(len(states), graph.weight.dtype)
+    old = inner = _Biases(zero, zero + 1, np.zeros(len(states), int), zero)
     for n in range(1, max_steps + 1):
         inner = _evaluate(graph.successor[states, policy], graph.weight[states, policy], inner)
+        if np.abs(inner.bias).max() > _most_bias(len(states)):
+            graph = graph._replace(weight=graph.weight.astype(object))
         answer = _improve(graph, inner, policy, ~graph.system)
         if (answer != policy).any():
             policy = answer
@@ -220,12 +241,12 @@ def _mean_iteration(graph: _Graph, max_steps: int) -> tuple[Integers, Fractions,
         policy = _improve(graph, inner, policy, ~graph.system)
         better = _improve(graph, inner, policy, graph.system)
         if (better == policy).all():
-            return policy, inner.gain, n, True
+            return policy, (inner.numerator, inner.denominator), n, True
         policy = better
-    return policy, inner.gain, max_steps, False
+    return policy, (inner.numerator, inner.denominator), max_steps, False
 
 
-def _evaluate(successor: Integers, weight: Fractions, old: _Biases) -> _Biases:
+def _evaluate(successor: Integers, weight: Integers, old: _Biases) -> _Biases:
     """Gains and biases of fixed choices, for which all paths end in cycles, by step doubling."""
     # On each cycle the bias of its first state is the old one where the gain is, and else zero.
     states = np.arange(len(successor))
@@ -239,28 +260,42 @@ def _evaluate(successor: Integers, weight: Fractions, old: _Biases) -> _Biases:
     paid, length = np.where(at_root, 0, weight), np.where(at_root, 0, 1)
     for _ in range(doublings):
         paid, length, ahead = paid + paid[ahead], length + length[ahead], ahead[ahead]
-    gain = ((weight + paid[successor]) / (1 + length[successor]))[root]
-    start = np.where(gain == old.gain[root], old.bias[root], 0)
-    return _Biases(gain, paid - gain * length + start)
+    total = (weight + paid[successor])[root]
+    size = (1 + length[successor])[root]
+    if weight.dtype == object:
+        length, size = length.astype(object), size.astype(object)
+    common = np.gcd(total, size)
+    numerator, denominator = total // common, size // common
+    same = (numerator == old.numerator[root]) & (denominator == old.denominator[root])
+    start = np.where(same, old.bias[root], 0)
+    bias = denominator * paid - numerator * length + start
+    return _Biases(numerator, denominator, _ranks(numerator, denominator), bias)
 
 
-def _images(graph: _Graph, v: _Biases) -> Fractions:
-    """``r - g + v(t)`` for each move to t, with the gain g of t."""
+def _ranks(numerator: Integers, denominator: Integers) -> Integers:
+    pairs = list(zip(numerator.tolist(), denominator.tolist(), strict=True))
+    order = sorted(set(pairs), key=lambda pair: Fraction(*pair))
+    number = {pair: i for i, pair in enumerate(order)}
+    return np.array([number[pair] for pair in pairs])
+
+
+def _images(graph: _Graph, v: _Biases) -> Integers:
+    """Denominator times ``r - g + v(t)`` for each move to t, with the gain g of t."""
     t = graph.successor
-    result: Fractions = graph.weight - v.gain[t] + v.bias[t]
-    return result
+    return v.denominator[t] * graph.weight - v.numerator[t] + v.bias[t]
 
 
 def _improve(graph: _Graph, v: _Biases, policy: Integers, chooser: Booleans) -> Integers:
     """The choosers' best moves, by gain and then by bias; changed only if strictly better."""
     states = np.arange(len(policy))
     sign = np.where(graph.system, 1, -1)[:, None]
-    rank = np.unique(v.gain, return_inverse=True)[1]
-    level = np.where(graph.available, sign * rank[graph.successor], -len(states) - 1)
-    best = level.max(-1, keepdims=True)
-    image = np.where(level == best, sign * _images(graph, v), -np.inf)
+    rank = np.where(graph.available, sign * v.rank[graph.successor], -len(states) - 1)
+    best = rank.max(-1, keepdims=True)
+    image = sign * _images(graph, v)
+    level = rank == best
+    image = np.where(level, image, image.min() - 1)
     action = image.argmax(-1)
-    better = (best[:, 0] > level[states, policy]) | (image[states, action] > image[states, policy])
+    better = (best[:, 0] > rank[states, policy]) | (image[states, action] > image[states, policy])
     return np.where(chooser & better, action, policy)
 
 
@@ -268,16 +303,19 @@ def _taken_over(graph: _Graph, policy: Integers, v: _Biases, old: _Biases) -> _B
     """Biases of the environment's best answer that agree with old ones where these fit."""
     # They fit if no gain has changed. Then, on cycles of moves without slack, the bias is the old
     # one; elsewhere it exceeds v by the least sum of slack and excess on the way to such states.
-    if (v.gain != old.gain).any():
+    changed = (v.numerator != old.numerator) | (v.denominator != old.denominator)
+    if changed.any():
         return v
     states = np.arange(len(policy))
     own = graph.available & ~graph.system[:, None]
     own[states, policy] = True
-    own &= v.gain[graph.successor] == v.gain[:, None]
+    own &= v.rank[graph.successor] == v.rank[:, None]
     slack = _images(graph, v) - v.bias[:, None]
     critical = _on_cycles(graph.successor, own & (slack == 0))
-    slack = np.where(own, slack, np.inf)
-    lift = np.where(critical, old.bias - v.bias, np.inf)
+    lift = np.where(critical, old.bias - v.bias, 0)
+    far = np.abs(lift).max() + np.where(own, slack, 0).max() * len(states) + 1
+    lift = np.where(critical, lift, far)
+    slack = np.where(own, slack, 2 * far)
     while True:
         least = np.minimum(lift, (slack + lift[graph.successor]).min(-1))
         if (least == lift).all():
@@ -298,9 +336,9 @@ def _on_cycles(successor: Integers, used: Booleans) -> Booleans:
     return large
 
 
-def _as_floats(exact: Fractions, dtype: np.dtype[np.floating]) -> tuple[Floats, ...]:
+def _as_floats(exact: list[Fraction], dtype: np.dtype[np.floating]) -> tuple[Floats, ...]:
     """The nearest floats, and floats that enclose the exact numbers."""
-    value = exact.astype(float).astype(dtype)
+    value = np.array([float(x) for x in exact]).astype(dtype)
     lower, upper = value.copy(), value.copy()
     for i, x in enumerate(exact):
         if Fraction(float(value[i])) != x:
