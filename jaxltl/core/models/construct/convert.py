@@ -105,8 +105,9 @@ def product_rows(world: SparseMDP, model: Product, kept: np.ndarray | None = Non
         row_start = offsets_from_counts(np.bincount(owner, minlength=state.size))
     total = world.num_transitions * model.num_memory if kept is None else None
     entry_start, of, entry = _members(world.entry_start, row, total)
-    xp, owner, step, successor, probability = namespace(
-        owner[of], model.next_memory, world.successor, world.probability
+    arrays = world.successor, world.probability, world.label, world.action
+    xp, (successor, probability, label, action), owner, step, initial = namespace(
+        arrays, owner[of], model.next_memory, model.initial
     )
     s, q = xp.asarray(state)[owner], xp.asarray(memory)[owner]
     return SparseMDP(
@@ -114,10 +115,10 @@ def product_rows(world: SparseMDP, model: Product, kept: np.ndarray | None = Non
         entry_start=entry_start,
         successor=flat_successor(successor[entry], step, s, q, model.label_on).astype(np.int32),
         probability=probability[entry],
-        initial=model.initial.ravel(),
-        label=world.label[state],
+        initial=initial.ravel(),
+        label=label[state],
         rewards={name: x.gathered(state, row, entry) for name, x in world.rewards.items()},
-        action=None if world.action is None else world.action[row],
+        action=None if action is None else action[row],
     )
 
 
