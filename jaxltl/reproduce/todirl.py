@@ -162,36 +162,26 @@ def _learned(
     return row, {**name, "steps": steps, **_curve(curve), "worlds": worlds}
 
 
-class Bounds(NamedTuple):
-    """L_phi and half the width of its certified bounds, for each world."""
-
-    mean: np.ndarray
-    half_width: np.ndarray
-
-
-class Performance(NamedTuple):
-    """L_phi in the training worlds ``[N]`` and in the test worlds ``[N, M]``."""
-
-    train: Bounds
-    test: Bounds
+Performance = tuple[np.ndarray, np.ndarray]
 
 
 def _evaluated(
     setting: Setting, memory: Automaton, method: str, radius: int, parameters: PyTree
 ) -> Performance:
-    """The performance of each seed's parameters in its training world and in all test worlds."""
+    """L_phi and half the width of its bounds, of each seed's parameters.
+
+    In the seed's training world, ``float[2, N]``, and in all M test worlds, ``float[2, N, M]``.
+    """
     seeds = len(setting.train)
     own = _policies(
         method, parameters, _stacked(setting.train, memory), _observed(setting.train, radius)
     )
     new_models, new_seen = _stacked(setting.test, memory), _observed(setting.test, radius)
     new = _everywhere(method, parameters, new_models, new_seen)
-    return Performance(
+    flat = new.reshape(-1, *new.shape[2:])
+    return (
         _performance(setting, memory, setting.train, own),
-        jax.tree.map(
-            lambda x: x.reshape(seeds, -1),
-            _performance(setting, memory, setting.test * seeds, new.reshape(-1, *new.shape[2:])),
-        ),
+        _performance(setting, memory, setting.test * seeds, flat).reshape(2, seeds, -1),
     )
 
 
@@ -219,33 +209,29 @@ def _everywhere(method: str, parameters: PyTree, models: Product, seen: jax.Arra
 
 def _performance(
     setting: Setting, memory: Automaton, worlds: list[grid.World], policies: jax.Array
-) -> Bounds:
-    """L_phi of the complete task for policies with any memory."""
-    if memory is setting.task:
-        return _bounds(task_performances(_stacked(worlds, setting.task), policies))
-    both = synchronize(memory, setting.task)
-    return _bounds(
-        task_performances(_stacked(worlds, both), lift_memory_policy(policies, setting.task))
-    )
-
-
-def _bounds(found: Any) -> Bounds:
-    return Bounds(*(np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)))
+) -> np.ndarray:
+    """L_phi of the complete task and half the width of its bounds, for policies with any memory."""
+    models = _stacked(worlds, setting.task)
+    if memory is not setting.task:
+        models = _stacked(worlds, synchronize(memory, setting.task))
+        policies = lift_memory_policy(policies, setting.task)
+    found = task_performances(models, policies)
+    return np.stack([np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)])
 
 
 def _row(found: Performance, states: PyTree) -> Record:
-    each = found.test.mean.mean(1)
+    (train, train_width), (test, test_width) = found
     return {
-        "train_mean": found.train.mean.mean(),
-        "train_std": _deviation(found.train.mean),
-        "test_mean": each.mean(),
-        "test_std": _deviation(each),
-        "test_worst": found.test.mean.min(),
-        "test_of_each_seed": np.round(each, 5),
-        "test_worst_of_each_seed": np.round(found.test.mean.min(1), 5),
-        "seeds": len(each),
+        "train_mean": train.mean(),
+        "train_std": _deviation(train),
+        "test_mean": test.mean(1).mean(),
+        "test_std": _deviation(test.mean(1)),
+        "test_worst": test.min(),
+        "test_of_each_seed": np.round(test.mean(1), 5),
+        "test_worst_of_each_seed": np.round(test.min(1), 5),
+        "seeds": len(train),
         "steps": np.mean(states.best.step),
-        "half_width": max(found.train.half_width.max(), found.test.half_width.max()),
+        "half_width": max(train_width.max(), test_width.max()),
     }
 
 
@@ -255,8 +241,8 @@ def _deviation(x: np.ndarray) -> float:
 
 def _curve(points: list[Performance]) -> Record:
     curve: Record = {}
-    for part in ("train", "test"):
-        each = [getattr(j, part).mean.reshape(len(j.train.mean), -1).mean(1) for j in points]
+    for k, part in enumerate(("train", "test")):
+        each = [point[k][0].reshape(len(point[k][0]), -1).mean(1) for point in points]
         curve[f"{part}_mean"] = [x.mean() for x in each]
         curve[f"{part}_std"] = [_deviation(x) for x in each]
     return curve
@@ -284,22 +270,20 @@ def _references(setting: Setting) -> list[Record]:
     """L_phi of the expert and of the uniform policy."""
     rows = []
     for name in ("expert", "random"):
-        found = []
-        for worlds in (setting.train, setting.test):
-            models = _stacked(worlds, setting.task)
-            policies = jax.vmap(lambda m: grid.expert_policy(m, _DISCOUNT))(models)
-            if name == "random":
-                policies = jnp.full_like(policies, 1 / models.num_actions)
-            found.append(_bounds(task_performances(models, policies)).mean)
-        rows.append(
-            {
-                "policy": name,
-                "train_mean": found[0].mean(),
-                "test_mean": found[1].mean(),
-                "test_worst": found[1].min(),
-            }
+        train, test = (
+            _reference(setting, worlds, name) for worlds in (setting.train, setting.test)
         )
+        means = {"train_mean": train.mean(), "test_mean": test.mean(), "test_worst": test.min()}
+        rows.append({"policy": name, **means})
     return rows
+
+
+def _reference(setting: Setting, worlds: list[grid.World], name: str) -> np.ndarray:
+    models = _stacked(worlds, setting.task)
+    policies = jax.vmap(lambda m: grid.expert_policy(m, _DISCOUNT))(models)
+    if name == "random":
+        policies = jnp.full_like(policies, 1 / models.num_actions)
+    return np.asarray(task_performances(models, policies).mean, float)
 
 
 # --- table and pictures -------------------------------------------------------------------------
