@@ -18,6 +18,23 @@ AGAIN = (
     "Checkpoints are kept: start all processes again, in the same or another number, and the "
     "run resumes"
 )
+# Patterns of the runtime's last message, and what follows the process's number; the first match counts.
+_REASONS = (
+    (
+        "RegisterTask.*ALREADY_EXISTS|ALREADY_EXISTS.*RegisterTask",
+        ": another process has the same number; give each its own --process, from 0 to one less "
+        "than --processes.",
+    ),
+    (
+        "RegisterTask",
+        ": not all processes have joined in time; start as many as --processes says, all with the "
+        "same --coordinator, or give them longer by --wait.",
+    ),
+    (
+        "PollForError.*Failed to send RPC|Failed to send RPC.*PollForError|Socket closed",
+        f" stops: process 0, which coordinates the others, has ended. {AGAIN}.",
+    ),
+)
 _CHATTER = ("[Gloo] Rank ",)
 _WAIT = 1.0  # seconds for the rest of a message
 
@@ -31,20 +48,9 @@ def explain(text: str, process: int) -> str:
         names = re.findall(r"\d+", silent[1])
         who = f"process {names[0]} does" if len(names) == 1 else f"processes {', '.join(names)} do"
         return f"process {process} stops: {who} not respond. {AGAIN}."
-    if "RegisterTask" in text and "ALREADY_EXISTS" in text:
-        return (
-            f"process {process}: another process has the same number; give each its own "
-            "--process, from 0 to one less than --processes."
-        )
-    if "RegisterTask" in text:
-        return (
-            f"process {process}: not all processes have joined in time; start as many as "
-            "--processes says, all with the same --coordinator, or give them longer by --wait."
-        )
-    if ("PollForError" in text and "Failed to send RPC" in text) or "Socket closed" in text:
-        return (
-            f"process {process} stops: process 0, which coordinates the others, has ended. {AGAIN}."
-        )
+    for pattern, reason in _REASONS:
+        if re.search(pattern, text, re.DOTALL):
+            return f"process {process}{reason}"
     return f"process {process} stops: another process has ended. {AGAIN}."
 
 

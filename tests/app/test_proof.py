@@ -61,7 +61,7 @@ def test_bounds_are_printed_rounded_outward():
     entry |= {"initial_cells": 1, "how": {"surely": 1}, "seconds": {}, "counterexample": None}
     assert "at least 0.9999999 from" in proof.sentence(entry)
     assert "at most 1 from" in proof.sentence(entry)
-    assert proof.tiles(entry)[0][0] == "[0.9999999, 1]"
+    assert proof.bounds(entry) == ["0.9999999", "1"]
 
 
 def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from jaxltl.app.guarantee import left_out
 from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, plain, short_name
@@ -25,7 +24,6 @@ from jaxltl.app.reports.page import (
     certified,
     number,
     probability,
-    rounded_down,
 )
 from jaxltl.app.wording import Record, Result, many, place
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -53,52 +51,9 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
     ]
 
 
-def _likelihood(result: Result) -> str:
-    """The negative log-likelihood, infinite if a demonstrated step has probability 0."""
-    never = result["guarantee"].get("never")
-    return "infinite" if never else number(result["neg_log_likelihood"])
-
-
 def _all_equal(evidence: Result) -> bool:
     """True if all initial states have the same probability, to four places."""
     return probability(evidence["mean"]["value"]) == probability(evidence["minimum"]["value"])
-
-
-def _guaranteed(result: Result, form: str = "P >= {} ") -> str:
-    """The guarantee from a log as text; empty for other worlds."""
-    if (data := result.get("data")) is None:
-        return ""
-    return form.format(rounded_down(data["guaranteed"])) + (
-        f"with confidence {data['confidence']:g}, from "
-        f"{many(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
-    )
-
-
-def _tiles(result: Result) -> list[tuple[str, str]]:
-    learned, best = result["satisfaction"], result["best_achievable"]
-    training, data = result["training"], result.get("data")
-    by = "" if data is None else " by the log's frequencies"
-    ended = ("good", "converged") if training["converged"] else ("bad", "not converged")
-    least = learned["minimum"]
-    tiles = [
-        (
-            probability(learned["mean"]["value"]),
-            f"mean probability{by} over {many(learned['num_starts'], 'initial state')}",
-        ),
-        (probability(least["value"]), f"minimum, from {place(least)}"),
-        (probability(best["mean"]["value"]), f"maximal mean probability{by}"),
-        (
-            _likelihood(result),
-            Markup('negative log-likelihood; <span class="{}">{}</span> in {} steps').format(
-                *ended, training["steps"]
-            ),
-        ),
-    ]
-    if _all_equal(learned):
-        del tiles[1]
-    if data is not None:
-        tiles.insert(0, (rounded_down(data["guaranteed"]), _guaranteed(result, "guaranteed ")))
-    return tiles
 
 
 _MEANINGS = {
@@ -125,14 +80,20 @@ def _weights(result: Result) -> list[tuple[str, str, str]]:
 
 
 def _values(result: Result) -> Record:
-    evidence = _evidence(result)
+    evidence, data, from_log = _evidence(result), result.get("data"), ""
+    if data is not None:
+        from_log = (
+            f"with confidence {data['confidence']:g}, from "
+            f"{many(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
+        )
+    # The likelihood is 0 if a demonstrated step has probability 0.
+    never = result["guarantee"].get("never")
     return {
-        "tiles": _tiles(result),
         "evidence": evidence,
         "evidence_rows": [(f"{policy}, {kind}", *rest) for policy, kind, *rest in evidence],
         "weights": _weights(result),
-        "likelihood": _likelihood(result),
-        "guaranteed": _guaranteed(result),
+        "likelihood": "infinite" if never else number(result["neg_log_likelihood"]),
+        "from_log": from_log,
         "optimal": _OPTIMAL,
         "steps": steps,
     }

@@ -23,7 +23,8 @@ def _values(result: Result) -> Record:
     names = (*_PROBABILITIES, *_visits(result))
     seeds = result["seeds"]
     return {
-        "tiles": _tiles(result),
+        "tiles": [(name, *_numbers(name, found)) for name in (*names, "length")],
+        "bounds": proof.bounds(result.get("proof") or {}),
         "sentence": (
             f"{result['method']} in {world['name']}: {kind}, "
             f"{many(result['num_memory'], 'automaton state')}, "
@@ -57,18 +58,6 @@ def _numbers(name: str, found: Result) -> tuple[str, str]:
     if name in _PROBABILITIES:
         return probability(value), "[{:.4f}, {:.4f}]".format(*ends)
     return number(value), "[{}, {}]".format(*map(number, ends))
-
-
-def _tiles(result: Result) -> list[tuple[str, str]]:
-    length = "steps until the formula is decided or the episode ends"
-    titles = {**{x: x for x in _PROBABILITIES}, "visits": "accepting visits", "length": length}
-    rows = (
-        (title, *_numbers(name, result["evaluation"]))
-        for name, title in titles.items()
-        if name != "visits" or _visits(result)
-    )
-    tiles = [(value, f"{title}, in {interval}") for title, value, interval in rows]
-    return [*proof.tiles(result.get("proof") or {}), *tiles]
 
 
 report = Report("environment", _values)

@@ -85,34 +85,6 @@ def _how_it_ended(result: Result) -> str:
     )
 
 
-def _tiles(result: Result) -> list[tuple[str, str]]:
-    training, test, learning = result["training"], result["test"], result["learning"]
-    tiles = []
-    if test:
-        one = test["learned"]
-        counted = f"{_number_of_worlds(test)} test worlds"
-        tiles += [
-            (probability(one["mean"]["value"]), f"mean probability in {counted}"),
-            (
-                probability(one["worst_world"]["value"]),
-                f"in the worst test world, {one['worst_world']['name']}",
-            ),
-        ]
-    held_out = learning["held_out"]
-    kind = "loss" if held_out is None else "negative log-likelihood of a held-out pair"
-    return [
-        *tiles,
-        (
-            probability(training["learned"]["mean"]["value"]),
-            f"mean probability in {many(training['num_counted'], 'training world')}",
-        ),
-        (
-            number(learning["loss"] if held_out is None else held_out),
-            f"{kind}; {_how_it_ended(result)}",
-        ),
-    ]
-
-
 def _evidence(result: Result) -> list[tuple[str, ...]]:
     return [
         (
@@ -139,7 +111,6 @@ def _values(result: Result) -> Record:
     return {
         "sentence": _sentence(result),
         "within": _within(result),
-        "tiles": _tiles(result),
         "evidence": _evidence(result),
         "steps": steps,
         "expert": _EXPERT[result["expert"]],

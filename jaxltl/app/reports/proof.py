@@ -52,25 +52,14 @@ def sentence(proof: Result) -> str:
     """The certified bounds of an entry, in lines, or the reason for which there is no proof."""
     if "reason" in proof:
         return f"no proof: {proof['reason']}"
-    lower, upper = _bounds(proof)
-    return render("jaxltl.app.reports", "proof.txt", proof=proof, lower=lower, upper=upper).rstrip(
-        "\n"
-    )
+    text = render("jaxltl.app.reports", "proof.txt", proof=proof, bounds=bounds(proof))
+    return text.rstrip("\n")
 
 
-def tiles(proof: Result) -> list[tuple[str, str]]:
-    """The bounds of an entry with their meaning, if it has bounds."""
-    if "lower" not in proof:
-        return []
-    lower, upper = _bounds(proof)
-    return [(f"[{lower}, {upper}]", "certified bounds of the worst initial state")]
-
-
-def _bounds(proof: Result) -> tuple[str, str]:
-    return (
-        rounded_outward(proof["lower"], False, _DIGITS),
-        rounded_outward(proof["upper"], True, _DIGITS),
-    )
+def bounds(proof: Result) -> list[str]:
+    """The certified bounds of an entry, rounded outward, if it has bounds."""
+    ends = (("lower", False), ("upper", True))
+    return [rounded_outward(proof[name], up, _DIGITS) for name, up in ends if name in proof]
 
 
 def picture(proof: Proof, dynamics: Dynamics, episodes: Sequence[Episode]) -> Picture:

@@ -109,7 +109,6 @@ def report_of(found: Synthesis) -> Report:
             "verdict": verdict(result),
             "confirmed": is_confirmed(result),
             "play": describe_play(found),
-            "tiles": _tiles(result),
             "title": result["game"],
             "formula": result["task"],
             "file_title": "Game file",
@@ -369,23 +368,6 @@ def write(found: Synthesis, out: Path, place: int | None, seconds: float) -> Res
     result = summary(found, seconds)
     write_results(out / "game.toml", report_of(found), result, parts, shown)
     return result
-
-
-def _tiles(result: Result) -> list[tuple[str, str]]:
-    region, strategy = result["region"], result["strategy"]
-    tiles = [
-        (
-            f"{region['initial_states']} of {region['num_initial_states']}",
-            "initial states from which the system wins",
-        )
-    ]
-    if strategy:
-        kind = "all winning ones" if strategy["maximal"] else "not all winning ones"
-        tiles += [
-            (str(strategy["num_states"]), "states of the game under the strategy"),
-            (str(strategy["num_system_moves"]), f"moves allowed to the system, {kind}"),
-        ]
-    return tiles
 
 
 def play_explorer(found: Synthesis) -> Explorer:
