@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable
 from typing import NamedTuple, TypeVar
 
@@ -73,22 +74,53 @@ def reachable(table: Table) -> tuple[Table, Integers]:
 
 
 def quotient(table: Table) -> tuple[Table, Integers]:
-    """Reachable states, merged where every word reads the same priorities (Moore 1956).
+    """Reachable states, merged where every word reads the same priorities.
 
     The minimal table, numbered breadth first, and a state of each class.
     """
     (delta, priority, _), old = reachable(table)
     columns, _ = distinct_columns(delta)
-    _, block = np.unique(priority, axis=0, return_inverse=True)
-    count = 0
-    while count < block.max() + 1 < len(delta):
-        count = block.max() + 1
-        signature = np.column_stack([block.ravel(), block.ravel()[delta[:, columns]]])
-        _, block = np.unique(signature, axis=0, return_inverse=True)
-    block = block.ravel()
+    _, output = np.unique(priority, axis=0, return_inverse=True)
+    block = coarsest_partition(delta[:, columns], output.ravel())
     _, first = np.unique(block, return_index=True)
     small, order = reachable(Table(block[delta[first]], priority[first], int(block[0])))
     return small, old[first[order]]
+
+
+def coarsest_partition(delta: Integers, output: Integers) -> Integers:
+    """Blocks of states with equal outputs on every word, ``int[Q]``.
+
+    Refinement by the smaller half of a split block, which takes O(L Q log Q) (Hopcroft 1971).
+    """
+    before: list[list[list[int]]] = [[[] for _ in delta] for _ in delta.T]
+    for state, row in enumerate(delta.tolist()):
+        for letter, successor in enumerate(row):
+            before[letter][successor].append(state)
+    block_of = output.tolist()
+    members: list[set[int]] = [set() for _ in range(max(block_of) + 1)]
+    for state, block in enumerate(block_of):
+        members[block].add(state)
+    waiting = list(range(len(members)))
+    while waiting:
+        splitter = list(members[waiting.pop()])
+        for sources in before:
+            hit: defaultdict[int, set[int]] = defaultdict(set)
+            for state in splitter:
+                for source in sources[state]:
+                    hit[block_of[source]].add(source)
+            for block, inside in hit.items():
+                whole = members[block]
+                if len(inside) == len(whole):
+                    continue
+                # The smaller half gets the new number, so that a state is renumbered O(log Q)
+                # times; the larger half stays in `waiting` if the block was there.
+                smaller = inside if 2 * len(inside) <= len(whole) else whole - inside
+                whole -= smaller
+                for state in smaller:
+                    block_of[state] = len(members)
+                waiting.append(len(members))
+                members.append(smaller)
+    return np.array(block_of)
 
 
 def components(table: Table) -> Integers:

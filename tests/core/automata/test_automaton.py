@@ -157,6 +157,14 @@ def test_minimal_tables_do_not_depend_on_the_numbering():
         assert left.initial == right.initial == 0
 
 
+def test_minimize_is_quick_on_a_long_chain():
+    n = 20_000
+    delta = np.minimum(np.arange(n) + 1, n - 1)[:, None].repeat(2, axis=1)
+    final = np.arange(n) == n - 1
+    automaton = make_automaton(delta, 0, [[False], [True]], ["a"], final=final, acceptance="cosafe")
+    assert len(minimize(automaton).delta) == n
+
+
 def test_complement_accepts_the_other_words():
     rng = random.Random(32)
     for _ in range(200):
