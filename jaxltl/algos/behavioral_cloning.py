@@ -1,4 +1,4 @@
-"""Behavioral cloning conditioned on the automaton state (dissertation, section 3.5).
+"""Behavioral cloning conditioned on the automaton state (Wen 2019, section 3.5).
 
 A network classifies the demonstrated action by a local observation and the state of the task's
 automaton. It uses no model of the world.

@@ -1,4 +1,4 @@
-"""Q-learning for two-player games with unknown rewards (dissertation, section 5.4.2).
+"""Q-learning for two-player games with unknown rewards (Wen 2019, section 5.4.2).
 
 The system maximises and the environment minimises the discounted reward; both choose among the
 actions that a mask allows, such as a permissive strategy's. Parallel chains share one table.

@@ -1,4 +1,4 @@
-"""Task-oriented deep inverse RL (dissertation, chapter 3).
+"""Task-oriented deep inverse RL (Wen 2019, chapter 3).
 
 Maximum-entropy inverse RL with a reward network that reads a local observation, the state of the
 task's automaton, and the action: find parameters for which the soft policy of the product makes

@@ -19,7 +19,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
 from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.environment_source import load_environment, load_world
+from jaxltl.app.environment_loading import load_environment, load_world
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import proof as proofs
 from jaxltl.app.reports.learn_environment import report as report

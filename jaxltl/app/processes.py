@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from jaxltl.app import exit_message
+from jaxltl.app import distributed_errors
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
@@ -217,8 +217,8 @@ def process_group(
     except Exception as error:
         if not is_loss(error):
             raise
-        line = f"process {launch.process} stops: another process has ended. {exit_message.AGAIN}."
-        os.write(2, f"{exit_message.END}{line}\n".encode())
+        line = f"process {launch.process} stops: another process has ended. {distributed_errors.AGAIN}."
+        os.write(2, f"{distributed_errors.END}{line}\n".encode())
         raise SystemExit(LOST) from None
     import jax
 
@@ -358,7 +358,7 @@ def _read_apart(launch: Launch) -> None:
     out, err = os.dup(1), os.dup(2)
     source, sink = os.pipe()
     subprocess.Popen(
-        [sys.executable, "-I", "-S", str(Path(exit_message.__file__)), str(launch.process)],
+        [sys.executable, "-I", "-S", str(Path(distributed_errors.__file__)), str(launch.process)],
         stdin=source,
         stdout=err,
         stderr=err,

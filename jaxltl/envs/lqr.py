@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator with bounded controls (dissertation, section 4.5.1).
+"""The linear-quadratic regulator with bounded controls (Wen 2019, section 4.5.1).
 
 ``x_(t+1) = A x_t + B u_t``; the cost ``J = sum_t x_(t+1)' Q x_(t+1) + u_t' R u_t`` is minimised
 subject to ``low <= u_t <= high``. The policy is a network that reads the state.

@@ -1,4 +1,4 @@
-"""Navigation of a robot with local sensors to a goal (dissertation, section 4.5.2).
+"""Robot navigation with point sensors: four constrained tasks (Wen 2019, section 4.5.2).
 
 The state is ``(x, y, heading)``, the action a speed and a turn: a step moves by
 ``speed * time_step`` along the heading, up to the bounds of the map, and then turns. Obstacles do

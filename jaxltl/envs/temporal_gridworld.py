@@ -1,4 +1,4 @@
-"""Coloured gridworlds with objects to visit in a given order (dissertation, section 3.5).
+"""Coloured gridworlds with objects to visit in a given order (Wen 2019, section 3.5).
 
 The colours of the 3 x 3 patch around a cell determine its kind: an object, an obstacle, or a
 distractor. Cells are ``(row, column)`` from 1 at the top left, with state

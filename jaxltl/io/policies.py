@@ -1,4 +1,4 @@
-"""Reading and writing of policy files; tabular policies need no JAX."""
+"""Policy files: reading (of tables with NumPy alone), writing, and export as C code."""
 
 from __future__ import annotations
 

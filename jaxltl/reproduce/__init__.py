@@ -1,4 +1,4 @@
-"""Experiments of the dissertation: measured results compared with the published ones.
+"""Experiments of Wen (2019): measured results compared with the published ones.
 
 One module for each experiment: ``measure(progress)`` returns the measured values, with ``seeds`` where
 learning is repeated; ``table(result)`` is the report, and ``pictures(result)`` are drawings by name. Run in

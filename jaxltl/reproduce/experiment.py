@@ -1,4 +1,4 @@
-"""Parts that several experiments of the dissertation share."""
+"""Parts that several experiments of Wen (2019) share."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos.common import checkpoint
-from jaxltl.app.exit_message import explain
+from jaxltl.app.distributed_errors import explain
 from jaxltl.app.processes import DeviceOptions, Launch, ProcessGroup, launched
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.discounted.soft import soft_value

@@ -1,4 +1,4 @@
-"""The constrained cross-entropy method (dissertation, chapter 4, algorithm 2).
+"""The constrained cross-entropy method (Wen 2019, chapter 4, algorithm 2).
 
 A policy is a vector of parameters with ``evaluate(parameters, key) -> (objective, cost)``: an
 objective to maximise, and costs that are feasible up to limits. Policies are sampled from a natural

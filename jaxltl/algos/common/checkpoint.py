@@ -1,4 +1,4 @@
-"""Checkpoints: a learner's state in a file, written atomically and read bit for bit.
+"""Training checkpoints: atomic, bit for bit, in parts of a mesh, refused for another problem.
 
 A fingerprint of the problem and of the hyperparameters is stored with it: shape, dtype and hash of
 every array, and every static field. A checkpoint of another problem is refused even if shapes

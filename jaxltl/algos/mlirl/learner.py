@@ -1,4 +1,4 @@
-"""Maximum-likelihood inverse RL with temporal-logic side information (dissertation, chapter 2).
+"""Maximum-likelihood inverse RL with temporal-logic side information (Wen 2019, chapter 2).
 
 Given demonstrations, find a reward with a softmax policy that maximises their likelihood (2.4), in the
 world or in its product with a task, plus ``mu`` times the probability that the policy satisfies the

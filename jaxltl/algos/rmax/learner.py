@@ -1,4 +1,4 @@
-"""R-max in the almost-sure winning region of a stochastic game (dissertation, chapter 6).
+"""R-max in the almost-sure winning region of a stochastic game (Wen 2019, chapter 6).
 
 Algorithm 5: PAC learning of an epsilon-optimal strategy among those that satisfy a Buchi objective
 almost surely, in a turn-based game with a known graph and unknown probabilities and rewards

@@ -1,4 +1,4 @@
-"""Task files of learning in environments by PPO, constrained cross-entropy or CPO.
+"""Schema of task files of PPO, constrained cross-entropy or CPO in environments.
 
 Tables ``[world]``, with ``[world.arguments]``, ``[task]``, ``[learner]``, one of the method's name
 for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` shows them.

@@ -1,4 +1,4 @@
-"""Task files with a table ``[grounding]``: formulas over symbols of unknown meaning."""
+"""Schema of task files with a table ``[grounding]``: formulas over symbols of unknown meaning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task files with ``method = "mlirl"``: maximum-likelihood inverse reinforcement learning.
+"""Schema of task files of maximum-likelihood inverse reinforcement learning (``"mlirl"``).
 
 A task file is TOML with the tables ``[world]``, ``[task]``, ``[demonstrations]`` and
 ``[learner]``; ``examples/two_goals.toml`` shows every key. Names of files are relative to it.

@@ -1,4 +1,4 @@
-"""Task files with ``method = "todirl"``: rewards that transfer to other worlds.
+"""Schema of task files of task-oriented inverse reinforcement learning (``"todirl"``).
 
 Table ``[test]`` has the worlds in which the learned reward is evaluated; see
 ``examples/in_order.toml``. Worlds are coloured grids (:func:`jaxltl.io.colored_world.read_world`)

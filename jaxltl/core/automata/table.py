@@ -1,4 +1,4 @@
-"""Automata as integer tables: breadth-first search, equal letters and equal states."""
+"""Parity automata as integer tables: breadth-first search, equal letters and equal states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Permissive strategies: masks of moves of which every choice wins (dissertation, 5.4.1)."""
+"""Permissive strategies: masks of moves of which every choice wins (Wen 2019, 5.4.1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lazy products of a model and an automaton.
+"""Implicit products of a model and an automaton: all pairs [S, Q], with transitions not stored.
 
 A value on the product has the shape ``[S, Q]``; the automaton determines the memory state at which
 the value of a successor is read.

@@ -21,7 +21,7 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
 from jaxltl.core.programs.initial import initial_states
-from jaxltl.core.programs.layout import Layout, Reader, Words, make_layout
+from jaxltl.core.programs.bit_layout import Layout, Reader, Words, make_layout
 from jaxltl.core.programs.local_choices import state_text
 from jaxltl.core.programs.weights import Functions, Intervals, Numbers, Weight
 from jaxltl.core.sparse.rows import offsets_from_counts

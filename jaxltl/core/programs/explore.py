@@ -13,9 +13,9 @@ from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.hash_table import HashTable
-from jaxltl.core.programs.layout import Layout, Words
+from jaxltl.core.programs.bit_layout import Layout, Words
 from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
-from jaxltl.core.programs.narrow import search_narrow
+from jaxltl.core.programs.scalar_search import search_narrow
 from jaxltl.core.programs.symmetry import Orbit
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.language.expressions import SCALAR, Expression
 from jaxltl.core.language.syntax import Command, Module, Variable
-from jaxltl.core.programs.layout import Layout
+from jaxltl.core.programs.bit_layout import Layout
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
 
 # Joint updates of a state as (difference of the packed state, probability).

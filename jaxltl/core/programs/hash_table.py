@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.programs.layout import Words
+from jaxltl.core.programs.bit_layout import Words
 
 # Odd multipliers of multiplicative hashing (Fibonacci hashing and splitmix64).
 _FACTORS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93)

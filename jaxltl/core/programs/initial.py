@@ -11,7 +11,7 @@ from jaxltl.core.language.compiled import compile_expressions
 from jaxltl.core.language.expressions import conjuncts, names_in
 from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.programs.layout import Layout, Words
+from jaxltl.core.programs.bit_layout import Layout, Words
 
 _CANDIDATES = 2**24  # partial assignments that are held at once
 

@@ -17,7 +17,7 @@ from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import Command, Module, Program
 from jaxltl.core.programs.generated import fixed_probabilities, may_leave
 from jaxltl.core.programs.hash_table import HashTable
-from jaxltl.core.programs.layout import Field, Layout, Reader, Words
+from jaxltl.core.programs.bit_layout import Field, Layout, Reader, Words
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
 

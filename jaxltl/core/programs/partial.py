@@ -23,7 +23,7 @@ from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
 from jaxltl.core.programs.explore import Search
 from jaxltl.core.programs.initial import initial_states
-from jaxltl.core.programs.layout import Reader, make_layout
+from jaxltl.core.programs.bit_layout import Reader, make_layout
 from jaxltl.core.programs.symmetry import find_orbits
 from jaxltl.core.programs.weights import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts

@@ -11,7 +11,7 @@ from jaxltl.core.array_types import Integers
 from jaxltl.core.language.compiled import compile_expressions
 from jaxltl.core.language.expressions import Expression, literal, names_in, substitute
 from jaxltl.core.language.syntax import Command
-from jaxltl.core.programs.layout import Reader
+from jaxltl.core.programs.bit_layout import Reader
 
 Weight = NDArray[Any]  # float64[N]; float64[N, 2] of intervals; int64[N], numbers of functions
 

@@ -21,7 +21,7 @@ from jaxltl.core.sparse.interval.row_operator import PolicyPair, RowOperator
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.linear.system_sequence import SystemSequence
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270

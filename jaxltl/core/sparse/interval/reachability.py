@@ -37,7 +37,7 @@ from jaxltl.core.sparse.interval.strategy_iteration import (
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as mdp_reachability
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
 METHOD = "policy iteration with nature"
 _STARTS = 60  # improvements by value iteration before strategy iteration

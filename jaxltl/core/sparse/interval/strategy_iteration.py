@@ -22,7 +22,7 @@ from jaxltl.core.sparse.interval.robust_values import (
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
 _ROUNDS = 100
 

@@ -25,7 +25,7 @@ from jaxltl.core.sparse.graph.qualitative import (
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import first_hits
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
-from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100

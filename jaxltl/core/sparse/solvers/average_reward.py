@@ -34,7 +34,7 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.reachability import quotient_policy
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
-from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 _LAZY = 0.5  # the step of value iteration: with self-loops no chain is periodic

@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.reachability import solve_shortest_path
-from jaxltl.core.sparse.solvers.total_cost import Enclosure, ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -1,4 +1,4 @@
-"""Reachability on a large padded product, one component of the automaton at a time.
+"""Bounds of reachability on a large padded product, one component of the automaton at a time.
 
 The strongly connected components of the automaton (most of them single states) are left for good in
 topological order. From the last one on, each is a reachability problem on the model alone, in which
@@ -31,7 +31,7 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.reachability import expands_fast, quotient_policy
-from jaxltl.core.sparse.solvers.total_cost import TINY
+from jaxltl.core.sparse.solvers.shortest_path_problem import TINY
 
 _EPS = float(np.finfo(np.float64).eps)
 _STARTS = 8  # states from one of which few steps

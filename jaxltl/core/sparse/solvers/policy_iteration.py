@@ -42,7 +42,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     topological_levels,
 )
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
-from jaxltl.core.sparse.solvers.total_cost import (
+from jaxltl.core.sparse.solvers.shortest_path_problem import (
     TINY,
     Enclosure,
     InteriorRows,

@@ -32,7 +32,7 @@ from jaxltl.core.sparse.linear.gauss_seidel import (
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import group_starts, row_entries
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
-from jaxltl.core.sparse.solvers.total_cost import TINY, Enclosure, Relative, ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import TINY, Enclosure, Relative, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 # A model mixes well, so that sweeps beat elimination, if a search meets many states in few steps.

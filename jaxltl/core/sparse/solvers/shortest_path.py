@@ -1,4 +1,4 @@
-"""Stochastic shortest paths (Bertsekas and Tsitsiklis 1991): least expected steps until a goal."""
+"""Least expected steps until a goal, and rows that attain them (Bertsekas and Tsitsiklis 1991)."""
 
 from __future__ import annotations
 

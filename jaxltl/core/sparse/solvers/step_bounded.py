@@ -19,7 +19,7 @@ from jaxltl.core.sparse.choice_order import Choices, choices_of
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, row_entries, sorted_unique
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.discounted import discounted_value
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status, row_tolerance
 from jaxltl.core.values.engine.state_quantities import finite_reward
 

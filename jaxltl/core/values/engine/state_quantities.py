@@ -13,7 +13,7 @@ from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.solvers.average_reward import AverageReward
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status, require_states
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative

@@ -1,4 +1,4 @@
-"""Certified optimality gap of an agent in a finite environment."""
+"""Certified optimality gaps: optimal less achieved satisfaction probability, by tabulation."""
 
 from __future__ import annotations
 

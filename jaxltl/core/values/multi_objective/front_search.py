@@ -23,7 +23,7 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import (
     weighted_optimum,
 )
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Status
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem

@@ -12,7 +12,7 @@ from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.sparse.solvers.total_cost import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties.answers import Answer
 

@@ -36,7 +36,7 @@ from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_pro
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Reward, SparseMDP
-from jaxltl.core.sparse.solvers.total_cost import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
 from jaxltl.core.types import Solution, Status
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array

@@ -27,7 +27,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
-from jaxltl.core.sparse.solvers.total_cost import Enclosure, Relative, as_width
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, Relative, as_width
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_states
 from jaxltl.core.values.engine.state_quantities import reduction_for

@@ -26,7 +26,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.average_reward import AverageReward, average
 from jaxltl.core.sparse.solvers.shortest_path import with_exits
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import Chain, induced_chain, status_between
 from jaxltl.core.values.engine.state_quantities import safe_ends

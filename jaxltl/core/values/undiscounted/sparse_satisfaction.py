@@ -23,7 +23,7 @@ from jaxltl.core.pretty_print import brief, count, nested_repr
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import reachability
-from jaxltl.core.sparse.solvers.total_cost import Relative, as_width
+from jaxltl.core.sparse.solvers.shortest_path_problem import Relative, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (

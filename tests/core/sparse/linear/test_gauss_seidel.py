@@ -8,7 +8,7 @@ from jaxltl.core.sparse.linear import gauss_seidel as relaxation
 from jaxltl.core.sparse.solvers import discounted
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
-from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import ShortestPathProblem
 from tests.sparse_models import random_sparse
 
 

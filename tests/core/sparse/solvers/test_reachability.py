@@ -13,7 +13,7 @@ from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import policy_iteration as transient
 from jaxltl.core.sparse.solvers.reachability import reachability, total_reward
-from jaxltl.core.sparse.solvers.total_cost import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
 
 
 def random_model(rng, num_states, most_choices=3):

@@ -1,4 +1,4 @@
-"""Figures with a text alternative for notebooks and pages."""
+"""Matplotlib figures with a text alternative in notebooks, and an optional HTML animation."""
 
 from __future__ import annotations
 

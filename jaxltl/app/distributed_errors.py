@@ -1,4 +1,4 @@
-"""Reports in one line why the JAX runtime ended a process.
+"""Failures of JAX's distributed runtime in one line, by a second process that watches the first.
 
 Runs as another program, with the process's number as argument and its error output as standard
 input, since the runtime ends its process at once. Imports nothing of the package.

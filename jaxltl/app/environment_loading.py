@@ -1,4 +1,4 @@
-"""Environments that task files name, by importing and calling their functions."""
+"""Environments of task files: built-in ones, adapters of other packages, and user functions."""
 
 from __future__ import annotations
 

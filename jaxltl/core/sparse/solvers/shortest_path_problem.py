@@ -1,4 +1,4 @@
-"""Stochastic shortest path problems on sparse rows, and their solution in topological order."""
+"""Stochastic shortest path problems: their data, and backward induction on acyclic states."""
 
 from __future__ import annotations
 

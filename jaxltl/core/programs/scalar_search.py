@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.generated import Local, Unsupported, Updates, generate
-from jaxltl.core.programs.layout import Layout, Words
+from jaxltl.core.programs.bit_layout import Layout, Words
 from jaxltl.core.programs.local_choices import ModuleCode
 
 # States of a level from which arrays are faster, by command and in all (benchmarks/programs.py).
