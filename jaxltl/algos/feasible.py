@@ -63,7 +63,7 @@ from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status, require_states
 from jaxltl.core.validation import Range
 from jaxltl.core.values.engine.state_quantities import safe_ends
-from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.interval.robust import requested_width
 from jaxltl.core.values.prepared.prepared import (
     Prepared,
     evaluate_prepared,
@@ -236,7 +236,7 @@ def certify(
       ValueError: the point is outside of the box, or the functions give no model there.
     """
     require_problem(problem)
-    return _bounds(problem, problem.model.at(parameters), width_asked(tolerance))
+    return _bounds(problem, problem.model.at(parameters), requested_width(tolerance))
 
 
 def _bounds(problem: Problem, model: SparseMDP, tolerance: float) -> tuple[float, float]:

@@ -105,20 +105,20 @@ class SequenceNetwork(nn.Module):
         world, (reach, avoid, length) = observation
         kind = jnp.result_type(float)
         depth = reach.shape[0]
-        asked = jnp.stack([reach, avoid]).astype(kind)
+        sets = jnp.stack([reach, avoid]).astype(kind)
         ahead = (jnp.arange(depth) < length).astype(kind)
         parts = []
         if self.by_name or self.events_seen is None:
-            rows = jnp.concatenate([asked[0], asked[1]], -1)
+            rows = jnp.concatenate([sets[0], sets[1]], -1)
             layer = nn.Dense(self.embedding, param_dtype=kind, name="events")
             parts += [flat_observation(world), jnp.ravel(nn.relu(layer(rows)) * ahead[:, None])]
         if self.events_seen is not None:
             seen = self.events_seen(world)
             seen = seen.reshape(-1, seen.shape[-1]).astype(kind)
-            told = asked[:, : self.detailed]
+            first_sets = sets[:, : self.detailed]
             parts += [
-                jnp.ravel(seen @ told.reshape(-1, told.shape[-1]).T),
-                jnp.ravel(asked.mean(-1)),
+                jnp.ravel(seen @ first_sets.reshape(-1, first_sets.shape[-1]).T),
+                jnp.ravel(sets.mean(-1)),
             ]
         x = jnp.concatenate([*parts, ahead])
         for i, width in enumerate(self.hidden):

@@ -35,7 +35,7 @@ _KEPT = 3  # policies that are compared after mixing for the expected steps
 class Guarantee:
     """An asked guarantee, and the optimal actions."""
 
-    asked: str | float  # "best", "none" or a probability
+    requested: str | float  # "best", "none" or a probability
     over: str  # initial states of an asked probability, their "mean" or the "worst"
     best: Solution  # the maximal satisfaction probability
     actions: OptimalActions | None  # the optimal actions; None without a guarantee
@@ -55,7 +55,9 @@ class Guarantee:
     @property
     def allowed(self) -> np.ndarray | None:
         """``bool[S, Q, A]``, the actions to choose from; None for all."""
-        return np.asarray(self.actions.allowed) if self.asked == "best" and self.actions else None
+        return (
+            np.asarray(self.actions.allowed) if self.requested == "best" and self.actions else None
+        )
 
 
 def ask(
@@ -63,25 +65,25 @@ def ask(
     world: World,
     shown: Trajectories,
     best: Solution,
-    asked: str | float,
+    requested: str | float,
     over: str = "mean",
 ) -> Guarantee:
     """Guarantee for a product, as the task file requests it."""
     nothing = np.zeros(np.shape(shown.state), bool)
-    if asked == "none":
+    if requested == "none":
         used = used_steps(model, best, nothing, shown)
-        return Guarantee(asked, over, best, None, nothing, None, used=used)
-    if not isinstance(asked, str):
-        require_attainable(model, best, asked, over, world.place)
-        if asked == 1:  # attained by optimal policies alone
-            asked = "best"
+        return Guarantee(requested, over, best, None, nothing, None, used=used)
+    if not isinstance(requested, str):
+        require_attainable(model, best, requested, over, world.place)
+        if requested == 1:  # attained by optimal policies alone
+            requested = "best"
     actions = optimal_actions(model, best)
     lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
-    used = used_steps(model, best, lost if isinstance(asked, str) else nothing, shown)
+    used = used_steps(model, best, lost if isinstance(requested, str) else nothing, shown)
     lost_use = (lost & (np.arange(lost.shape[1]) < used[:, None])).sum(1)
     useless = np.flatnonzero((used > 0) & (lost_use == used))
-    if not isinstance(asked, str):
-        return Guarantee(asked, over, best, actions, nothing, None, not useless.size, used)
+    if not isinstance(requested, str):
+        return Guarantee(requested, over, best, actions, nothing, None, not useless.size, used)
     if useless.size:
         n, count = useless[0], int(lost_use[useless[0]])
         first = "its first step" if shown.length[n] > 1 else "its only step"
@@ -90,7 +92,7 @@ def ask(
             f"demonstration {n + 1}: {what} lowers the best probability of satisfying the formula, "
             'so that none is left to learn from; leave it out, or write guarantee = "none".'
         )
-    return Guarantee(asked, over, best, actions, lost, cost, used=used)
+    return Guarantee(requested, over, best, actions, lost, cost, used=used)
 
 
 def used_steps(
@@ -173,8 +175,8 @@ def kept(
     solution: Solution,
 ) -> Record:
     """The guarantee and how it was attained, for ``result.json``."""
-    found: Record = {"asked": guarantee.asked, "over": guarantee.over}
-    if guarantee.asked == "best" and guarantee.actions is not None:
+    found: Record = {"asked": guarantee.requested, "over": guarantee.over}
+    if guarantee.requested == "best" and guarantee.actions is not None:
         found["loss"] = guarantee.actions.loss
     if attempt is not None:
         found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
@@ -196,7 +198,7 @@ def kept(
             "to": after,
             **world.where(int(np.asarray(shown.state)[n, t])),
         }
-    if guarantee.asked == "none":
+    if guarantee.requested == "none":
         missing = at_starts(model, np.subtract(guarantee.best.value, solution.value), "mean")[0]
         if missing > 1e-3:  # the guarantee of the remedy
             sure = optimal_actions(model, guarantee.best).attained
@@ -250,17 +252,17 @@ class Search(Generic[Learned]):
         Where no reward attains the probability, a policy is mixed with the likeliest or with the
         quickest one of optimal actions.
         """
-        asked = float(self.guarantee.asked)
+        requested = float(self.guarantee.requested)
         first = self._attempt(free, 0.0)
-        if first.attained >= asked:
+        if first.attained >= requested:
             return first
         more = self.constrained() if is_weighable(self.model) else []
         tried = [first, *(self._attempt(learned, weight) for learned, weight in more)]
-        found = [one for one in tried if one.attained >= asked]
+        found = [one for one in tried if one.attained >= requested]
         quickest = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
         # A learned policy that delays satisfaction leaves no share for other actions.
         for sure in (policy, quickest.astype(float)):
-            found += [self._mixed(one, sure, inside) for one in tried if one.attained < asked]
+            found += [self._mixed(one, sure, inside) for one in tried if one.attained < requested]
         likeliest = sorted(found, key=lambda one: one.neg_log_likelihood)[:_KEPT]
         return min(likeliest, key=lambda one: self._loss(self.within_steps(one.policy)))
 
@@ -268,14 +270,14 @@ class Search(Generic[Learned]):
         return neg_log_likelihood(policy, self.counts)
 
     def _attempt(self, learned: Learned, weight: float) -> Attempt:
-        policy, asked = self.policy_of(learned), float(self.guarantee.asked)
-        reached = attained_if_near(self.model, policy, self.guarantee.over, asked)
+        policy, requested = self.policy_of(learned), float(self.guarantee.requested)
+        reached = attained_if_near(self.model, policy, self.guarantee.over, requested)
         return Attempt(policy, self._loss(policy), reached, weight, 0.0, learned)
 
     def _mixed(self, below: Attempt, sure: np.ndarray, inside: Learned) -> Attempt:
         """The mixture with the least share of a policy of optimal actions."""
-        asked, over = float(self.guarantee.asked), self.guarantee.over
-        found = probable_mixture(self.model, below.policy, sure, asked, over)
+        requested, over = float(self.guarantee.requested), self.guarantee.over
+        found = probable_mixture(self.model, below.policy, sure, requested, over)
         return Attempt(
             found.policy, self._loss(found.policy), found.attained, None, found.share, inside
         )

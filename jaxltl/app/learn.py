@@ -147,7 +147,7 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
     """Learning under the guarantee: all seeds, the kept one, and how a probability is attained."""
     guarantee, problem = setup.guarantee, setup.problem
     hparams = settings(mlirl.Hparams, setup.task.learner.given())
-    if isinstance(guarantee.asked, str):
+    if isinstance(guarantee.requested, str):
         learned = _train(setup, problem, hparams, training)
         return learned, _least_loss(learned), None
     actions, again = guarantee.actions, Training(training.seed, 1)
@@ -185,7 +185,7 @@ def _constrained(
 ) -> list[tuple[Learned, float]]:
     """The most likely results at and below the required probability, and their weights mu."""
     guarantee, problem = setup.guarantee, setup.problem
-    required, soft = float(guarantee.asked), FullSupport(setup.model, guarantee.over)
+    required, soft = float(guarantee.requested), FullSupport(setup.model, guarantee.over)
     value = jnp.zeros(setup.model.state_shape, setup.model.dtype)
 
     def evaluate(parameters: np.ndarray) -> Point:
@@ -322,7 +322,7 @@ class Setup:
                 model.mdp, shown, goal=table.goal or (), progress=table.progress_labels, avoid=avoid
             )
         # Without a guarantee, those of the dissertation's Table 1 alone.
-        best = None if self.guarantee.asked == "none" else self.guarantee.best
+        best = None if self.guarantee.requested == "none" else self.guarantee.best
         return mlirl.task_features(
             model, shown, avoid=avoid, progress=table.progress_states, best=best
         )
@@ -331,7 +331,7 @@ class Setup:
     def problem(self) -> mlirl.Problem:
         """The learning problem under the guarantee."""
         allowed = self.guarantee.allowed
-        if not isinstance(self.guarantee.asked, str):
+        if not isinstance(self.guarantee.requested, str):
             allowed = np.asarray(self.model.available)  # an array, so that one program serves both
         return _problem(self, allowed)
 
@@ -366,10 +366,12 @@ def prepare(task: MlirlFile, seed: int) -> Setup:
         key = jax.random.fold_in(jax.random.key(seed), 0)
         shown, dropped = synthetic_demonstrations(task.path, table, model, key, best)
     with errors_in(f"{task.path}: [task] "):
-        asked = ask(model, world, shown, best, task.guarantee, task.over)
-        actions = asked.actions or optimal_actions(model, best)
-        bound = step_bound(model, actions, asked.asked, task.over, task.steps, task.steps_factor)
-    setup = Setup(task, world, model, shown, dropped, asked, bound, trivial)
+        guarantee = ask(model, world, shown, best, task.guarantee, task.over)
+        actions = guarantee.actions or optimal_actions(model, best)
+        bound = step_bound(
+            model, actions, guarantee.requested, task.over, task.steps, task.steps_factor
+        )
+    setup = Setup(task, world, model, shown, dropped, guarantee, bound, trivial)
     with errors_in(f"{task.path}: [learner] "):
         _ = setup.problem  # raises its errors before learning
     return setup
@@ -397,7 +399,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
         solution = satisfaction_probability(model, policy)
     else:  # the search certifies with a tolerance, and before mixing
         over = setup.guarantee.over
-        solution = certified(model, policy, over, float(setup.guarantee.asked))
+        solution = certified(model, policy, over, float(setup.guarantee.requested))
         attempt = dataclasses.replace(
             attempt,
             policy=policy,

@@ -245,16 +245,16 @@ def _acting(setup: Setup, state: PyTree) -> Agent:
 
 
 def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:
-    asked = setup.task.evaluation
+    evaluation = setup.task.evaluation
     return evaluate(
         key,
         agent,
         _unshaped(setup.environment),
-        num_episodes=asked.episodes,
+        num_episodes=evaluation.episodes,
         num_steps=setup.num_steps,
-        confidence=asked.confidence,
-        discount=asked.discount,
-        threshold=asked.threshold if threshold else None,
+        confidence=evaluation.confidence,
+        discount=evaluation.discount,
+        threshold=evaluation.threshold if threshold else None,
     )
 
 

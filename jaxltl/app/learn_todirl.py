@@ -132,10 +132,10 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
         soft,
         found,
         dropped,
-        asked="best" if task.guarantee == 1 else task.guarantee,
+        requested="best" if task.guarantee == 1 else task.guarantee,
         trivial=trivial,
     )
-    if setup.asked == "none":
+    if setup.requested == "none":
         return _until_mistakes(setup)
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
     setup = replace(setup, sure=[optimal_actions(lane) for lane in lanes])
@@ -154,7 +154,7 @@ def _until_mistakes(setup: Setup) -> Setup:
         mdp = setup.worlds.scenes[w].mdp
         model = product(mdp, setup.judge, label_on=setup.task.label_on)
         mistake = np.zeros(each.state.shape, bool)
-        if setup.asked == "best" and setup.sure is not None:
+        if setup.requested == "best" and setup.sure is not None:
             mistake = mistakes(model, np.asarray(setup.sure[w].allowed)[: mdp.num_states], each)
         used = used_steps(model, optimal_satisfaction(model), mistake, each)
         unused += int(np.sum(each.length)) - int(used.sum())
@@ -494,7 +494,7 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
         radius=task.learner.radius,
         formula=task.formula,
         kinds=tuple(kinds),
-        guarantee=outcome.setup.asked,
+        guarantee=outcome.setup.requested,
         over=task.over,
         steps_factor=task.steps_factor,
     )

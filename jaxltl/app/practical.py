@@ -39,7 +39,7 @@ class StepBound:
 def step_bound(
     model: Product,
     actions: OptimalActions,
-    asked: str | float,
+    requested: str | float,
     over: str,
     steps: float | None,
     factor: float | None,
@@ -54,27 +54,27 @@ def step_bound(
         return None
     quickest = StepAnalysis(model).quickest(actions)
     anchor, least = np.eye(model.num_actions)[quickest.policy], quickest.steps.upper
-    probability = 0.0 if isinstance(asked, str) else float(asked)
+    probability = 0.0 if isinstance(requested, str) else float(requested)
     if steps is None:
-        bounded = factor is not None and asked != "none" and np.isfinite(least)
+        bounded = factor is not None and requested != "none" and np.isfinite(least)
         limit = factor * least if bounded and factor is not None else np.inf
         return StepBound(quickest, limit, anchor, factor, probability, over)
     if steps < least:
-        anchor = _anchor(model, quickest, asked, over, steps)
+        anchor = _anchor(model, quickest, requested, over, steps)
     return StepBound(quickest, steps, anchor, None, probability, over)
 
 
 def _anchor(
-    model: Product, quickest: Quickest, asked: str | float, over: str, steps: float
+    model: Product, quickest: Quickest, requested: str | float, over: str, steps: float
 ) -> np.ndarray:
     """A policy with an asked probability in fewer steps than the quickest optimal policy takes."""
     text = (
-        f"guarantee = {{ probability = {1 if asked == 'best' else asked}, steps = {steps:g} }}: the "
+        f"guarantee = {{ probability = {1 if requested == 'best' else requested}, steps = {steps:g} }}: the "
         f"quickest policy with the best probability takes {quickest.steps.value:.6g} steps"
     )
-    if isinstance(asked, str) or over != "mean" or not model.automaton.is_cosafe:
+    if isinstance(requested, str) or over != "mean" or not model.automaton.is_cosafe:
         raise ValueError(f"{text}; ask for at least so many.")
-    found = meeting(model, asked, steps, quickest)
+    found = meeting(model, requested, steps, quickest)
     if found.policy is None:
         raise ValueError(
             f"{text}, and in {steps:g} steps no policy has more than {max(found.most, 0):.6g}; ask "

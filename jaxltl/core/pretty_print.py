@@ -66,9 +66,9 @@ def _repr(self: Any) -> str:
 
 def _safe(facts: Facts, plain: Facts, value: object) -> list[str]:
     """The facts of an object; JAX temporarily stores axes and shardings in the fields of trees."""
-    for told in (facts, plain):
+    for describe in (facts, plain):
         try:
-            return [text for text in told(value) if isinstance(text, str) and text]
+            return [text for text in describe(value) if isinstance(text, str) and text]
         except Exception:
             continue
     return ["..."]

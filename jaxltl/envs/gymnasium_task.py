@@ -114,7 +114,7 @@ class _Steps:
     def reset(self, *, seed: int | None = None, options: PyTree = None) -> PyTree:
         seen, info = self.env.reset(seed=seed, options=options)
         self._memory = int(self._tables.delta[self._tables.initial, self._letter(seen, info)])
-        return self._observe(seen), self._told(info, self._tables.verdict[self._memory])
+        return self._observe(seen), self._details(info, self._tables.verdict[self._memory])
 
     def step(self, action: PyTree) -> PyTree:
         seen, earned, ended, cut, info = self.env.step(action)
@@ -128,9 +128,9 @@ class _Steps:
         reward = tables.decided[verdict] if decided else tables.reward[before, letter]
         ahead = 0 if ended else tables.learner_discount * discount * tables.potential[after]
         self._memory = after
-        told = {**self._told(info, verdict), "discount": discount, "reward": float(earned)}
+        details = {**self._details(info, verdict), "discount": discount, "reward": float(earned)}
         total = float(reward + ahead - tables.potential[before])
-        return self._observe(seen), total, ended, bool(cut), told
+        return self._observe(seen), total, ended, bool(cut), details
 
     def _letter(self, seen: PyTree, info: PyTree) -> int:
         shown = self._labels(seen, info)
@@ -147,7 +147,7 @@ class _Steps:
         )
         return int(self._tables.letter[code])
 
-    def _told(self, info: PyTree, verdict: int) -> PyTree:
+    def _details(self, info: PyTree, verdict: int) -> PyTree:
         return {**info, "verdict": int(verdict), "memory": self._memory}
 
     def _observe(self, seen: PyTree) -> PyTree:

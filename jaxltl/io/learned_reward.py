@@ -111,16 +111,16 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
             f"world's states: {(world.num_states, width)}."
         )
     plan = partial(todirl.plan, learned.network, learned.parameters, model, seen, learned.hparams)
-    asked = learned.guarantee
-    if asked == "none":
+    requested = learned.guarantee
+    if requested == "none":
         return model, plan()
     sure = optimal_actions(model)
     inside = plan(allowed=sure.allowed)
     factor, least, found = learned.steps_factor or np.inf, 0.0, inside
-    if not isinstance(asked, str):
-        require_attainable(model, sure.best, asked, learned.over, "state {}".format)
-        soft, least = plan(), asked
-        mixed = reaching(model, soft.policy, inside.policy, sure.best, asked, over=learned.over)
+    if not isinstance(requested, str):
+        require_attainable(model, sure.best, requested, learned.over, "state {}".format)
+        soft, least = plan(), requested
+        mixed = reaching(model, soft.policy, inside.policy, sure.best, requested, over=learned.over)
         policy = jnp.asarray(mixed.policy, model.dtype)
         found = replace(soft, policy=policy, status=worst(soft.status, inside.status))
     if np.isinf(factor):

@@ -30,10 +30,10 @@ def svg(draw: Callable[..., Figure], *arguments: object, text: str, **options: o
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of signs that the font lacks, which stay boxes
         found = to_bytes(draw(*arguments, **options), "svg").decode()
-    told = html.escape(" ".join(text.split()))
-    head = f'<svg role="img" aria-label="{told}" style="max-width:100%;height:auto"'
+    label = html.escape(" ".join(text.split()))
+    head = f'<svg role="img" aria-label="{label}" style="max-width:100%;height:auto"'
     opening, rest = found[found.index("<svg") + 4 :].split(">", 1)
-    return f"{head}{opening}><title>{told}</title>{rest}"
+    return f"{head}{opening}><title>{label}</title>{rest}"
 
 
 def _stacked(pictures: list[str], text: str) -> str | None:
@@ -45,15 +45,15 @@ def _stacked(pictures: list[str], text: str) -> str | None:
         for one in pictures
     ]
     wide, high = max(w for w, _ in sizes), sum(h for _, h in sizes)
-    told, y, parts = html.escape(" ".join(text.split())), 0.0, []
+    label, y, parts = html.escape(" ".join(text.split())), 0.0, []
     for one, (_, height) in zip(pictures, sizes, strict=True):
         inner = one.replace('role="img"', f'y="{y:.2f}"', 1).replace('pt"', '"', 2)
         parts.append(re.sub(r' aria-label="[^"]*" style="[^"]*"', "", inner, count=1))
         y += height
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{told}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{label}" '
         f'style="max-width:100%;height:auto" width="{wide:.2f}pt" height="{high:.2f}pt" '
-        f'viewBox="0 0 {wide:.2f} {high:.2f}"><title>{told}</title>{"".join(parts)}</svg>'
+        f'viewBox="0 0 {wide:.2f} {high:.2f}"><title>{label}</title>{"".join(parts)}</svg>'
     )
 
 

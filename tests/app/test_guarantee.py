@@ -402,7 +402,7 @@ def test_to_ask_for_certainty_is_to_ask_for_the_best(write):  # noqa: F811
     wide = (". . r\nb . y", ". . . . . r\nb . . . . y")
     setup = prepared(write(wide, asking(1.0)))
     weight = np.asarray(setup.model.mdp.initial)
-    assert np.ones(10) @ weight[weight > 0] < 1 and setup.guarantee.asked == "best"
+    assert np.ones(10) @ weight[weight > 0] < 1 and setup.guarantee.requested == "best"
     assert at_starts(setup.model, np.ones(setup.model.state_shape), "mean")[0] == 1
 
 

@@ -344,7 +344,7 @@ def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, ask
     assert asked > 0.5 or (mixed, outcome.learned.weight) == (0, 0)
     # Nothing that was learned with another weight makes the demonstrations likelier.
     setup = outcome.setup
-    assert setup.asked == asked
+    assert setup.requested == asked
 
 
 @pytest.mark.slow
@@ -377,7 +377,7 @@ def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, t
     with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):
         prepared(write(narrow, ("guarantee = 0.85", "guarantee = 0.999"), text=RISKY))
     sure = (("guarantee = 0.85", "guarantee = 1.0"), ("slip = 0.1", "slip = 0.0"))
-    assert prepared(write(*sure, text=RISKY)).asked == "best"
+    assert prepared(write(*sure, text=RISKY)).requested == "best"
 
 
 @pytest.mark.parametrize("asked", ['"best"', '"none"', "0.6"])

@@ -207,8 +207,8 @@ def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
     most, rho = hparams.population, hparams.rho
     if hparams.num_samples is None:
         return jnp.int32(most), jnp.int32(num_elites(rho, most))
-    asked = jnp.round(jnp.asarray(at(hparams.num_samples, step), float))
-    num_samples = jnp.clip(asked, math.ceil(1 / rho - SLACK), most).astype(jnp.int32)
+    requested = jnp.round(jnp.asarray(at(hparams.num_samples, step), float))
+    num_samples = jnp.clip(requested, math.ceil(1 / rho - SLACK), most).astype(jnp.int32)
     counts = jnp.asarray([num_elites(rho, n) for n in range(most + 1)], jnp.int32)
     return num_samples, counts[num_samples]
 

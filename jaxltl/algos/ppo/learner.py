@@ -347,14 +347,14 @@ def improved(
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
         some, memory = lanes.split_axis(some, over, int(recurrent)), lanes.split_axis(memory, over)
-        (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
+        (_, statistics), slope = jax.value_and_grad(loss, has_aux=True)(
             before[0], some, memory, problem, hparams
         )
-        slope, told = lanes.replicate((slope, told), over)
+        slope, statistics = lanes.replicate((slope, statistics), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
-        told = told | {"gradient_norm": norm}
+        statistics = statistics | {"gradient_norm": norm}
         if hparams.target_kl is not None:
-            stopped |= told["kl"] > hparams.target_kl
+            stopped |= statistics["kl"] > hparams.target_kl
         finite = jnp.isfinite(norm)
         if hparams.max_gradient_norm is not None:
             shorter = jnp.minimum(1, hparams.max_gradient_norm / jnp.maximum(norm, 1e-38))
@@ -365,9 +365,9 @@ def improved(
         )
         made = finite & ~stopped
         new = trees.choose(made, (parameters, optimizer), tuple(before))
-        return (*new, stopped), (told, made, ~finite & ~stopped)
+        return (*new, stopped), (statistics, made, ~finite & ~stopped)
 
-    (parameters, optimizer, _), (told, made, lost) = minibatch_epochs(
+    (parameters, optimizer, _), (statistics, made, lost) = minibatch_epochs(
         key,
         update,
         (state.parameters, state.optimizer, jnp.bool_(False)),
@@ -378,7 +378,7 @@ def improved(
     number = made.sum()
     figures = {
         name: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan)
-        for name, x in told.items()
+        for name, x in statistics.items()
     }
     figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.sum().astype(jnp.int32)}
     return parameters, optimizer, figures

@@ -208,7 +208,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     inputs = normalized(state.moments, hparams, batch.observation)
     inputs = jnp.where(batch.valid[..., None], inputs, 0)
     value, found = _estimated(state, batch, inputs, hparams)
-    parameters, told = _improved(state.parameters, batch, inputs, found, problem, hparams)
+    parameters, statistics = _improved(state.parameters, batch, inputs, found, problem, hparams)
     values, optimizer, value_moments = fitted(
         fit_key, state, value_inputs(inputs), value + found, batch.valid, hparams
     )
@@ -230,7 +230,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     )
     (_, left_out), (_, total) = (_moments(x, batch.valid) for x in (found, value + found))
     return state, replace(
-        told,
+        statistics,
         trajectories=state.trajectories,
         unexplained=left_out / positive(total),
     )

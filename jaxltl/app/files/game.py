@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 import numpy as np
 
@@ -48,19 +48,27 @@ Formulas = Annotated[list[str], Meta('a list of Boolean formulas, such as ["a", 
 class GameTable(Table):
     """``[game]``: two robots on a map, or a model file."""
 
-    map: Key[Map | None, "Rows of a text map, or the file that has them; default none."] = None
-    legend: Key[Legend | None, "Propositions of each kind of cell; default the kind itself."] = None
-    wall: Key[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
-    slip: Key[Unit | None, "Probability of slipping to either side; default 0."] = None
-    system_start: Key[Start | None, "Initial cells of the system; default all.", "[1, 4]"] = None
-    environment_start: Key[Start | None, "Initial cells of the other; default all.", '"b"'] = None
-    system_stays: Key[bool | None, "True if the system may stay; default true.", "false"] = None
-    environment_stays: Key[bool | None, "True if the other may stay; default false."] = None
-    model: Key[Text | None, "Model file of a game; default none.", '"game.pg"'] = None
-    constants: Key[
+    map: TomlKey[Map | None, "Rows of a text map, or the file that has them; default none."] = None
+    legend: TomlKey[
+        Legend | None, "Propositions of each kind of cell; default the kind itself."
+    ] = None
+    wall: TomlKey[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
+    slip: TomlKey[Unit | None, "Probability of slipping to either side; default 0."] = None
+    system_start: TomlKey[Start | None, "Initial cells of the system; default all.", "[1, 4]"] = (
+        None
+    )
+    environment_start: TomlKey[Start | None, "Initial cells of the other; default all.", '"b"'] = (
+        None
+    )
+    system_stays: TomlKey[bool | None, "True if the system may stay; default true.", "false"] = None
+    environment_stays: TomlKey[bool | None, "True if the other may stay; default false."] = None
+    model: TomlKey[Text | None, "Model file of a game; default none.", '"game.pg"'] = None
+    constants: TomlKey[
         Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
     ] = None
-    initial: Key[Text | None, "Formula of initial states; default the model's.", '"start"'] = None
+    initial: TomlKey[Text | None, "Formula of initial states; default the model's.", '"start"'] = (
+        None
+    )
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("map", "model"), "a map or a model (a file)")
@@ -78,12 +86,16 @@ class GameTable(Table):
 class TaskTable(Table):
     """``[task]``: the objective of the system."""
 
-    formula: Key[Text | None, "Temporal-logic formula; default none.", '"G !collision"'] = None
-    assumptions: Key[Formulas | None, "Assumed infinitely often (GR(1)); default none."] = None
-    guarantees: Key[Formulas | None, "Required infinitely often (GR(1)); default none."] = None
-    safe: Key[Text | None, "Formula that must hold always; default none.", '"!collision"'] = None
-    parity: Key[Literal["model"] | None, "Condition of a parity game's file; default none."] = None
-    chance: Key[
+    formula: TomlKey[Text | None, "Temporal-logic formula; default none.", '"G !collision"'] = None
+    assumptions: TomlKey[Formulas | None, "Assumed infinitely often (GR(1)); default none."] = None
+    guarantees: TomlKey[Formulas | None, "Required infinitely often (GR(1)); default none."] = None
+    safe: TomlKey[Text | None, "Formula that must hold always; default none.", '"!collision"'] = (
+        None
+    )
+    parity: TomlKey[Literal["model"] | None, "Condition of a parity game's file; default none."] = (
+        None
+    )
+    chance: TomlKey[
         Literal["random", "adversarial"], "Random moves: by probability, or by the environment."
     ] = "random"
 
@@ -116,10 +128,12 @@ class TaskTable(Table):
 class StrategyTable(Table):
     """``[strategy]``: how a permissive strategy is computed."""
 
-    method: Key[
+    method: TomlKey[
         Literal["auto", "stay", "rank", "counter", "parity"], "Method of permissive strategies."
     ] = "auto"
-    bound: Key[Count | None, "Bound of counter (required) and parity; default none.", "6"] = None
+    bound: TomlKey[Count | None, "Bound of counter (required) and parity; default none.", "6"] = (
+        None
+    )
 
 
 @table
@@ -127,9 +141,9 @@ class GameFile(File):
     """A checked game file."""
 
     KIND: ClassVar[str] = "the game file"
-    game: Key[GameTable, "The game."]
-    task: Key[TaskTable, "The objective of the system."]
-    strategy: Key[StrategyTable | None, "Demands a strategy."] = None
+    game: TomlKey[GameTable, "The game."]
+    task: TomlKey[TaskTable, "The objective of the system."]
+    strategy: TomlKey[StrategyTable | None, "Demands a strategy."] = None
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from typing import (
     get_origin,
     get_type_hints,
 )
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 import attrs
 
@@ -95,7 +95,7 @@ def key_name(field: attrs.Attribute[Any]) -> str:
 
 
 def _fields(schema: Any) -> tuple[attrs.Attribute[Any], ...]:
-    """The keys of a table: its fields of a type ``Key[...]``."""
+    """The keys of a table: its fields of a type ``TomlKey[...]``."""
     return tuple(field for field in attrs.fields(schema) if get_origin(field.type) is Annotated)
 
 
@@ -139,9 +139,9 @@ class File(Table):
     KIND: ClassVar[str] = "the task file"  # begins the error if it cannot be read
     path: Path = Path()
     raw: bytes = b""  # its content
-    name: Key[Name, "Name of the results' folder; default the file's own name.", '"two goals"'] = (
-        attrs.field(default=None)
-    )
+    name: TomlKey[
+        Name, "Name of the results' folder; default the file's own name.", '"two goals"'
+    ] = attrs.field(default=None)
 
     @classmethod
     def read(cls, path: str | Path, raw: bytes | None = None) -> Self:

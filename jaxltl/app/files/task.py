@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 from jaxltl.app.files.schema import (
     Count,
@@ -73,40 +73,42 @@ Optimizer = Annotated[
 class GridTable(Table):
     """Keys of ``[world]`` about text maps."""
 
-    legend: Key[Legend | None, "Propositions of each kind of cell; default the kind itself."] = None
-    wall: Key[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
-    slip: Key[Unit | None, "Probability of slipping to either side; default 0."] = None
-    absorbing: Key[Propositions | None, "Propositions of absorbing cells; default none."] = None
+    legend: TomlKey[
+        Legend | None, "Propositions of each kind of cell; default the kind itself."
+    ] = None
+    wall: TomlKey[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
+    slip: TomlKey[Unit | None, "Probability of slipping to either side; default 0."] = None
+    absorbing: TomlKey[Propositions | None, "Propositions of absorbing cells; default none."] = None
 
 
 @table
 class FormulaTable(Table):
     """``[task]``: the formula."""
 
-    formula: Key[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
+    formula: TomlKey[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
 
 
 @table
 class TaskTable(FormulaTable):
     """``[task]``: the formula, and the guarantee."""
 
-    label_on: Key[
+    label_on: TomlKey[
         Literal["entry", "exit"] | None,
         "Label read by a step: of the state entered (default with mlirl) or left (with todirl); "
         "default by the method.",
     ] = None
-    guarantee: Key[
+    guarantee: TomlKey[
         GuaranteeKey | None,
         "Satisfaction probability to certify; default best, and none if the learner does not see "
         "the formula.",
         "0.9",
     ] = None
-    steps_factor: Key[
+    steps_factor: TomlKey[
         StepsFactor | None,
         "Bound on the expected steps to satisfaction, as a multiple of the quickest optimal "
         "policy's; default 2, and none where guarantee has steps or is none.",
     ] = None
-    over: Key[
+    over: TomlKey[
         Literal["mean", "worst"] | None,
         "Initial states of a given probability: their mean, or the worst; default mean.",
         '"worst"',
@@ -117,28 +119,28 @@ class TaskTable(FormulaTable):
 class SyntheticTable(Table):
     """Keys of ``[demonstrations]`` about simulated demonstrations."""
 
-    synthetic: Key[Count | None, "Number of simulated demonstrations; default none."] = None
-    discount: Key[
+    synthetic: TomlKey[Count | None, "Number of simulated demonstrations; default none."] = None
+    discount: TomlKey[
         Discount | None,
         "Discount of a simulated demonstrator's reward; default the quickest optimal policy.",
     ] = None
-    length: Key[Count | None, "Longest simulated demonstration; default 200."] = None
+    length: TomlKey[Count | None, "Longest simulated demonstration; default 200."] = None
 
 
 @table
 class LearnerTable(Table):
     """``[learner]`` of any method."""
 
-    method: Key[str, "Learning algorithm."]
-    steps: Key[Count, "Steps of the learner."]
+    method: TomlKey[str, "Learning algorithm."]
+    steps: TomlKey[Count, "Steps of the learner."]
 
 
 @table
 class OptimizerTable(LearnerTable):
     """Keys of ``[learner]`` of all methods of learning from demonstrations."""
 
-    l2: Key[NonNegative | None, "Precision of the Gaussian prior on the parameters."] = None
-    learning_rate: Key[NonNegative | None, "Step size of the optimizer."] = None
+    l2: TomlKey[NonNegative | None, "Precision of the Gaussian prior on the parameters."] = None
+    learning_rate: TomlKey[NonNegative | None, "Step size of the optimizer."] = None
 
     @property
     def hides_formula(self) -> str | None:
@@ -154,8 +156,8 @@ class OptimizerTable(LearnerTable):
 class FormulaFile(File):
     """A task file of any method."""
 
-    task: Key[FormulaTable, "The formula."]
-    learner: Key[LearnerTable, "The learner."]
+    task: TomlKey[FormulaTable, "The formula."]
+    learner: TomlKey[LearnerTable, "The learner."]
 
     @property
     def formula(self) -> str:
@@ -168,8 +170,8 @@ class TaskFile(FormulaFile):
     """A task file of learning from demonstrations."""
 
     LABEL_ON: ClassVar[str] = "entry"  # default of label_on
-    task: Key[TaskTable, "The formula, and the guarantee."]
-    learner: Key[OptimizerTable, "The learner and its hyperparameters."]
+    task: TomlKey[TaskTable, "The formula, and the guarantee."]
+    learner: TomlKey[OptimizerTable, "The learner and its hyperparameters."]
 
     @property
     def label_on(self) -> str:
@@ -179,8 +181,8 @@ class TaskFile(FormulaFile):
     @property
     def guarantee(self) -> str | float:
         """Either "best", "none" or a probability to certify."""
-        asked = self.task.guarantee or ("none" if self.learner.hides_formula else "best")
-        return asked["probability"] if isinstance(asked, dict) else asked
+        requested = self.task.guarantee or ("none" if self.learner.hides_formula else "best")
+        return requested["probability"] if isinstance(requested, dict) else requested
 
     @property
     def over(self) -> str:
@@ -190,8 +192,8 @@ class TaskFile(FormulaFile):
     @property
     def steps(self) -> float | None:
         """Bound on the expected steps to satisfaction, if it is a number."""
-        asked = self.task.guarantee
-        return asked["steps"] if isinstance(asked, dict) else None
+        requested = self.task.guarantee
+        return requested["steps"] if isinstance(requested, dict) else None
 
     @property
     def steps_factor(self) -> float | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 import attrs
 
@@ -54,22 +54,22 @@ Score = Literal[
 class WorldTable(Table):
     """``[world]``: the environment."""
 
-    environment: Key[
+    environment: TomlKey[
         Text | None, "Environment, or function that makes one; default the dynamics.", '"brax:ant"'
     ] = None
-    dynamics: Key[
+    dynamics: TomlKey[
         Text | None,
         "Function that makes dynamics, in which the policy is proven; default the environment.",
         '"shuttle.py:make"',
     ] = None
-    arguments: Key[Record, "Arguments of the function.", "{ horizon = 120 }"] = attrs.field(
+    arguments: TomlKey[Record, "Arguments of the function.", "{ horizon = 120 }"] = attrs.field(
         factory=dict
     )
-    labels: Key[
+    labels: TomlKey[
         Text | None, "Function of labels; default the environment's.", '"cart.py:labels"'
     ] = None
-    propositions: Key[Labels | None, "Names of the labels; default the environment's."] = None
-    horizon: Key[Count | None, "Longest episode in steps; default the environment's."] = None
+    propositions: TomlKey[Labels | None, "Names of the labels; default the environment's."] = None
+    horizon: TomlKey[Count | None, "Longest episode in steps; default the environment's."] = None
 
     @property
     def function(self) -> str:
@@ -100,24 +100,24 @@ class WorldTable(Table):
 class TaskTable(FormulaTable):
     """``[task]``: the formula and its reward; see ``jaxltl.task_environment``."""
 
-    reward: Key[
+    reward: TomlKey[
         Literal["auto", "reach", "keep", "eventual", "two-discount", "parity"] | None,
         "Reward of the formula; default auto.",
         '"reach"',
     ] = None
-    discount: Key[
+    discount: TomlKey[
         Unit | None,
         "Discount of steps; default 1 for reach and keep without shaping, else 0.99.",
         "0.98",
     ] = None
-    ratio: Key[Unit | None, "Ratio of successive rewards; default 1 minus the discount."] = None
-    shaping: Key[
+    ratio: TomlKey[Unit | None, "Ratio of successive rewards; default 1 minus the discount."] = None
+    shaping: TomlKey[
         Literal["auto", "distance", "none"] | None,
         "Potential-based shaping of the reward, auto for distance with ppo where all steps are "
         "discounted, so that it changes no optimal policy; default auto.",
         '"distance"',
     ] = None
-    ending: Key[
+    ending: TomlKey[
         Literal["repeat", "violated", "undecided"] | None,
         "Verdict where the world ends; default repeat, of its last label.",
         '"violated"',
@@ -128,8 +128,8 @@ class TaskTable(FormulaTable):
 class LearnerTable(AnyLearnerTable):
     """``[learner]``: the method."""
 
-    method: Key[Literal["ppo", "cce", "cpo"], "Learning algorithm."]
-    steps: Key[Count, "Steps of the learner."]
+    method: TomlKey[Literal["ppo", "cce", "cpo"], "Learning algorithm."]
+    steps: TomlKey[Count, "Steps of the learner."]
 
 
 def hparams_table(hparams: type[Any], *omit: str) -> Any:
@@ -137,7 +137,7 @@ def hparams_table(hparams: type[Any], *omit: str) -> Any:
     fields = {}
     for field in dataclasses.fields(hparams):
         if "valid" in field.metadata and field.name not in omit:
-            kind: Any = Key[_type_of(field) | None, ""]
+            kind: Any = TomlKey[_type_of(field) | None, ""]
             fields[field.name] = attrs.field(default=None, type=kind)
     return attrs.make_class(
         "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
@@ -169,30 +169,34 @@ def _type_of(field: dataclasses.Field[Any]) -> Any:
 class PpoTable(hparams_table(ppo.Hparams)):  # type: ignore[misc]
     """``[ppo]``: hyperparameters, and the networks."""
 
-    discount: Key[Unit, "Discount of rewards.", "0.99"] = 1.0
-    hidden: Key[Widths | None, "Widths of the networks' hidden layers; default [64, 64]."] = None
-    activation: Key[Literal["tanh", "relu", "gelu", "silu"] | None, "Activation; default tanh."] = (
+    discount: TomlKey[Unit, "Discount of rewards.", "0.99"] = 1.0
+    hidden: TomlKey[Widths | None, "Widths of the networks' hidden layers; default [64, 64]."] = (
         None
     )
-    initial_deviation: Key[NonNegative | None, "Deviation of Gaussian actions; default 1."] = None
+    activation: TomlKey[
+        Literal["tanh", "relu", "gelu", "silu"] | None, "Activation; default tanh."
+    ] = None
+    initial_deviation: TomlKey[NonNegative | None, "Deviation of Gaussian actions; default 1."] = (
+        None
+    )
 
 
 @table
 class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # type: ignore[misc]
     """``[cce]``: hyperparameters, the policy network, and the scores of samples."""
 
-    rate: Key[Schedule, "Smoothing of the distribution's parameters."] = 0.5
-    margin: Key[Number | None, "Margin of the constraint."] = None
-    noise: Key[Schedule | None, "Noise added to the variance."] = None
-    hidden: Key[Widths, "Widths of the policy network's hidden layers."] = attrs.field(
+    rate: TomlKey[Schedule, "Smoothing of the distribution's parameters."] = 0.5
+    margin: TomlKey[Number | None, "Margin of the constraint."] = None
+    noise: TomlKey[Schedule | None, "Noise added to the variance."] = None
+    hidden: TomlKey[Widths, "Widths of the policy network's hidden layers."] = attrs.field(
         factory=lambda: [16]
     )
-    activation: Key[Literal["tanh", "relu"], "Activation of the network."] = "tanh"
-    deviation: Key[NonNegative, "Initial deviation of the network's parameters."] = 1.0
-    objective: Key[Score, "Score that is maximised."] = "reward"
-    cost: Key[Score | None, "Score that limit bounds; default none.", '"failure"'] = None
-    limit: Key[Number | None, "Upper bound of the cost; default none.", "0.1"] = None
-    episodes: Key[Count, "Episodes by which a sample is scored."] = 10
+    activation: TomlKey[Literal["tanh", "relu"], "Activation of the network."] = "tanh"
+    deviation: TomlKey[NonNegative, "Initial deviation of the network's parameters."] = 1.0
+    objective: TomlKey[Score, "Score that is maximised."] = "reward"
+    cost: TomlKey[Score | None, "Score that limit bounds; default none.", '"failure"'] = None
+    limit: TomlKey[Number | None, "Upper bound of the cost; default none.", "0.1"] = None
+    episodes: TomlKey[Count, "Episodes by which a sample is scored."] = 10
 
     def __attrs_post_init__(self) -> None:
         if self.limit is not None and self.cost is None:
@@ -207,9 +211,11 @@ class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # ty
 class CpoTable(hparams_table(trust_region.Hparams, "method", "penalty")):  # type: ignore[misc]
     """``[cpo]``: hyperparameters, and the cost."""
 
-    discount: Key[Unit, "Discount of rewards.", "0.99"] = 1.0
-    limit: Key[Number | None, "Upper bound of the expected cost; default required.", "0.1"] = None
-    cost: Key[
+    discount: TomlKey[Unit, "Discount of rewards.", "0.99"] = 1.0
+    limit: TomlKey[Number | None, "Upper bound of the expected cost; default required.", "0.1"] = (
+        None
+    )
+    cost: TomlKey[
         Literal["world", "violation"], "Cost: the world's, or 1 where the formula is violated."
     ] = "world"
 
@@ -221,12 +227,14 @@ _TABLES = {"ppo": PpoTable, "cce": CceTable, "cpo": CpoTable}
 class EvaluationTable(Table):
     """``[evaluation]``: fresh episodes."""
 
-    episodes: Key[Count, "Number of episodes."] = 1000
-    steps: Key[Count | None, "Steps after which an episode is cut off; default the horizon."] = None
-    confidence: Key[Confidence, "Confidence of each interval."] = 0.95
-    threshold: Key[Confidence | None, "Success probability to test for; default none."] = None
-    discount: Key[Confidence | None, "Discount of the discounted scores; default none."] = None
-    policy: Key[
+    episodes: TomlKey[Count, "Number of episodes."] = 1000
+    steps: TomlKey[
+        Count | None, "Steps after which an episode is cut off; default the horizon."
+    ] = None
+    confidence: TomlKey[Confidence, "Confidence of each interval."] = 0.95
+    threshold: TomlKey[Confidence | None, "Success probability to test for; default none."] = None
+    discount: TomlKey[Confidence | None, "Discount of the discounted scores; default none."] = None
+    policy: TomlKey[
         Literal["drawn", "likeliest"] | None,
         "Actions: drawn, or the likeliest ones; default drawn.",
         '"likeliest"',
@@ -237,28 +245,28 @@ class EvaluationTable(Table):
 class ProofTable(Table):
     """``[proof]``: bounds of the learned policy's satisfaction probability, in worlds of dynamics."""
 
-    cells: Key[
+    cells: TomlKey[
         Cells | None, "Cells along each axis at first; default about 20,000 in all.", "[200, 200]"
     ] = None
-    tolerance: Key[Confidence | None, "Width of the bounds; default 0.001.", "0.01"] = None
-    threshold: Key[Confidence | None, "Stop when this bound is decided; default none.", "0.999"] = (
-        None
-    )
-    max_cells: Key[Count | None, "Cells of the finest grid; default 1048576."] = None
+    tolerance: TomlKey[Confidence | None, "Width of the bounds; default 0.001.", "0.01"] = None
+    threshold: TomlKey[
+        Confidence | None, "Stop when this bound is decided; default none.", "0.999"
+    ] = None
+    max_cells: TomlKey[Count | None, "Cells of the finest grid; default 1048576."] = None
 
 
 @table
 class EnvironmentFile(FormulaFile):
     """A task file of a simulated world."""
 
-    world: Key[WorldTable, "The environment."]
-    task: Key[TaskTable, "The formula and its reward."]
-    learner: Key[LearnerTable, "The method."]
-    ppo: Key[PpoTable | None, "Hyperparameters of ppo."] = None
-    cce: Key[CceTable | None, "Hyperparameters of cce."] = None
-    cpo: Key[CpoTable | None, "Hyperparameters of cpo."] = None
-    evaluation: Key[EvaluationTable, "Episodes of the evaluation."] = EvaluationTable()
-    proof: Key[ProofTable, "Proof of the learned policy."] = ProofTable()
+    world: TomlKey[WorldTable, "The environment."]
+    task: TomlKey[TaskTable, "The formula and its reward."]
+    learner: TomlKey[LearnerTable, "The method."]
+    ppo: TomlKey[PpoTable | None, "Hyperparameters of ppo."] = None
+    cce: TomlKey[CceTable | None, "Hyperparameters of cce."] = None
+    cpo: TomlKey[CpoTable | None, "Hyperparameters of cpo."] = None
+    evaluation: TomlKey[EvaluationTable, "Episodes of the evaluation."] = EvaluationTable()
+    proof: TomlKey[ProofTable, "Proof of the learned policy."] = ProofTable()
 
     @property
     def settings(self) -> PpoTable | CceTable | CpoTable:

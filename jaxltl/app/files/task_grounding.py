@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 from jaxltl.app.files.schema import (
     Confidence,
@@ -38,33 +38,33 @@ Meanings = Annotated[
 class WorldTable(GridTable):
     """``[world]``: maps; what their legend states is observed and has no other meaning."""
 
-    maps: Key[Maps, "Maps with demonstrations."]
-    initial: Key[Text | None, "Formula of initial cells; default all cells.", '"a"'] = None
+    maps: TomlKey[Maps, "Maps with demonstrations."]
+    initial: TomlKey[Text | None, "Formula of initial cells; default all cells.", '"a"'] = None
 
 
 @table
 class GroundingTable(Table):
     """``[grounding]``: observations, and how their meaning is learned."""
 
-    observations: Key[
+    observations: TomlKey[
         Observations,
         "Observations: the propositions of the legend, or tables (CSV) of [world] maps and then of "
         "[test] maps, with a line of names and a line of numbers for each cell.",
     ]
-    clusters: Key[
+    clusters: TomlKey[
         Count | None, "Number of clusters of noisy observations; default none, all are 0 or 1.", "6"
     ] = None
-    level: Key[Confidence, "Posterior weight of the credible set of groundings."] = 0.95
+    level: TomlKey[Confidence, "Posterior weight of the credible set of groundings."] = 0.95
 
 
 @table
 class DemonstrationsTable(SyntheticTable):
     """``[demonstrations]``: files, or simulated ones by a soft optimal policy."""
 
-    discount: Key[Discount, "Discount of the demonstrator."] = 0.95
-    files: Key[Files | None, "Files of demonstrations, one per map; default none."] = None
-    meaning: Key[Meanings | None, "Hidden meanings, for simulations; default none."] = None
-    scale: Key[NonNegative, "Reward of an event, for simulations."] = 40.0
+    discount: TomlKey[Discount, "Discount of the demonstrator."] = 0.95
+    files: TomlKey[Files | None, "Files of demonstrations, one per map; default none."] = None
+    meaning: TomlKey[Meanings | None, "Hidden meanings, for simulations; default none."] = None
+    scale: TomlKey[NonNegative, "Reward of an event, for simulations."] = 40.0
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("files", "synthetic"), "files = [...] or synthetic = N")
@@ -75,7 +75,7 @@ class DemonstrationsTable(SyntheticTable):
 class TestTable(Table):
     """``[test]``: further maps in which policies are certified."""
 
-    maps: Key[Maps, "Maps without demonstrations."]
+    maps: TomlKey[Maps, "Maps without demonstrations."]
 
 
 @table
@@ -83,11 +83,11 @@ class GroundingFile(FormulaFile):
     """A task file with a table ``[grounding]``."""
 
     learner: LearnerTable = LearnerTable(method="grounding", steps=1)  # no table of the file
-    world: Key[WorldTable, "The worlds with demonstrations."]
-    task: Key[FormulaTable, "The formula over symbols."]
-    grounding: Key[GroundingTable, "Observations, and how their meaning is learned."]
-    demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
-    test: Key[TestTable | None, "Further worlds."] = None
+    world: TomlKey[WorldTable, "The worlds with demonstrations."]
+    task: TomlKey[FormulaTable, "The formula over symbols."]
+    grounding: TomlKey[GroundingTable, "Observations, and how their meaning is learned."]
+    demonstrations: TomlKey[DemonstrationsTable, "What was demonstrated."]
+    test: TomlKey[TestTable | None, "Further worlds."] = None
 
     @property
     def maps(self) -> list[str | dict[str, str]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 from jaxltl.app.files.schema import (
     Confidence,
@@ -47,32 +47,32 @@ Start = Annotated[list[Number], Meta("a list of finite numbers, one per feature"
 class WorldTable(GridTable):
     """``[world]``: a map, a model file, or a log of transitions."""
 
-    map: Key[Map | None, "Rows of a text map, or the file that has them; default none."] = None
-    model: Key[Text | None, "Model file; default none.", '"model.umb"'] = None
-    constants: Key[
+    map: TomlKey[Map | None, "Rows of a text map, or the file that has them; default none."] = None
+    model: TomlKey[Text | None, "Model file; default none.", '"model.umb"'] = None
+    constants: TomlKey[
         Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
     ] = None
-    transitions: Key[Text | None, "Log of transitions; default none.", '"log.csv"'] = None
-    initial: Key[
+    transitions: TomlKey[Text | None, "Log of transitions; default none.", '"log.csv"'] = None
+    initial: TomlKey[
         Initial | None,
         "Formula of the initial states, or their names in a log; default all, or the model's.",
         '"s"',
     ] = None
-    confidence: Key[Confidence | None, "Confidence of a log, which requires it; default none."] = (
-        None
-    )
-    labels: Key[Text | None, "Table of a log's labels; default none.", '"labels.csv"'] = None
-    terminal: Key[StateNames | None, "States of a log where episodes end; default none."] = None
-    graph: Key[
+    confidence: TomlKey[
+        Confidence | None, "Confidence of a log, which requires it; default none."
+    ] = None
+    labels: TomlKey[Text | None, "Table of a log's labels; default none.", '"labels.csv"'] = None
+    terminal: TomlKey[StateNames | None, "States of a log where episodes end; default none."] = None
+    graph: TomlKey[
         Literal["seen", "complete"] | None,
         "Possible transitions of a log: those in the log, or all; default none.",
     ] = None
-    least_probability: Key[
+    least_probability: TomlKey[
         LeastProbability | None,
         "Assumed lower bound of a log's probabilities; default none.",
         "0.01",
     ] = None
-    method: Key[
+    method: TomlKey[
         Literal["anytime", "clopper-pearson", "hoeffding", "weissman"] | None,
         "Confidence sets of a log; default anytime.",
     ] = None
@@ -109,7 +109,7 @@ class WorldTable(GridTable):
 class DemonstrationsTable(SyntheticTable):
     """``[demonstrations]``: a file, or simulated ones."""
 
-    file: Key[Text | None, "JSON file of demonstrations; default none.", '"shown.json"'] = None
+    file: TomlKey[Text | None, "JSON file of demonstrations; default none.", '"shown.json"'] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("file", "synthetic"), 'file = "..." or synthetic = N')
@@ -122,27 +122,33 @@ class LearnerTable(OptimizerTable):
     """``[learner]``: hyperparameters; see ``jaxltl.algos.mlirl.Hparams`` for other defaults."""
 
     # Files of todirl are read by task_todirl.
-    method: Key[
+    method: TomlKey[
         Annotated[Literal["mlirl"], Meta('"mlirl" or "todirl"')], "Learning algorithm.", '"mlirl"'
     ]
-    in_: Key[
+    in_: TomlKey[
         Literal["product", "world"], "State space of the reward: the product, or the world alone."
     ] = "product"
-    discount: Key[Discount, "Discount of the learned reward."]
-    mu: Key[NonNegative | None, "Weight of the satisfaction probability, equation (2.6)."] = None
-    steps: Key[Count, "Largest number of steps of the optimizer."] = 500
-    policy: Key[Literal["boltzmann", "soft"] | None, "Policy of a reward."] = None
-    adjoint: Key[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
-    optimizer: Key[Optimizer, "Optimizer of the likelihood."] = "lbfgs"
-    tolerance: Key[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
-    start: Key[Start | None, "Initial weights; default zeros."] = None
-    start_scale: Key[NonNegative | None, "Standard deviation of the initial weights."] = None
-    satisfaction_over: Key[
+    discount: TomlKey[Discount, "Discount of the learned reward."]
+    mu: TomlKey[NonNegative | None, "Weight of the satisfaction probability, equation (2.6)."] = (
+        None
+    )
+    steps: TomlKey[Count, "Largest number of steps of the optimizer."] = 500
+    policy: TomlKey[Literal["boltzmann", "soft"] | None, "Policy of a reward."] = None
+    adjoint: TomlKey[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
+    optimizer: TomlKey[Optimizer, "Optimizer of the likelihood."] = "lbfgs"
+    tolerance: TomlKey[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
+    start: TomlKey[Start | None, "Initial weights; default zeros."] = None
+    start_scale: TomlKey[NonNegative | None, "Standard deviation of the initial weights."] = None
+    satisfaction_over: TomlKey[
         Literal["initial", "all"], "States over which mu weighs the satisfaction probability."
     ] = "initial"
-    avoid: Key[Propositions | None, "Propositions that add the feature avoid; default none."] = None
-    goal: Key[Propositions | None, 'Goal cells, for in = "world"; default none.', '["y"]'] = None
-    progress: Key[
+    avoid: TomlKey[
+        Propositions | None, "Propositions that add the feature avoid; default none."
+    ] = None
+    goal: TomlKey[Propositions | None, 'Goal cells, for in = "world"; default none.', '["y"]'] = (
+        None
+    )
+    progress: TomlKey[
         Progress | None,
         "Propositions or automaton states of the feature progress; default mlirl.progress_states.",
         "[1, 2]",
@@ -194,9 +200,9 @@ class LearnerTable(OptimizerTable):
 class MlirlFile(TaskFile):
     """A task file of ``mlirl``."""
 
-    world: Key[WorldTable, "Where demonstrations were made."]
-    demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
-    learner: Key[LearnerTable, "The learner and its hyperparameters."]
+    world: TomlKey[WorldTable, "Where demonstrations were made."]
+    demonstrations: TomlKey[DemonstrationsTable, "What was demonstrated."]
+    learner: TomlKey[LearnerTable, "The learner and its hyperparameters."]
 
     def __attrs_post_init__(self) -> None:
         super().__attrs_post_init__()

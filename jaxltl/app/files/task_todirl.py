@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
-from typing import Annotated as Key
+from typing import Annotated as TomlKey
 
 import attrs
 
@@ -56,12 +56,16 @@ REWARDS = ("progress", "failure", "step", "won", "lost")
 class WorldTable(GridTable):
     """``[world]``: the training worlds."""
 
-    maps: Key[Maps, "Maps of the training worlds."]
-    objects: Key[ColorCounts | None, "Kinds of goal cells, by colours; default o1, o2, o3."] = None
-    obstacles: Key[ColorCounts | None, "Kinds of obstacles, by colours; default ob."] = None
-    margin: Key[Count | None, "Rings of cells that are seen, not entered; default 1.", "2"] = None
-    initial: Key[Text | None, "Formula of initial cells; default all cells.", '"s"'] = None
-    transitions: Key[
+    maps: TomlKey[Maps, "Maps of the training worlds."]
+    objects: TomlKey[ColorCounts | None, "Kinds of goal cells, by colours; default o1, o2, o3."] = (
+        None
+    )
+    obstacles: TomlKey[ColorCounts | None, "Kinds of obstacles, by colours; default ob."] = None
+    margin: TomlKey[Count | None, "Rings of cells that are seen, not entered; default 1.", "2"] = (
+        None
+    )
+    initial: TomlKey[Text | None, "Formula of initial cells; default all cells.", '"s"'] = None
+    transitions: TomlKey[
         None,
         "Belongs to mlirl.",
         Meta(
@@ -81,12 +85,14 @@ class WorldTable(GridTable):
 class DemonstrationsTable(SyntheticTable):
     """``[demonstrations]``: files, or simulated ones."""
 
-    files: Key[Files | None, "Files of demonstrations, one per world; default none."] = None
-    progress: Key[Number | None, "Expert's reward of progress of the automaton; default 10."] = None
-    failure: Key[Number | None, "Expert's reward of violating the formula; default -10."] = None
-    step: Key[Number | None, "Expert's reward of each step; default -1."] = None
-    won: Key[Number | None, "Expert's reward in satisfied states; default 3."] = None
-    lost: Key[Number | None, "Expert's reward in violated states; default -3."] = None
+    files: TomlKey[Files | None, "Files of demonstrations, one per world; default none."] = None
+    progress: TomlKey[
+        Number | None, "Expert's reward of progress of the automaton; default 10."
+    ] = None
+    failure: TomlKey[Number | None, "Expert's reward of violating the formula; default -10."] = None
+    step: TomlKey[Number | None, "Expert's reward of each step; default -1."] = None
+    won: TomlKey[Number | None, "Expert's reward in satisfied states; default 3."] = None
+    lost: TomlKey[Number | None, "Expert's reward in violated states; default -3."] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("files", "synthetic"), "files = [...] or synthetic = N")
@@ -108,20 +114,20 @@ class DemonstrationsTable(SyntheticTable):
 class LearnerTable(OptimizerTable):
     """``[learner]``: hyperparameters; see ``jaxltl.algos.todirl.Hparams`` for other defaults."""
 
-    method: Key[Literal["todirl"], "Learning algorithm."]
-    discount: Key[Unit, "Discount of the learned reward; 1 needs a horizon.", "0.95"]
-    memory: Key[Text | None, "Formula of the memory; default the task's.", '"F o1"'] = None
-    radius: Key[WholeNumber, "Cells that are observed around the own one."] = 1
-    hidden: Key[Widths, "Widths of the reward network's hidden layers."] = attrs.field(
+    method: TomlKey[Literal["todirl"], "Learning algorithm."]
+    discount: TomlKey[Unit, "Discount of the learned reward; 1 needs a horizon.", "0.95"]
+    memory: TomlKey[Text | None, "Formula of the memory; default the task's.", '"F o1"'] = None
+    radius: TomlKey[WholeNumber, "Cells that are observed around the own one."] = 1
+    hidden: TomlKey[Widths, "Widths of the reward network's hidden layers."] = attrs.field(
         factory=lambda: [80, 80]
     )
-    steps: Key[Count, "Largest number of steps of the optimizer."] = 300
-    patience: Key[
+    steps: TomlKey[Count, "Largest number of steps of the optimizer."] = 300
+    patience: TomlKey[
         Count | None, "Steps without a better held-out likelihood after which learning ends."
     ] = None
-    held_out: Key[Discount, "Share of the demonstrations that is held out.", "0.1"] = 0.2
-    optimizer: Key[Optimizer | None, "Optimizer of the likelihood."] = None
-    horizon: Key[Count | None, "Steps of an episode; default unbounded."] = None
+    held_out: TomlKey[Discount, "Share of the demonstrations that is held out.", "0.1"] = 0.2
+    optimizer: TomlKey[Optimizer | None, "Optimizer of the likelihood."] = None
+    horizon: TomlKey[Count | None, "Steps of an episode; default unbounded."] = None
 
     def __attrs_post_init__(self) -> None:
         if self.discount == 1 and self.horizon is None:
@@ -147,13 +153,15 @@ class LearnerTable(OptimizerTable):
 class TestTable(Table):
     """``[test]``: worlds for the evaluation, which have no part in learning."""
 
-    maps: Key[Maps | None, "Test worlds; default none."] = None
-    generate: Key[Count | None, "Number of random test worlds; default none."] = None
-    obstacles: Key[WholeNumber | None, "Random obstacles; default as in training."] = None
-    min_distance: Key[Count | None, "Least distance of random objects; default 3.", "4"] = None
-    shape: Key[Shape | None, "Rows and columns of a random world; default as in training."] = None
-    seed: Key[WholeNumber | None, "First seed of the random worlds; default 0."] = None
-    leave_out: Key[Names, "Names of test worlds that do not count in means."] = attrs.field(
+    maps: TomlKey[Maps | None, "Test worlds; default none."] = None
+    generate: TomlKey[Count | None, "Number of random test worlds; default none."] = None
+    obstacles: TomlKey[WholeNumber | None, "Random obstacles; default as in training."] = None
+    min_distance: TomlKey[Count | None, "Least distance of random objects; default 3.", "4"] = None
+    shape: TomlKey[Shape | None, "Rows and columns of a random world; default as in training."] = (
+        None
+    )
+    seed: TomlKey[WholeNumber | None, "First seed of the random worlds; default 0."] = None
+    leave_out: TomlKey[Names, "Names of test worlds that do not count in means."] = attrs.field(
         factory=list
     )
 
@@ -169,10 +177,10 @@ class TodirlFile(TaskFile):
     """A task file of ``todirl``."""
 
     LABEL_ON: ClassVar[str] = "exit"
-    world: Key[WorldTable, "The training worlds."]
-    demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
-    learner: Key[LearnerTable, "The learner and its hyperparameters."]
-    test: Key[TestTable | None, "The test worlds."] = None
+    world: TomlKey[WorldTable, "The training worlds."]
+    demonstrations: TomlKey[DemonstrationsTable, "What was demonstrated."]
+    learner: TomlKey[LearnerTable, "The learner and its hyperparameters."]
+    test: TomlKey[TestTable | None, "The test worlds."] = None
 
     def __attrs_post_init__(self) -> None:
         files, count = self.demonstrations.files, len(self.world.maps)

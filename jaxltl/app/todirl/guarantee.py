@@ -41,7 +41,7 @@ def check_attainable(setup: Setup) -> None:
             require_attainable(
                 part_of(setup.worlds.model, w),
                 sure.best,
-                float(setup.asked),
+                float(setup.requested),
                 task.over,
                 scene.place,
             )
@@ -56,9 +56,11 @@ def check_attainable(setup: Setup) -> None:
 def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
     """Mixes plans ``[W, S, Q, A]`` of all actions and of optimal ones, in the first W worlds."""
     assert setup.sure is not None
-    asked, over = float(setup.asked), setup.task.over
+    requested, over = float(setup.requested), setup.task.over
     return [
-        reaching(part_of(setup.worlds.model, w), policy[w], inside[w], sure.best, asked, over=over)
+        reaching(
+            part_of(setup.worlds.model, w), policy[w], inside[w], sure.best, requested, over=over
+        )
         for w, sure in enumerate(setup.sure[: len(policy)])
     ]
 
@@ -69,7 +71,9 @@ def step_bounds(setup: Setup) -> list[StepBound] | None:
     for w, (scene, sure) in enumerate(zip(setup.worlds.scenes, setup.sure or (), strict=True)):
         with errors_in(f"{task.path}: [task] in the world {scene.name}: "):
             model = part_of(setup.worlds.model, w)
-            bound = step_bound(model, sure, setup.asked, task.over, task.steps, task.steps_factor)
+            bound = step_bound(
+                model, sure, setup.requested, task.over, task.steps, task.steps_factor
+            )
         if bound is None:
             return None
         found.append(bound)
@@ -105,28 +109,28 @@ def likeliest(
         return Attempt(held, loss, min(each), weight, 0.0, learned)
 
     found = [judged(free, 0.0)]
-    if found[0].attained < float(setup.asked) and train is not None:
-        found += _bracket(lambda mu: judged(train(mu), mu), float(setup.asked))
+    if found[0].attained < float(setup.requested) and train is not None:
+        found += _bracket(lambda mu: judged(train(mu), mu), float(setup.requested))
     return min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
 
 
-def _bracket(tried: Callable[[float], Attempt], asked: float) -> Iterator[Attempt]:
+def _bracket(tried: Callable[[float], Attempt], requested: float) -> Iterator[Attempt]:
     """Yields attempts with increasing weights until one suffices, then by bisection."""
     # The likelihood has several maxima, and those found from too large a weight are lower.
     low = 0.0
     for high in map(float, _WEIGHTS):
         last = tried(high)
         yield last
-        if last.attained >= asked:
+        if last.attained >= requested:
             break
         low = high
     else:
         return
     low = low or high * 1e-3
     for _ in range(_HALVINGS):
-        if asked <= last.attained <= asked + _AIM:
+        if requested <= last.attained <= requested + _AIM:
             return
         middle = float(np.sqrt(low * high))
         last = tried(middle)
         yield last
-        low, high = (low, middle) if last.attained >= asked else (middle, high)
+        low, high = (low, middle) if last.attained >= requested else (middle, high)

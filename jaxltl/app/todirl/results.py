@@ -62,7 +62,7 @@ class Setup:
     soft: bool  # whether the expert is soft-optimal for a reward, not the quickest optimal policy
     demonstrations: list[Trajectories]  # in each of the training worlds
     dropped: int  # number of simulated demonstrations that do not satisfy the formula
-    asked: str | float  # the guarantee; a probability of 1 is "best"
+    requested: str | float  # the guarantee; a probability of 1 is "best"
     # optimal actions in each world; None without a guarantee
     sure: list[OptimalActions] | None = None
     # bounds on the expected steps in each world; None without a guarantee and for safety formulas
@@ -78,7 +78,7 @@ class Setup:
 
     @property
     def is_probability(self) -> bool:
-        return not isinstance(self.asked, str)
+        return not isinstance(self.requested, str)
 
     @property
     def groups(self) -> dict[str, slice]:
@@ -151,7 +151,7 @@ def summary(outcome: Outcome) -> Record:
         "radius": task.learner.radius,
         "horizon": task.learner.horizon,
         "guarantee": {
-            "asked": setup.asked,
+            "asked": setup.requested,
             "over": task.over,
             "left_out": setup.left_out,
             "unused": setup.unused and {"steps": setup.unused, "of": setup.unused + sum(pairs)},

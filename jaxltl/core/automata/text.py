@@ -78,14 +78,14 @@ def _telling(chosen: set[int], others: set[int], width: int) -> int:
         if not mixed:
             return kept
 
-        def told(p: int, mixed: list[tuple[list[int], list[int]]] = mixed) -> int:
+        def score(p: int, mixed: list[tuple[list[int], list[int]]] = mixed) -> int:
             pairs = 0
             for left, right in mixed:
                 held, others_held = (sum(n >> p & 1 for n in part) for part in (left, right))
                 pairs += held * (len(right) - others_held) + (len(left) - held) * others_held
             return pairs
 
-        kept |= 1 << max(range(width), key=told)
+        kept |= 1 << max(range(width), key=score)
 
 
 def _diagram_of(letters: set[int], width: int, diagrams: Diagrams) -> int:

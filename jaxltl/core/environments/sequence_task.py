@@ -187,11 +187,11 @@ def draw_sequence(key: Key, sampler: SequenceSampler) -> Sequence:
     wanted = 1 + size(keys[1], sampler.reach, (depth, 1))
     shunned = size(keys[2], sampler.avoid, (depth, 1))
     rank = jnp.argsort(jnp.argsort(jax.random.uniform(keys[3], (depth, count)), -1), -1)
-    asked = (jnp.arange(depth) < length)[:, None]
-    reach = asked & ((rank < wanted)[..., None] & sets).any(1)
+    is_within = (jnp.arange(depth) < length)[:, None]
+    reach = is_within & ((rank < wanted)[..., None] & sets).any(1)
     before = jnp.concatenate([jnp.zeros_like(reach[:1]), reach[:-1]])
     chosen = (rank >= wanted) & (rank < wanted + shunned) & ~(before[:, None] & sets).any(-1)
-    return Sequence(reach, asked & (chosen[..., None] & sets).any(1) & ~reach, length)
+    return Sequence(reach, is_within & (chosen[..., None] & sets).any(1) & ~reach, length)
 
 
 def sequence_environment(

@@ -310,12 +310,12 @@ def _left_out_is_idle(kind: _Kind) -> bool:
 
     def listed(world: PyTree, action: PyTree, key: Key) -> PyTree:
         found = Timestep(*environment.step(world, action, key))
-        told = None
+        declared = None
         if environment.outcomes is not None:
             each, probability = environment.outcomes(world, action)
-            told = jax.vmap(kind.distinct)(each[0]), tuple(each)[1:5], probability
+            declared = jax.vmap(kind.distinct)(each[0]), tuple(each)[1:5], probability
         mask = allowed_in(environment, world)
-        return kind.distinct(found.world), found[1:5], told, mask, environment.labels(world)
+        return kind.distinct(found.world), found[1:5], declared, mask, environment.labels(world)
 
     shown = jax.make_jaxpr(kind.distinct)(kind.like).jaxpr
     kept = {id(x) for x in shown.outvars}  # as they are; of a part of an array nothing is known
@@ -379,10 +379,12 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
             paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
             drawn = jnp.concatenate([drawn, paid], axis=-1)
         else:
-            told, probability = environment.outcomes(world, action)
+            declared, probability = environment.outcomes(world, action)
             probability = jnp.asarray(probability)
-            rest = [jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in tuple(told)[1:]]
-            found = Timestep(told[0], *rest)
+            rest = [
+                jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in tuple(declared)[1:]
+            ]
+            found = Timestep(declared[0], *rest)
         return _Followers(
             _plain(found.world),
             jax.vmap(environment.labels)(found.world),
@@ -490,7 +492,7 @@ def _numbered(
     return place[inverse.reshape(-1)], np.array(new, np.int64)
 
 
-def _check(found: _Followers, base: int, told: bool) -> None:
+def _check(found: _Followers, base: int, declared: bool) -> None:
     """Refuses undeclared randomness, disagreeing distributions and states without actions."""
     stuck = np.flatnonzero(~found.allowed.any(axis=1))
     if stuck.size:
@@ -499,7 +501,7 @@ def _check(found: _Followers, base: int, told: bool) -> None:
             "the order of the search; end the episode there."
         )
     drawn = _rows(found.drawn)  # [B, A, N]
-    if told:
+    if declared:
         sums = found.probability.sum(axis=-1, dtype=np.float64)
         bad = ((np.abs(sums - 1) > 1e-5) | (found.probability < 0).any(axis=-1)) & found.allowed
         for b, a in first_true(bad):

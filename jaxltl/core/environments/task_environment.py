@@ -441,11 +441,11 @@ def _outcomes(
     before: TaskWorld,
     action: PyTree,
 ) -> tuple[Timestep, jax.Array]:
-    told, probability = outcomes(before.world, action)
-    told = Timestep(*told)
-    rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in told[1:])
+    timesteps, probability = outcomes(before.world, action)
+    timesteps = Timestep(*timesteps)
+    rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in timesteps[1:])
     return jax.vmap(lambda found: _read_on(tables, labels, before, found))(
-        Timestep(told.world, *rest)
+        Timestep(timesteps.world, *rest)
     ), probability
 
 

@@ -248,10 +248,10 @@ def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
     moves = claim.moves
     base = int(moves.action.max()) + 1
     known = (action >= 0) & (action < base)
-    asked = np.arange(action.shape[0])[:, None] * base + np.where(known, action, 0)
+    requested = np.arange(action.shape[0])[:, None] * base + np.where(known, action, 0)
     number = moves.state * base + moves.action
-    place = np.minimum(np.searchsorted(number, asked), number.size - 1)
-    valid = known & (number[place] == asked)
+    place = np.minimum(np.searchsorted(number, requested), number.size - 1)
+    valid = known & (number[place] == requested)
     wrong = np.argwhere(where[:, None] & ~valid)
     if not wrong.size:
         return ""

@@ -51,8 +51,8 @@ class Property:
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
 
     Example:
-      >>> asked = parse_property('Pmax>=0.9 [ F "goal" ]')
-      >>> asked.operator, asked.objective, asked.relation, str(asked.threshold), str(asked.path)
+      >>> prop = parse_property('Pmax>=0.9 [ F "goal" ]')
+      >>> prop.operator, prop.objective, prop.relation, str(prop.threshold), str(prop.path)
       ('P', 'max', '>=', '9/10', 'F goal')
     """
 
@@ -281,25 +281,25 @@ class _Parser(TokenStream):
         place, kind = self.token, self.take().text
         self.require(kind in FILTERS, f"the kind of the filter: {', '.join(FILTERS)}", place)
         self.expect(",")
-        first, before, asked = self.token, self.place, None
+        first, before, inner = self.token, self.place, None
         if first.kind == "word" and _OPERATOR.fullmatch(first.text):
-            asked = self.property_()
-        if asked is None or self.token.text not in (",", ")"):  # it begins a state formula
+            inner = self.property_()
+        if inner is None or self.token.text not in (",", ")"):  # it begins a state formula
             self.place = before
-            asked = self.state_property()
+            inner = self.state_property()
         wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
         self.require(
-            FILTERS[kind] in (None, asked.relation is not None),
+            FILTERS[kind] in (None, inner.relation is not None),
             f"{wanted} in a filter of this kind",
             first,
         )
         among, defined = self.scoped(self.state_content) if self.accept(",") else (TRUE, ())
         self.expect(")", " or ','")
         return replace(
-            asked,
+            inner,
             text=self.written(start),
             name=name,
-            definitions=(*asked.definitions, *defined),
+            definitions=(*inner.definitions, *defined),
             aggregate=kind,
             among=among,
         )

@@ -227,15 +227,15 @@ class LocalTable:
         bits = sum(width for *_, width in self.pieces)
         self.number = np.full(1 << bits, -1, np.int32) if bits <= _DENSE_BITS else None
         self.known = HashTable(len(code.support))
-        self.asked = self.size = 0
+        self.num_requested = self.size = 0
         self.table: Choices | None = None
 
     def choices(self, words: Words) -> tuple[Choices, Integers]:
         """Choices, and the index of each state among those that they are of."""
-        self.asked += words[0].size
+        self.num_requested += words[0].size
         if self.number is not None:
             index = self._dense(self.number, words)
-        elif self.size < max(_TRIAL, min(_MOST, self.asked // _GAIN)):
+        elif self.size < max(_TRIAL, min(_MOST, self.num_requested // _GAIN)):
             support = map(np.uint64, self.code.support)
             index = self.known.insert(tuple(map(np.bitwise_and, words, support)))
         else:

@@ -29,7 +29,7 @@ from jaxltl.core.programs.weights import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import complement_event
-from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.interval.robust import requested_width
 from jaxltl.core.values.properties.answers import Answer
 from jaxltl.core.values.properties.solve_property import TOLERANCE, as_answer, solve_property
 
@@ -104,7 +104,7 @@ def solve_program(
             )
         return cast(Answer, solve_property(model, prop, tolerance=tolerance))
     validation.choice("method", method, ("build", "partial"))
-    tolerance = width_asked(tolerance)
+    tolerance = requested_width(tolerance)
     max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
     if program.kind == "smg" or program.has_intervals or program.parameters:
         raise ValueError(

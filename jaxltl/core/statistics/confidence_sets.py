@@ -134,7 +134,7 @@ def intervals_from_counts(
     row = np.repeat(np.arange(listed.size), listed)
     shape = (listed.size,) if entry_start is not None else is_entry.shape[:-1]
     outcomes = _outcomes(num_outcomes, listed, shape)
-    asked = _asked(rows, shape)
+    claimed = _claimed(rows, shape)
     total = np.bincount(row, count, listed.size).astype(np.int64)
     if (total >= _MOST).any():
         raise ValueError(
@@ -143,23 +143,23 @@ def intervals_from_counts(
         )
     by_row = method == "weissman"
     claims = np.where((outcomes > 2) & ~np.array(by_row), outcomes, outcomes > 1)
-    num_claims = _claims(num_claims, int(claims[asked].sum()))
+    num_claims = _claims(num_claims, int(claims[claimed].sum()))
     failure = (1 - confidence) / max(num_claims, 1)
     center = np.where(total[row] > 0, frequency(count, total[row]), 1 / np.maximum(listed, 1)[row])
     radius = None
     if by_row:
-        radius = np.where(asked, l1_radius(total, outcomes, failure), 2.0 * (outcomes > 1))
+        radius = np.where(claimed, l1_radius(total, outcomes, failure), 2.0 * (outcomes > 1))
         lower, upper = around(center, (radius / 2)[row])
         rest = radius / 2
     else:
         lower, upper = _ENDS[method](count, total[row], failure)
         rest = _ENDS[method](np.zeros_like(total), total, failure)[1] * (outcomes - listed)
     known = (outcomes == 1)[row]
-    unknown = (~asked & (outcomes > 1))[row]
+    unknown = (~claimed & (outcomes > 1))[row]
     lower = np.where(known, 1.0, np.where(unknown, 0.0, lower))
     upper = np.where(known | unknown, 1.0, upper)
     left = 1 - np.bincount(row, lower, listed.size) + (listed + 2) * _EPS
-    rest = np.minimum(np.where(asked, rest * (1 + 4 * _EPS), 1), np.clip(left, 0, 1))
+    rest = np.minimum(np.where(claimed, rest * (1 + 4 * _EPS), 1), np.clip(left, 0, 1))
     return ConfidenceSets(
         lower=_as_given(lower, is_entry),
         upper=_as_given(upper, is_entry),
@@ -319,7 +319,7 @@ def _name(row: int, shape: tuple[int, ...]) -> str:
     return f"state {place[0]}, action {place[1]}" if len(place) == 2 else f"row {place}"
 
 
-def _asked(rows: ArrayLike | None, shape: tuple[int, ...]) -> Booleans:
+def _claimed(rows: ArrayLike | None, shape: tuple[int, ...]) -> Booleans:
     if rows is None:
         return np.ones(int(np.prod(shape)), bool)
     rows = np.asarray(rows)

@@ -41,9 +41,9 @@ def over_cores(function: Callable[..., Result], *arguments: PyTree) -> Result:
 
 def num_cores() -> int:
     """Number of cores that this process uses: ``NPROC``, as in XLA, or all that it may use."""
-    asked = os.environ.get("NPROC", "")
-    if asked.isdecimal():
-        return max(int(asked), 1)
+    setting = os.environ.get("NPROC", "")
+    if setting.isdecimal():
+        return max(int(setting), 1)
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 

@@ -382,20 +382,20 @@ class _Halo(NamedTuple):
     layout: StateLayout
     rounds: PyTree
     sent: list[dict[int, np.ndarray]]
-    asked: list[np.ndarray] | None  # the states that each range asks for, in order
+    requested: list[np.ndarray] | None  # the states that each range asks for, in order
     first: dict[tuple[int, int], int]  # the first place of each received range
 
     def own(self, d: int) -> int:
         """The place of a device's first own state."""
-        return d * self.layout.size if self.asked is None else 0
+        return d * self.layout.size if self.requested is None else 0
 
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
         owner, found = self.layout.place(successor)
-        if self.asked is None:
+        if self.requested is None:
             return cast(np.ndarray, (owner * self.layout.size + found).astype(np.int32))
         for e in np.unique(owner[owner != d]):
             here = owner == e
-            of_e = _within(self.asked[d], *self.layout.span(int(e)))
+            of_e = _within(self.requested[d], *self.layout.span(int(e)))
             found[here] = self.first[d, int(e)] + np.searchsorted(of_e, successor[here])
         return found.astype(np.int32)
 
@@ -406,16 +406,18 @@ def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
 
 def _halo(layout: StateLayout, parts: Mapping[int, SparseMDP]) -> _Halo:
     count, size = layout.parts, layout.size
-    asked = {}
+    requested = {}
     for d, part in parts.items():
         wanted = np.zeros(layout.num_given, bool)
         wanted[part.successor] = True
         wanted[slice(*layout.span(d))] = False
-        asked[d] = np.flatnonzero(wanted)
-    lengths = np.concatenate(layout.exchanged({d: np.array([x.size]) for d, x in asked.items()}))
+        requested[d] = np.flatnonzero(wanted)
+    lengths = np.concatenate(
+        layout.exchanged({d: np.array([x.size]) for d, x in requested.items()})
+    )
     if lengths.sum() > _HALO * layout.num_given * (count - 1):
         return _Halo(layout, None, [], None, {})
-    every = layout.exchanged(asked)
+    every = layout.exchanged(requested)
     rounds, sent, first, begins = [], [], {}, size
     for k in range(1, count):
         lists = [_within(x, *layout.span((d + k) % count)) for d, x in enumerate(every)]

@@ -150,12 +150,14 @@ def largest(
     The value of the mixture meets the first ones; no value that meets the second ones is larger.
     """
     least, count = thresholds[0], len(points)
-    asked = np.flatnonzero(np.isfinite(least))
+    constrained = np.flatnonzero(np.isfinite(least))
     lower, share = -np.inf, np.full(count, 1 / count)
-    mixtures = _largest_mixtures(points, index, least, asked, scale) if asked.size else []
+    mixtures = (
+        _largest_mixtures(points, index, least, constrained, scale) if constrained.size else []
+    )
     if known is not None:
         mixtures.append(np.append(known, np.zeros(count - known.size)))
-    mixtures += list(np.eye(count)[(points[:, asked] >= least[asked]).all(1)])
+    mixtures += list(np.eye(count)[(points[:, constrained] >= least[constrained]).all(1)])
     for tried in mixtures:
         single = np.count_nonzero(tried) == 1
         value = points[tried.argmax()] if single else mixture(points, tried)
@@ -166,20 +168,20 @@ def largest(
 
 
 def _largest_mixtures(
-    points: Floats, index: int, least: Floats, asked: Integers, scale: Floats
+    points: Floats, index: int, least: Floats, constrained: Integers, scale: Floats
 ) -> list[Floats]:
     """Candidates for the best mixture under thresholds."""
-    inner = separation(points[:, asked], least[asked], scale[asked]).share
-    kept = np.append(asked, index)
+    inner = separation(points[:, constrained], least[constrained], scale[constrained]).share
+    kept = np.append(constrained, index)
     ahead = (points - np.where(np.isfinite(least), least, 0))[:, kept] / scale[kept]
-    found = _apart(ahead, np.append(np.zeros(asked.size), 1.0))
+    found = _apart(ahead, np.append(np.zeros(constrained.size), 1.0))
     if found is None:
         return [inner]
     best = found[2]
     # A program is rounded: a small share of an inner point makes up for its error.
-    misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
+    misses = (least - mixture(points, best))[constrained] + 4 * _EPS * np.abs(least[constrained])
     misses = np.maximum(misses, 0)
-    spare = (mixture(points, inner) - least)[asked]
+    spare = (mixture(points, inner) - least)[constrained]
     if not (spare > 0).all():
         return [best, inner]
     part = float((misses / (misses + spare)).max())
@@ -192,7 +194,7 @@ def _outer(
     """Upper bound of an objective within half-spaces, and the vector that attains it."""
     from scipy import optimize
 
-    asked = np.isfinite(least)
+    constrained = np.isfinite(least)
     normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
     size = len(scale)
     goal = np.zeros(size)
@@ -209,10 +211,10 @@ def _outer(
     if not normal[index] > 0:
         return np.inf, found.x * scale
     others = np.arange(size) != index
-    needless = others & ~asked
+    needless = others & ~constrained
     if (normal[needless] > 1e-12 * normal[index]).any():
         return np.inf, found.x * scale
-    taken = np.where(others & asked, least, 0)
+    taken = np.where(others & constrained, least, 0)
     upper = (bound - normal @ taken) / normal[index]
     slack = (
         8

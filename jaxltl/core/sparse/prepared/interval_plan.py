@@ -221,19 +221,19 @@ class _RecordingMDP(UncertainMDP):
 
     def _record(self, row: Integers, entries: Booleans) -> None:
         start, lower = self.mdp.entry_start, self.lower
-        asked = np.zeros(self.mdp.num_rows, bool)
-        asked[row] = True
+        queried = np.zeros(self.mdp.num_rows, bool)
+        queried[row] = True
         needed = np.logical_or.reduceat(~entries & (lower > 0), start[:-1])
         some = np.logical_or.reduceat(entries, start[:-1])
         every = np.logical_and.reduceat(entries, start[:-1])
-        asked &= some & ~needed & ~every
-        if not asked.any():
+        queried &= some & ~needed & ~every
+        if not queried.any():
             return
         room = row_sums(np.where(entries, self.upper, 0), start, -self._ones) >= 0
-        entry = np.flatnonzero(entries & asked[self.mdp.row])
-        group = (np.cumsum(asked) - 1)[self.mdp.row[entry]]
-        rows = np.flatnonzero(asked)
-        self.log.append(RoomQueries(self.origin[entry], group, rows, room[asked]))
+        entry = np.flatnonzero(entries & queried[self.mdp.row])
+        group = (np.cumsum(queried) - 1)[self.mdp.row[entry]]
+        rows = np.flatnonzero(queried)
+        self.log.append(RoomQueries(self.origin[entry], group, rows, room[queried]))
 
 
 def _recording(model: UncertainMDP, log: list[RoomQueries]) -> _RecordingMDP:

@@ -32,7 +32,12 @@ from jaxltl.core.sparse.linear.gauss_seidel import (
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import group_starts, row_entries
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
-from jaxltl.core.sparse.solvers.shortest_path_problem import TINY, Enclosure, Relative, ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import (
+    TINY,
+    Enclosure,
+    RelativeTolerance,
+    ShortestPathProblem,
+)
 
 _EPS = float(np.finfo(np.float64).eps)
 # A model mixes well, so that sweeps beat elimination, if a search meets many states in few steps.
@@ -323,7 +328,7 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     known, highest, problem = reduced.known_value, reduced.highest, reduced.problem
     if problem is None:
         return Enclosure(known, known, known, reduced.known_row, 0, 0.0, "the graph")
-    relative = isinstance(tolerance, Relative) or not np.isfinite(highest)
+    relative = isinstance(tolerance, RelativeTolerance) or not np.isfinite(highest)
     found = solve_shortest_path(
         problem, maximize=reduced.maximize, tolerance=tolerance, relative=relative
     )

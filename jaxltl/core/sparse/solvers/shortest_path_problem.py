@@ -22,13 +22,13 @@ from jaxltl.core.sparse.rows import (
 TINY = 1e-290  # products that underflow: relative errors do not count them
 
 
-class Relative(float):
+class RelativeTolerance(float):
     """A width of bounds relative to the value, where a plain number would be absolute."""
 
 
 def as_width(tolerance: SupportsFloat) -> float:
-    """A tolerance as a float, or as :class:`Relative`."""
-    return tolerance if isinstance(tolerance, Relative) else float(tolerance)
+    """A tolerance as a float, or as :class:`RelativeTolerance`."""
+    return tolerance if isinstance(tolerance, RelativeTolerance) else float(tolerance)
 
 
 @dataclass(frozen=True)

@@ -130,18 +130,18 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
       >>> mean.value.tolist(), mean.policy.tolist()
       ([2.0, 2.0], [1, 0])
     """
-    asked = as_game(game)
-    refuse_sharded(asked)
-    if is_traced((asked, reward)):
+    game_model = as_game(game)
+    refuse_sharded(game_model)
+    if is_traced((game_model, reward)):
         raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")
-    form, reward = compiled_form(asked, reward)
+    form, reward = compiled_form(game_model, reward)
     if isinstance(form.mdp, SparseMDP):
         host = form.mdp.host
         earned = pad_rows(form.mdp, choice_reward(form.mdp, reward))
         found = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
         row = pad_rows(form.mdp, np.arange(host.num_rows))
         policy = row[np.arange(host.num_states), np.asarray(found.policy)]
-        return reshape_solution(asked, replace(found, policy=jnp.asarray(policy, jnp.int32)))
+        return reshape_solution(game_model, replace(found, policy=jnp.asarray(policy, jnp.int32)))
     game, reward = form, expected_reward(form, reward)
     if not is_deterministic(game):
         raise ValueError(

@@ -170,11 +170,11 @@ def strategy_value(
       [2.0, 2.0]
     """
     (max_steps,) = validation.options("strategy_value", options, max_steps=100_000)
-    asked = as_game(game)
-    form, reward = compiled_form(asked, reward)
+    game_model = as_game(game)
+    form, reward = compiled_form(game_model, reward)
     if isinstance(environment, str):
         environment = None
-    strategy, environment = (flatten_policy(asked.mdp, x) for x in (strategy, environment))
+    strategy, environment = (flatten_policy(game_model.mdp, x) for x in (strategy, environment))
     given = [("strategy", strategy, form.system)]
     if environment is not None:
         given.append(("environment", environment, ~form.system))
@@ -197,7 +197,9 @@ def strategy_value(
     moves, drawn, live = to_jax((moves, drawn, ~lost))
     checked = checked._replace(used=drawn)
     problem = _Problem(form, checked, moves, live, defined, reward, discount)
-    return reshape_solution(asked, _solve(problem, tolerance, max_steps, per=per, method=method))
+    return reshape_solution(
+        game_model, _solve(problem, tolerance, max_steps, per=per, method=method)
+    )
 
 
 def _read(game: Game, states: Array) -> Array:

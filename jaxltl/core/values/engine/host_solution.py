@@ -171,13 +171,15 @@ def discounted(
     earned, magnitude = finite_reward(sparse, reward)
     host, depth = sparse.host, 0
     largest = float(np.abs(earned).max()) / (1 - float(discount))
-    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
+    requested = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
     if policy is not None:
         chain = induced_chain(model, sparse, policy)
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
-    found = discounted_value(host, earned, magnitude, float(discount), tolerance=asked, depth=depth)
-    solution = solution_from_enclosure(model, sparse, found, asked, relative=False)
+    found = discounted_value(
+        host, earned, magnitude, float(discount), tolerance=requested, depth=depth
+    )
+    solution = solution_from_enclosure(model, sparse, found, requested, relative=False)
     return with_given_policy(solution, policy)
 
 

@@ -47,7 +47,7 @@ def nature_direction(nature: str | None, objective: str) -> str:
     return objective if nature == "cooperative" else {"max": "min", "min": "max"}[objective]
 
 
-def width_asked(tolerance: jax.Array | float | None) -> float:
+def requested_width(tolerance: jax.Array | float | None) -> float:
     """The width of the enclosure: `tolerance`, or the default."""
     if tolerance is None:
         return TOLERANCE
@@ -105,13 +105,13 @@ def robust_reachability(
       >>> robust_reachability(model, [False, True, False]).value.tolist()
       [0.4, 1.0, 0.0]
     """
-    asked = width_asked(tolerance)
+    requested = requested_width(tolerance)
     world, sides = sides_of(model, policy, objective, nature)
     target = sides.states(state_mask(world.nominal, target, "target"))
     if stay is not None:
         stay = sides.states(state_mask(world.nominal, stay, "stay")) | sides.added
-    found = reachability(sides.host, target, sides.query(asked), stay=stay)
-    return robust_solution(world, sides, found, asked, relative=False)
+    found = reachability(sides.host, target, sides.query(requested), stay=stay)
+    return robust_solution(world, sides, found, requested, relative=False)
 
 
 @validated()
@@ -151,12 +151,12 @@ def robust_total_reward(
       >>> found.value.round(6).tolist(), found.nature.tolist()  # tosses, if nature is against it
       ([2.0, 0.0], [0.5, 0.5, 1.0])
     """
-    asked = width_asked(tolerance)
+    requested = requested_width(tolerance)
     world, sides = sides_of(model, policy, objective, nature)
     target = sides.states(state_mask(world.nominal, target, "target"))
     earned = np.where(sides.choosing, 0, interval_reward(world, reward)[sides.encoded.row])
-    found = total_reward(sides.host, earned, target, sides.query(asked))
-    return robust_solution(world, sides, found, asked, relative=True)
+    found = total_reward(sides.host, earned, target, sides.query(requested))
+    return robust_solution(world, sides, found, requested, relative=True)
 
 
 @validated()
@@ -198,10 +198,10 @@ def robust_discounted_value(
     entry, given = sides.encoded.entry, reward_structure(world.nominal, reward)
     earned = np.where(entry < 0, 0, transition_reward(world.nominal, given)[entry])
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
-    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
+    requested = 1e-8 * max(largest, 1e-300) if tolerance is None else requested_width(tolerance)
     discounts = np.where(sides.choosing, 1.0, float(discount))
-    found = discounted_value(DiscountedModel(sides.host, earned, discounts), sides.query(asked))
-    return robust_solution(world, sides, found, asked, relative=False)
+    found = discounted_value(DiscountedModel(sides.host, earned, discounts), sides.query(requested))
+    return robust_solution(world, sides, found, requested, relative=False)
 
 
 def robust_expectation(

@@ -28,7 +28,13 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.types import Solution, require_shape, row_tolerance
-from jaxltl.core.values.interval.robust import Sides, host_sides, solution_at, width_asked, world_of
+from jaxltl.core.values.interval.robust import (
+    Sides,
+    host_sides,
+    solution_at,
+    requested_width,
+    world_of,
+)
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
     automaton_and_letters,
@@ -60,7 +66,7 @@ def robust_satisfaction(
 ) -> Satisfaction:
     """Robust satisfaction probability of a task in an interval MDP; labels are read on exit."""
     world, system = world_of(model)
-    asked = width_asked(tolerance)
+    requested = requested_width(tolerance)
     automaton, letter = automaton_and_letters(world.nominal, task)
     states = starting_states(world, states)
     start = states, np.broadcast_to(automaton.initial, states.shape)
@@ -68,9 +74,9 @@ def robust_satisfaction(
         world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
     moves = None if system is None else system[product.base_state]
-    found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
+    found = _solved(host_sides(host, moves, objective, nature), host, verdicts, requested)
     row = product.base_row[found.row].astype(np.int32)
-    solution = solution_at(found, product.start, product.start.shape, row, asked)
+    solution = solution_at(found, product.start, product.start.shape, row, requested)
     return Satisfaction(solution, automaton, letter, product, row, found.value, "exit")
 
 
@@ -94,7 +100,7 @@ def robust_product_satisfaction(
             "a product of an interval model takes no mask of actions; restrict the "
             "world by with_allowed(world, rows)."
         )
-    asked = width_asked(tolerance)
+    requested = requested_width(tolerance)
     shape = model.state_shape
     state, memory = (x.ravel() for x in np.indices(shape))
     product, host, verdicts = _product(
@@ -108,14 +114,14 @@ def robust_product_satisfaction(
     sides = host_sides(host, None, objective, nature)
     if policy is not None:
         sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
-    found = _solved(sides, host, verdicts, asked)
+    found = _solved(sides, host, verdicts, requested)
     if policy is not None:
-        solution = solution_at(found, product.start, shape, np.asarray(policy), asked)
+        solution = solution_at(found, product.start, shape, np.asarray(policy), requested)
         result: Solution = solution.replace(nature=None)  # type: ignore[attr-defined]
         return result
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     found = replace(found, probability=found.probability[: product.host.num_transitions])
-    return solution_at(found, product.start, shape, policy, asked)
+    return solution_at(found, product.start, shape, policy, requested)
 
 
 def _product(

@@ -240,8 +240,10 @@ class FrontSearch:
 
     def nearest(self, wanted: np.ndarray, index: int | None = None) -> NearestMixture:
         """The mixture nearest to thresholds, with the best value of one objective if given."""
-        lower, asked = self.lower, np.isfinite(wanted)
-        apart = frontier.separation(lower[:, asked], wanted[asked], self.scale[asked])
+        lower, constrained = self.lower, np.isfinite(wanted)
+        apart = frontier.separation(
+            lower[:, constrained], wanted[constrained], self.scale[constrained]
+        )
         share = apart.share
         if index is not None:
             enough = wanted - (apart.distance + 1e-15) * self.scale

@@ -311,13 +311,13 @@ def _checked(
                 num_segments=room.shape[0],
                 indices_are_sorted=True,
             )
-            asked = high[entry]
-            given = parts(asked)
+            ends = high[entry]
+            given = parts(ends)
             # A sum near one has the right sign if no addition rounds, and the same one if nothing
             # has changed; else it does not tell.
             grain = 1 / float(jnp.finfo(low.dtype).eps)
-            coarse = parts(jnp.where(asked * grain == jnp.floor(asked * grain), 0, 1)) == 0
-            same = parts(jnp.where(asked == prepared.upper[entry], 0, 1)) == 0
+            coarse = parts(jnp.where(ends * grain == jnp.floor(ends * grain), 0, 1)) == 0
+            same = parts(jnp.where(ends == prepared.upper[entry], 0, 1)) == 0
             clear = jnp.abs(given - 1) > rounding(width, low.dtype)
             valid &= jnp.all(same | ((clear | coarse) & ((given >= 1) == room)))
     if reward is not None:

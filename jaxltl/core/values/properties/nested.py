@@ -12,7 +12,7 @@ from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties.answers import Answer
 
@@ -118,7 +118,7 @@ def _number(
     lower, value, upper = (np.array([float(x)]) for x in found)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0.0, upper - lower)[0]
-    relative = prop.operator in ("R", "T") or isinstance(tolerance, Relative)
+    relative = prop.operator in ("R", "T") or isinstance(tolerance, RelativeTolerance)
     scale = max(abs(found[0]), abs(found[2])) if relative else 1.0
     # Rounding of the aggregate itself is not counted.
     narrow = width <= tolerance * scale + 1e-14 * abs(found[1])

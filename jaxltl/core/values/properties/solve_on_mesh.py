@@ -59,9 +59,9 @@ class Question:
         names = ("value", "lower", "upper")
         small: dict[str, Array] = {name: self.taken(getattr(found, name)) for name in names}
         nobody: Array = np.zeros(0, np.int32)
-        told = replace(found, **small, policy=nobody, status=on_host(found.status))
+        solution = replace(found, **small, policy=nobody, status=on_host(found.status))
         method = "interval iteration" if self.goes_on else "policy iteration by a Krylov method"
-        return as_answer(self.prop, self.states, told, wanted, f"{method} on the mesh")
+        return as_answer(self.prop, self.states, solution, wanted, f"{method} on the mesh")
 
     def is_answered(self, answer: Answer, part: float) -> bool:
         """True if the answer needs no narrower bounds of those in :data:`FINER`."""
@@ -129,9 +129,9 @@ def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
         return result
     names = [prop.reward] if prop.reward is not None else list(model.rewards)
     if len(names) != 1 or names[0] not in model.rewards:
-        asked = "" if prop.reward is None else f" {prop.reward!r}"
+        named = "" if prop.reward is None else f" {prop.reward!r}"
         raise ValueError(
-            f"{prop.text}: which reward{asked}? The model has "
+            f"{prop.text}: which reward{named}? The model has "
             f"{', '.join(map(repr, model.rewards)) or 'none'}."
         )
     return model.rewards[names[0]]

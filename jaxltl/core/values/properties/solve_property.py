@@ -36,12 +36,12 @@ from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_pro
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Reward, SparseMDP
-from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Solution, Status
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.values.average.average_reward import average_reward
-from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.interval.robust import requested_width
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -152,7 +152,7 @@ def solve_property(
             f"{prop.text}: relative=True is for probabilities of path formulas, without intervals, "
             "and for total rewards."
         )
-    width = Relative if relative else float
+    width = RelativeTolerance if relative else float
     if prop.operator == "multi":
         if states is not None or isinstance(model, IntervalMDP):
             what = "from other than the initial states" if states is not None else "with intervals"
@@ -165,7 +165,7 @@ def solve_property(
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
-    tolerance = width_asked(tolerance)
+    tolerance = requested_width(tolerance)
     solve = partial(_solved, _Query(model, states, prop.text), prop, _aim(model, prop))
     found = solve(width(tolerance))
     if prop.relation is None:
@@ -198,7 +198,7 @@ def _filter(
     shares = {"sum": len(among), "range": 2}
     part = replace(prop, aggregate=None, definitions=())
     fine = tolerance / shares.get(str(prop.aggregate), 1)
-    relative = isinstance(tolerance, Relative)
+    relative = isinstance(tolerance, RelativeTolerance)
     answer = cast(
         Answer, solve_property(model, part, states=among, tolerance=fine, relative=relative)
     )
@@ -236,22 +236,22 @@ def _answer(
 def _status(prop: Property, found: _Found, tolerance: float) -> Status:
     """CONVERGED if the bounds at the requested states are within the tolerance."""
     lower, upper = found.solution.lower, found.solution.upper
-    told = Status(int(np.max(found.solution.status)))
-    if np.isnan(lower).any() or np.isnan(upper).any() or told == Status.INVALID:
-        return max(told, Status.NONFINITE)
+    status = Status(int(np.max(found.solution.status)))
+    if np.isnan(lower).any() or np.isnan(upper).any() or status == Status.INVALID:
+        return max(status, Status.NONFINITE)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0, upper - lower)
         most: Array = tolerance
-        relative = isinstance(tolerance, Relative)
+        relative = isinstance(tolerance, RelativeTolerance)
         if prop.operator in ("R", "T") or relative:
             most = tolerance * np.maximum(np.abs(lower), np.abs(upper))
             most = most if relative else np.maximum(most, TINY)
         narrow = (width == 0) | ((width <= most) & np.isfinite(width))
     # An average near zero is narrow as a share of the rewards that cancel out in it.
-    told_narrow = prop.path == Earned("average") and told == Status.CONVERGED
-    if narrow.all() or told_narrow:
+    proven_narrow = prop.path == Earned("average") and status == Status.CONVERGED
+    if narrow.all() or proven_narrow:
         return Status.CONVERGED
-    return max(told, Status.PRECISION)
+    return max(status, Status.PRECISION)
 
 
 def _is_exact(found: _Found) -> bool:

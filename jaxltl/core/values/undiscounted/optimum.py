@@ -273,8 +273,8 @@ def _optimize(
     small = small and combined.dispatch(type(model)) is not combined.dispatch(object)
     if small:
         run = partial(_by_policy_iteration, objective=objective)
-        asked = 2 * _half_width(model, tolerance)
-        solution, row_of = sequential_vmap(run, model, sets, components, asked)
+        requested = 2 * _half_width(model, tolerance)
+        solution, row_of = sequential_vmap(run, model, sets, components, requested)
     else:
         row_of = None
         solution = _by_intervals(model, sets, components, options, objective=objective)
@@ -290,7 +290,7 @@ def _by_policy_iteration(
     model: ActionModel,
     sets: Sets,
     components: EndComponents | None,
-    asked: Array,
+    requested: Array,
     *,
     objective: str,
 ) -> tuple[Solution, jax.Array]:
@@ -303,7 +303,7 @@ def _by_policy_iteration(
         rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
     )
     finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
-    found, leaves = solve_problem(problem, jnp.minimum(asked, finest), asked)
+    found, leaves = solve_problem(problem, jnp.minimum(requested, finest), requested)
     value, lower, upper = (
         jnp.where(open_, x, one) for x in (found.value, found.lower, found.upper)
     )

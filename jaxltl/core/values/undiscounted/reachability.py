@@ -27,7 +27,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
-from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, Relative, as_width
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance, as_width
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_states
 from jaxltl.core.values.engine.state_quantities import reduction_for
@@ -164,13 +164,13 @@ def refuse_iteration(max_steps: object, start: object) -> None:
         )
 
 
-def relative_width(model: Model | IntervalMDP, tolerance: Array | None) -> Relative:
+def relative_width(model: Model | IntervalMDP, tolerance: Array | None) -> RelativeTolerance:
     """A tolerance relative to the value; ValueError unless the model is sparse, without intervals."""
     if isinstance(model, IntervalMDP) or not is_sparse(model):
         raise ValueError(
             f"relative=True is for a SparseMDP, not for a {type(model).__name__} (see to_sparse)."
         )
-    return Relative(default_tolerance(model) if tolerance is None else tolerance)
+    return RelativeTolerance(default_tolerance(model) if tolerance is None else tolerance)
 
 
 def _on_host(
@@ -185,7 +185,7 @@ def _on_host(
     sparse = rows_of_model(model)
     # An optimum of a small model is as close as possible in any case, for its ties.
     exact = stay is None and not is_sparse(model) and (tolerance is None or policy is None)
-    asked, fine = _tolerances(model, tolerance, exact=exact)
+    requested, fine = _tolerances(model, tolerance, exact=exact)
     host, depth = sparse.host, 0
     if policy is not None:
         host, _, depth = induced_chain(model, sparse, policy)
@@ -195,7 +195,9 @@ def _on_host(
             found, row=_fastest(host, np.asarray(target, bool).ravel(), objective, found)
         )
     return with_given_policy(
-        solution_from_enclosure(model, sparse, found, asked, relative=isinstance(asked, Relative)),
+        solution_from_enclosure(
+            model, sparse, found, requested, relative=isinstance(requested, RelativeTolerance)
+        ),
         policy,
     )
 
@@ -203,13 +205,13 @@ def _on_host(
 def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[float, float]:
     """The width of the enclosure that counts as converged, and the width to aim for."""
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
-    asked = default_tolerance(model) if tolerance is None else as_width(tolerance)
+    requested = default_tolerance(model) if tolerance is None else as_width(tolerance)
     if exact and tolerance is None:
-        asked = 2 * eps**0.5
+        requested = 2 * eps**0.5
     small = model.num_states <= _FINE_LIMIT
     if exact and (tolerance is None or small):
-        return asked, min(asked, max(4 * eps, 1e-12 if small else 1e-11))
-    return asked, asked
+        return requested, min(requested, max(4 * eps, 1e-12 if small else 1e-11))
+    return requested, requested
 
 
 def rows_of_model(model: Model) -> SparseMDP:
@@ -337,9 +339,9 @@ def _by_layers(
     world = model.mdp
     if not isinstance(world, MDP) or model.label_on != "entry" or model.num_states <= QUICK_LIMIT:
         return None
-    asked, fine = _tolerances(model, tolerance, exact=True)
+    requested, fine = _tolerances(model, tolerance, exact=True)
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
-    width = fine if tolerance is None else asked - 4 * eps  # bounds are rounded outwards
+    width = fine if tolerance is None else requested - 4 * eps  # bounds are rounded outwards
     if not width > 0:
         return None
     used = support(world)
@@ -369,7 +371,7 @@ def _by_layers(
         residual=float(half.max()),
         method="sweeps in place",
     )
-    return solution_from_enclosure(model, None, bounds, asked, relative=False)
+    return solution_from_enclosure(model, None, bounds, requested, relative=False)
 
 
 def _normalised(weight: Floats) -> Floats:

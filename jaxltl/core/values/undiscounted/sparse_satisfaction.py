@@ -23,7 +23,7 @@ from jaxltl.core.pretty_print import brief, count, nested_repr
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import reachability
-from jaxltl.core.sparse.solvers.shortest_path_problem import Relative, as_width
+from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
@@ -161,13 +161,13 @@ def _best(
     else:
         aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
     whole = sparse_mdp_of_product(product)
-    asked = default_tolerance(whole) if tolerance is None else as_width(tolerance)
+    requested = default_tolerance(whole) if tolerance is None else as_width(tolerance)
     found = solution_from_enclosure(
         whole,
         whole,
-        reachability(product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
-        asked,
-        relative=isinstance(asked, Relative),
+        reachability(product.host, goal, maximize=aim == "max", tolerance=requested, depth=depth),
+        requested,
+        relative=isinstance(requested, RelativeTolerance),
     )
     row = np.asarray(found.policy)
     if visiting is not None:

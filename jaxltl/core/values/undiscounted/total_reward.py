@@ -115,7 +115,7 @@ def total_reward(
     if target is not None:
         require_states("target", target, model.state_shape)
         target = np.asarray(target, bool).ravel()
-    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    requested = default_tolerance(model) if tolerance is None else float(tolerance)
     host, depth, maximize = sparse.host, 0, objective == "max"
     if policy is not None:
         chain = induced_chain(model, sparse, policy)
@@ -123,14 +123,14 @@ def total_reward(
         host, depth = chain.mdp, chain.depth
     if target is None:
         found = optimal.reward_forever(
-            host, earned, maximize=maximize, tolerance=asked, depth=depth
+            host, earned, maximize=maximize, tolerance=requested, depth=depth
         )
     else:
         found = optimal.total_reward(
-            host, earned, target, maximize=maximize, tolerance=asked, depth=depth
+            host, earned, target, maximize=maximize, tolerance=requested, depth=depth
         )
     return with_given_policy(
-        solution_from_enclosure(model, sparse, found, asked, relative=True), policy
+        solution_from_enclosure(model, sparse, found, requested, relative=True), policy
     )
 
 
@@ -218,8 +218,8 @@ def _by_sweeps(
     padded = cast(ActionModel, model)
     earned = _on_choices(padded, world, reward)
     _require_rewards(padded, world, earned)
-    asked = default_tolerance(model) if tolerance is None else tolerance
-    return total_reward_by_sweeps(padded, earned, target, policy, asked, objective=objective)
+    requested = default_tolerance(model) if tolerance is None else tolerance
+    return total_reward_by_sweeps(padded, earned, target, policy, requested, objective=objective)
 
 
 def _on_choices(model: ActionModel, world: World, reward: Reward) -> Array:

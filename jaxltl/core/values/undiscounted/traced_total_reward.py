@@ -469,7 +469,7 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
 
 
 def solve_problem(
-    problem: Problem, tolerance: jax.Array, asked: jax.Array
+    problem: Problem, tolerance: jax.Array, requested: jax.Array
 ) -> tuple[Solution, jax.Array]:
     """The enclosure of a problem, of width `tolerance` if possible; converged if it is `asked`.
 
@@ -523,7 +523,7 @@ def solve_problem(
     middle = dw.words(k.bounds[0])[0] + k.gap / 2
     value = jnp.where(both, middle, jnp.maximum(dw.words(k.at.image)[0], lower))
     value = jnp.clip(value, lower, upper)
-    narrow = _width(problem, upper - lower, upper) <= asked
+    narrow = _width(problem, upper - lower, upper) <= requested
     exhausted = k.ended | (_wide(problem, k) <= inner)
     status = status_code(narrow, jnp.all(jnp.isfinite(value)), jnp.all(both) & exhausted)
     num_steps = jnp.maximum(k.num_steps, 0)

@@ -13,7 +13,7 @@ from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import policy_iteration as transient
 from jaxltl.core.sparse.solvers.reachability import reachability, total_reward
-from jaxltl.core.sparse.solvers.shortest_path_problem import Relative
+from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 
 
 def random_model(rng, num_states, most_choices=3):
@@ -210,7 +210,9 @@ def test_small_probabilities_to_a_relative_width(way, maximize):
         likely = first + rng.integers(6, size=host.num_rows) % np.diff(host.entry_start)
         weight[likely] += 1 - np.add.reduceat(weight, first)
         host = HostMDP(host.row_start, host.entry_start, host.successor, weight)
-        found = reachability(host, target, maximize=maximize, stay=stay, tolerance=Relative(1e-6))
+        found = reachability(
+            host, target, maximize=maximize, stay=stay, tolerance=RelativeTolerance(1e-6)
+        )
         best = best_of(probabilities(host, target, stay), maximize=maximize)
         encloses(found, best, maximize=maximize)
         certain = found.lower > 1e-280
