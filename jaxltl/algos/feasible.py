@@ -4,10 +4,9 @@ For a model with probabilities and rewards that are functions of parameters in a
 point at which a reachability probability or an expected total reward meets a threshold? Projected
 gradient ascent from many starts, with implicit derivatives of a prepared solve. The objective is
 the logarithm of the value, or of the odds of a probability, and coordinates are shares of the box,
-so that a learning rate means the same for every model.
-
-Gradients find local optima, in floating point: failure proves nothing, and :func:`feasible` has
-every point that meets the threshold certified by the sparse engine, on the model at that point.
+so that a learning rate means the same for every model. Gradients find local optima, in floating
+point: failure proves nothing, and :func:`feasible` has every point that meets the threshold
+certified by the sparse engine, on the model at that point.
 
 Example: a head of one coin, then a tail of another; their biases are parameters.
   >>> import jax, jax.numpy as jnp, numpy as np
@@ -508,8 +507,9 @@ def feasible(
     """
     require_problem(problem)
     threshold = validation.finite_number("threshold", threshold)
-    hparams, budget = hparams or Hparams(), budget or Budget()
+    hparams = Hparams() if hparams is None else hparams
     validation.instance("hparams", hparams, Hparams, "Hparams")
+    budget = Budget() if budget is None else budget
     validation.instance("budget", budget, Budget, "a Budget")
     key = jax.random.key(0) if key is None else key
     # A little beyond the threshold, so that rounding does not decide.

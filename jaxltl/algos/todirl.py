@@ -345,10 +345,17 @@ def objective(
     if hparams.horizon is None and problem.horizon is not None:
         counts, held_out = counts.sum(axis=1), held_out.sum(axis=1)
 
-    found = trees.each_world(
-        partial(_likelihoods, problem, hparams, parameters),
+    rewards = trees.each_world(
+        lambda model, seen: jnp.asarray(
+            reward(problem.network, parameters, model, seen), model.dtype
+        ),
         problem.model,
         problem.observation,
+    )
+    found = trees.each_world(
+        partial(_likelihoods, hparams),
+        problem.model,
+        rewards,
         (counts, held_out),
         _initial(problem, initial),
         problem.predecessors,
@@ -377,11 +384,9 @@ def objective(
 
 
 def _likelihoods(
-    problem: Problem,
     hparams: Hparams,
-    parameters: PyTree,
     model: Product,
-    observation: jax.Array,
+    rewards: jax.Array,
     counts: tuple[jax.Array, jax.Array],
     initial: jax.Array,
     predecessors: PredecessorTable | None,
@@ -390,7 +395,6 @@ def _likelihoods(
 
     That of the demonstrated ones is differentiable.
     """
-    rewards = jnp.asarray(reward(problem.network, parameters, model, observation), model.dtype)
     satisfaction, value = jnp.full((), jnp.nan, model.dtype), initial
     if hparams.horizon is not None:
         solution = _backward_induction(rewards, model, hparams)

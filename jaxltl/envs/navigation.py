@@ -323,7 +323,13 @@ def reward(world: Navigation, state: State) -> jax.Array:
 
 
 def check_task(task: object) -> None:
-    """Raises ValueError unless a task is one of the four."""
+    """Refuses what is not the number of one of the four tasks.
+
+    Raises:
+      ValueError: the task is not 1, 2, 3 or 4.
+
+    >>> check_task(3)
+    """
     if np.ndim(task) or task not in TASKS:  # type: ignore[arg-type]
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
 

@@ -8,7 +8,7 @@ from .curves import (
     paths as paths,
     sweep as sweep,
 )
-from .described import described as described
+from .alt_text import described as described
 from .episodes import (
     draw_episode as draw_episode,
     draw_episodes as draw_episodes,

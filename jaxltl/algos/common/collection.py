@@ -83,20 +83,19 @@ def acting(
     memory: PyTree = (),
 ) -> Agent:
     """The agent of an actor `evaluate`; `how`: whether actions are sampled, and their squash."""
-    return Agent(Partial(_act, struct.Static(how), actions, evaluate), memory)
+    return Agent(Partial(_act, struct.Static(how), (actions, evaluate)), memory)
 
 
 def _act(
     how: struct.Static,
-    actions: actions_of.Actions,
-    evaluate: Evaluate,
+    actor: tuple[actions_of.Actions, Evaluate],
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
     key: Key,
 ) -> tuple[jax.Array, PyTree]:
     """An action; a sampled one fails without a key, by which proofs refuse it."""
-    sampled, squash = how.value
+    (sampled, squash), (actions, evaluate) = how.value, actor
     output = evaluate(memory, observation)
     action = actions_of.chosen(key, actions, output.action, allowed, sampled=sampled, squash=squash)
     return action, output.memory
