@@ -14,13 +14,13 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 102_510,
-    "statements": 51_780,
-    "docstring lines": 16_945,
+    "lines": 98_265,
+    "statements": 49_170,
+    "docstring lines": 16_825,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,
-    "Any in annotations": 211,
-    "modules of the largest folder": 20,
+    "Any in annotations": 206,
+    "modules of the largest folder": 19,
     "names at the top level": 80,
 }
 MODULE_LINES, BODY_LINES = 600, 68
