@@ -54,7 +54,7 @@ from jaxltl.algos.common.play import (
     check_reward,
     cumulative,
     draw,
-    draw_weighted,
+    draw_from_rows,
     environment_policy,
     explicit_game,
     observed_reward,
@@ -84,6 +84,7 @@ class Problem:
       start: ``float[S]``, distribution over the chains' initial states.
       exact: ``float[S]``, the minimax value, to measure the error; or None.
       measured: ``bool[S]``, the states over which the error is measured; None with `exact`.
+      behavior_table: ``uint32[S, A]``, `behavior` as cumulative weights.
       start_table: ``uint32[S]``, `start` as cumulative weights.
       method: ``"generalized"`` or ``"maximin"``; static.
     """
@@ -95,6 +96,7 @@ class Problem:
     start: jax.Array
     exact: Array
     measured: Array
+    behavior_table: jax.Array
     start_table: jax.Array
     method: str = struct.field(pytree_node=False, default="generalized")
 
@@ -149,6 +151,7 @@ def make_problem(
         start=jnp.asarray(start, game.dtype),
         exact=None,
         measured=None,
+        behavior_table=jnp.asarray(cumulative(behavior)),
         start_table=jnp.asarray(cumulative(start)),
         method=method,
     )
@@ -493,8 +496,8 @@ def _choose(
     stream: splitmix.Stream,
 ) -> jax.Array:
     """Each chain's action: greedy with the probability of its player, else by behavior."""
-    behavior = take(problem.behavior, state.position)
-    action = draw_weighted(behavior, splitmix.words(stream, 2 * i))
+    words = splitmix.words(stream, 2 * i)
+    action = draw_from_rows(problem.behavior_table, state.position, words)
     epsilons = [hparams.epsilon, hparams.environment_epsilon]
     if epsilons == [None, None]:
         return action

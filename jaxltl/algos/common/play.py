@@ -94,11 +94,10 @@ def environment_policy(
 
 
 def cumulative(distribution: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Cumulative weights in units of ``2 ** -31``, ``uint32[S]``, for :func:`draw`."""
-    total = np.rint(np.cumsum(distribution) * 2.0**31)
-    last = np.flatnonzero(distribution > 0)[-1]
-    total[last:] = 2.0**31
-    return np.minimum(total, 2.0**31).astype(np.uint32)
+    """Cumulative weights over the last axis in units of ``2 ** -31``, for draws by 32 random bits."""
+    total, some = np.rint(np.cumsum(distribution, -1) * 2.0**31), distribution > 0
+    after = np.cumsum(some[..., ::-1], -1)[..., ::-1] - some  # positive weights after each one
+    return np.where(after > 0, np.minimum(total, 2.0**31), 2.0**31).astype(np.uint32)
 
 
 # --- inside jit -----------------------------------------------------------------------------
@@ -122,6 +121,11 @@ def draw(table: jax.Array, words: jax.Array) -> jax.Array:
 
     passes = -(-(size - 1).bit_length() // 2)
     return lax.fori_loop(0, passes, bisect_twice, jnp.zeros(point.shape, jnp.int32))
+
+
+def draw_from_rows(table: jax.Array, row: jax.Array, words: jax.Array) -> jax.Array:
+    """Actions ``int32[N]`` drawn from given rows of :func:`cumulative` weights ``uint32[S, A]``."""
+    return jnp.sum(take(table, row) <= (words >> 1)[:, None], -1, dtype=jnp.int32)
 
 
 def draw_weighted(weight: jax.Array, words: jax.Array) -> jax.Array:
