@@ -96,7 +96,8 @@ def environment_policy(
 def cumulative(distribution: NDArray[np.float64]) -> NDArray[np.uint32]:
     """Cumulative weights over the last axis in units of ``2 ** -31``, for draws by 32 random bits."""
     total, some = np.rint(np.cumsum(distribution, -1) * 2.0**31), distribution > 0
-    after = np.cumsum(some[..., ::-1], -1)[..., ::-1] - some  # positive weights after each one
+    # The number of positive weights after each one.
+    after: NDArray[np.int64] = np.cumsum(some[..., ::-1], -1)[..., ::-1] - some
     return np.where(after > 0, np.minimum(total, 2.0**31), 2.0**31).astype(np.uint32)
 
 
