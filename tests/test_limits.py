@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 98_265,
+    "lines": 98_271,
     "statements": 49_170,
-    "docstring lines": 16_825,
+    "docstring lines": 16_823,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,
     "Any in annotations": 206,
