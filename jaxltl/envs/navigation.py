@@ -323,7 +323,7 @@ def reward(world: Navigation, state: State) -> jax.Array:
 
 
 def check_task(task: object) -> None:
-    """Refuses what is not the number of one of the four tasks.
+    """Check of the number of a task.
 
     Raises:
       ValueError: the task is not 1, 2, 3 or 4.

@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import lzma
+import re
 import tarfile
 from dataclasses import replace
 from fractions import Fraction
@@ -19,7 +20,7 @@ from jaxltl.io import files as _files
 from jaxltl.io.umb import umb
 from jaxltl.io.umb import values as _umb_values
 from jaxltl.io.umb.index import Record, Type, Variable
-from jaxltl.io.umb.tar import tar_pieces, write_gzip
+from jaxltl.io.umb.tar import members, tar_pieces, write_gzip
 from jaxltl.io.umb.umb import read_umb, write_umb
 from jaxltl.io.umb.values import read_numbers, read_variables
 from tests.io.archives import (
@@ -839,3 +840,20 @@ def test_storm_finds_the_same_values(tmp_path):
     again = stormpy.build_model_from_umb(path)
     for text in ('Pmax=? [F "goal"]', 'Pmin=? [F "goal"]', 'R{"steps"}max=? [F "goal" | "Low"]'):
         assert storm_values(storm, text) == storm_values(again, text)
+
+
+def test_a_damaged_extended_header_is_no_end_of_an_archive():
+    """Python's tarfile ends silently there, without the members that follow."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as file:
+        for name in ("first.bin", "x" * 120 + ".bin", "last.bin"):
+            file.addfile(tarfile.TarInfo(name))
+    content = buffer.getvalue()
+    found = [name for name, _ in members(io.BytesIO(content))]
+    assert len(found) == 3 and found[-1] == "last.bin"
+    record = re.search(rb"\d+ path=", content)
+    assert record is not None
+    zero = b"0" * (len(record[0]) - len(b" path=")) + b" path="
+    damaged = content[: record.start()] + zero + content[record.end() :]
+    with pytest.raises(ValueError, match="a header is damaged, or data follow"):
+        list(members(io.BytesIO(damaged)))

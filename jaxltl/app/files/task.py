@@ -145,7 +145,7 @@ class OptimizerTable(LearnerTable):
     @property
     def hides_formula(self) -> str | None:
         """The key that hides the formula from the learner, if there is one."""
-        raise NotImplementedError
+        return None
 
     def hyperparameters(self) -> Record:
         """The keys that have a value, but the method."""

@@ -186,7 +186,7 @@ def certify_policy(
 def prove(
     dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
 ) -> tuple[Certificate, Abstraction, Bounds]:
-    """The certificate of a step under the best actions of a grid, and what it was made of."""
+    """The certificate of a step under the best actions of a grid, and its parts."""
     given: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
     given["tolerance"] = validation.finite_number("tolerance", given.get("tolerance", 1e-3))
     if given.get("threshold") is not None:

@@ -185,7 +185,7 @@ def _facts(value: Environment) -> tuple[str, ...]:
         propositions_text(value.propositions),
         f"at most {count(value.horizon, 'step')}" if value.horizon is not None else "",
         "actions are masked" if value.allowed is not None else "",
-        "chances are told" if value.outcomes is not None else "",
+        "outcomes are declared" if value.outcomes is not None else "",
     )
 
 

@@ -32,7 +32,7 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 _BATCH = 1024  # states of a batch, at most
 _BYTES = 2**26  # bytes of the successors of a batch, at most
 _LIVE, _TERMINATED, _TRUNCATED = range(3)
-_EVIDENCE = ("keyless", "told", "keys", "distinct")  # from the strongest to the weakest
+_EVIDENCE = ("keyless", "declared", "keys", "distinct")  # from the strongest to the weakest
 
 
 def _facts(value: Table) -> tuple[str, ...]:
@@ -62,13 +62,13 @@ class Table:
         :func:`~jaxltl.core.values.evaluation.optimality_gap.optimality_gap`.
       num_steps: the time limit, which is not part of the states, or None; static.
       evidence: the weakest justification of the probabilities, in this order; static. ``"keyless"``:
-        the program does not read the key; ``"told"``: `starts` and `outcomes` agreed with samples;
+        the program does not read the key; ``"declared"``: `starts` and `outcomes` agreed with samples;
         ``"keys"``: all sampled keys gave the same result; ``"distinct"``: the caller's `distinct`,
         which the program does not imply.
 
     >>> over = Table(
     ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
-    ...     terminated=np.array([True]), truncated=np.array([False]), evidence="told")
+    ...     terminated=np.array([True]), truncated=np.array([False]), evidence="declared")
     >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
     (1, [7], None)
     """
@@ -119,7 +119,7 @@ def tabulate(
     ...     from_dense([[[0, 1]], [[0, 1]]], initial=[1, 0]))
     >>> table = tabulate(walk)
     >>> table.world.tolist(), table.model.num_rows, table.evidence
-    ([0, 1], 2, 'told')
+    ([0, 1], 2, 'declared')
     """
     inner, limit = without_time_limit(environment)
     max_states = validation.integer("max_states", max_states, least=1)
@@ -237,7 +237,7 @@ def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[PyTre
         worlds = _plain(jax.tree.map(lambda x: jnp.asarray(x)[possible], worlds))
         if not np.isin(seen, _rows(_codes(kind, worlds)[0])).all():
             raise ValueError("reset draws a world that starts does not tell; give all of them.")
-        return worlds, probability[possible] / probability.sum(), "told"
+        return worlds, probability[possible] / probability.sum(), "declared"
     if len(np.unique(seen)) > 1:
         raise ValueError(
             f"tabulate: reset is random, {len(np.unique(seen))} worlds from {len(seen)} keys, and "
@@ -410,7 +410,7 @@ def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
     """Breadth-first search in batches."""
     environment, shape = kind.environment, kind.like
     action = jax.ShapeDtypeStruct((), jnp.int32)
-    evidence = "told"
+    evidence = "declared"
     if environment.outcomes is not None:
         _count("outcomes", jax.eval_shape(environment.outcomes, shape, action)[0][0], shape)
     else:
@@ -436,7 +436,7 @@ def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
             found = jax.tree.map(
                 lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch)
             )
-            _check(found, sum(len(x.allowed) for x in parts), evidence == "told")
+            _check(found, sum(len(x.allowed) for x in parts), evidence == "declared")
             real = found.allowed[..., None] & (found.probability > 0)
             before, places = len(ended), np.zeros(real.shape, np.int64)
             places[real], first = _numbered(_rows(found.seen)[real], number, ended)

@@ -210,7 +210,7 @@ class _Parser(TokenStream):
     def scoped(
         self, read: Callable[[], _Content]
     ) -> tuple[_Content, tuple[tuple[str, Comparison | Property], ...]]:
-        """What a method reads, and the definitions that it makes."""
+        """The result of a method of the parser, and the definitions in its text."""
         outer, self.definitions = self.definitions, {}
         found = read()
         defined, self.definitions = tuple(self.definitions.items()), outer

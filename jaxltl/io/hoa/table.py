@@ -33,7 +33,7 @@ def only_text(text: str, hint: str = "") -> list[Token]:
 
 
 def parsed(tokens: list[Token], make: Callable[[Header, list[State]], Made]) -> Made:
-    """What is made of the header and the states of an automaton."""
+    """Table of an automaton in the Hanoi format, from its header and states."""
     try:
         (version, items), states = parse_tokens(tokens)
         header = read_header(version, items)

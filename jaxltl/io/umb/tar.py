@@ -33,7 +33,7 @@ class _Member(tarfile.TarInfo):
                 raise tarfile.HeaderError("'ustar' is missing at byte 257")
         except (tarfile.HeaderError, UnicodeDecodeError) as error:
             raise ValueError(
-                f"a header of the tar archive cannot be read, {error}: {buf[:40]!r}."
+                f"a header of the tar archive cannot be read, {error}: {buf[:40]!r}; is it a UMB file?"
             ) from None
         # What tarfile reads itself are extended headers.
         if info.size < 0 or (info.size > _LONGEST_NAME and info.type in b"xgLKX"):
@@ -54,8 +54,9 @@ def members(file: BinaryIO) -> Iterator[tuple[str, int]]:
                 yield name, info.size
     except tarfile.TarError as error:
         raise ValueError(f"the archive is cut off or damaged: {error}.") from None
-    while file.read(2**20):  # which verifies the checksum of a compressed file
-        pass
+    while rest := file.read(2**20):  # which verifies the checksum of a compressed file
+        if rest.strip(b"\0"):  # tarfile ends without an error at a damaged extended header
+            raise ValueError("a header is damaged, or data follow the end of the tar archive.")
 
 
 def fill(file: BinaryIO, target: bytearray | NDArray[np.uint8], subject: str) -> None:

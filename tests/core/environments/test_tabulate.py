@@ -144,7 +144,7 @@ def test_a_told_world_is_its_process(seed):
     assert model.label.tolist() == [[s % 3 == 0, s % 3 == 1] for s, _ in pairs]
     initial = [p.initial[s] if over == 0 else 0 for s, over in pairs]
     np.testing.assert_allclose(model.initial, initial, atol=1e-12)
-    assert table.evidence == "told" and table.num_steps is None
+    assert table.evidence == "declared" and table.num_steps is None
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_a_map_of_letters_is_a_torus_whose_program_reads_no_key():
     after = (row + down) % 4 * 4 + (column + right) % 4
     assert (place[model.successor] == after).all()
     assert (model.label == (cells.ravel()[place][:, None] == np.arange(2))).all()
-    assert len(table.start) == 13 and table.evidence == "told"
+    assert len(table.start) == 13 and table.evidence == "declared"
     one = tabulate(letter_world(layout=cells, letters=2, start=0))
     assert one.model.initial[one.start].tolist() == [1]
 
@@ -296,7 +296,7 @@ def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
             ),
             outcomes=told,
         )
-        == "told"
+        == "declared"
     )
 
 

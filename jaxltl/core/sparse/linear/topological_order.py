@@ -60,8 +60,7 @@ def ordered_components(edges: Edges) -> Integers:
 
     size = edges.num_nodes
     ones = np.ones(edges.target.size)
-    arrays = ones, edges.target.copy(), edges.start.copy()
-    graph = sparse.csr_array(arrays, shape=(size, size))
+    graph = sparse.csr_array((ones, edges.target.copy(), edges.start.copy()), shape=(size, size))
     graph.sum_duplicates()  # with repeated edges SciPy may not end
     _, label = csgraph.connected_components(graph, connection="strong")
     source = np.repeat(np.arange(size), np.diff(graph.indptr))

@@ -215,7 +215,7 @@ def test_a_network_is_what_it_does_in_its_tasks_environment():
     share = jax.vmap(success)(jax.random.split(jax.random.key(2), 10_000)).mean()
     assert abs(share - found.mean_value[0]) < 4.5 * 0.5 / 100
     assert 0.2 < found.mean_value[0] < 0.9 and found.mean_optimum == (1, 1)
-    assert found.evidence == table.evidence == "told"
+    assert found.evidence == table.evidence == "declared"
 
 
 @pytest.mark.slow
