@@ -540,7 +540,7 @@ def test_the_command_keeps_compiled_programs_and_the_library_does_not(tmp_path):
         code = f"""
 import os, sys
 from jaxltl import cli
-cli._begin = lambda text: sys.exit()
+cli._begin = lambda *_: sys.exit()
 try:
     cli.main({list(arguments)!r})
 except SystemExit:
@@ -567,7 +567,7 @@ def test_short_work_is_compiled_soon_and_published_figures_as_the_library_is(tmp
         code = f"""
 import os, sys
 from jaxltl import cli
-cli._begin = lambda text: sys.exit()
+cli._begin = lambda *_: sys.exit()
 try:
     cli.main({command!r})
 except SystemExit:

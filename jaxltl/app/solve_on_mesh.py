@@ -119,9 +119,9 @@ class MeshSolver:
         return answers(queries, self._answer, self._is_fatal)
 
     def _is_fatal(self, error: Exception) -> bool:
-        """True if other processes may not have the same error."""
-        known = isinstance(error, ValueError | NotConverged) and not is_loss(error)
-        return self.group.processes > 1 and not known
+        """True for bugs, which leave checkpoints in place, and if other processes are lost."""
+        lost = self.group.processes > 1 and is_loss(error)
+        return lost or not isinstance(error, ValueError | NotConverged)
 
     def _answer(self, prop: Property) -> Answer:
         model, group = self.model, self.group

@@ -9,6 +9,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.grounding import job
+from jaxltl.app.job import took
 from jaxltl.app.protocols import Training
 from jaxltl.app.run_job import job_of
 
@@ -79,7 +80,7 @@ def test_a_task_file_has_a_table_policies_and_a_report(write, tmp_path):
     assert chance.shape[0] == 4 and np.allclose(chance.sum(-1), 1)
     text = job.report.table(result)
     assert "goal    b" in text and "symbol  meaning  weight" in text
-    page = job.report.page(result | {"seconds": 1.0}, [], [], "text")
+    page = job.report.page(result | took(1.0), [], [], "text")
     assert "decisive step" in page and "Satisfaction probability" in page
     assert len(job.pictures(outcome)) == 4 and len(job.task_pictures(outcome.setup)) == 1
 
