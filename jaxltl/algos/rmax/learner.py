@@ -230,13 +230,15 @@ class _Rollout:
     state: State
     remaining: jax.Array
     pair: jax.Array
+    observed: jax.Array  # reward of the last move
     known: jax.Array
     fresh: jax.Array
 
 
 def _start_rollout(state: State, moves: jax.Array) -> _Rollout:
     """A rollout of at most some moves from the current position."""
-    return _Rollout(state, moves, jnp.int32(0), jnp.bool_(False), jnp.bool_(False))
+    no, zero = jnp.bool_(False), jnp.zeros((), state.reward.dtype)
+    return _Rollout(state, moves, jnp.int32(0), zero, no, no)
 
 
 def _move(rollout: _Rollout, rules: _Rules) -> _Rollout:
@@ -265,16 +267,20 @@ def _record(rollout: _Rollout, seen: _Transition, rules: _Rules, active: jax.Arr
     # Not flat: arrays that are reshaped in a loop are copied in every iteration.
     place = (s, action)
     was_known = take(state.known_at, place) >= 0
-    entry = (*place, successor_slot(game, s, action, successor))
-    # Written before it is read, else the whole array would be copied.
-    counts = state.counts.at[entry].add(active.astype(jnp.int32), mode="promise_in_bounds")
-    row = take(counts, place)
-    single = jnp.sum(take(game.mdp.probability, place) > 0) == 1
-    enough = single | (jnp.sum(row).astype(game.dtype) >= rules.enough)
-    first = active & (row[entry[-1]] == 1)
-    known, fresh = active & ~was_known & enough, first & was_known & every
-    # In place of the optimistic reward, which is larger.
-    least = jnp.where(first if every else known, observed, jnp.inf).astype(state.reward.dtype)
+    counts, reward = state.counts, state.reward
+    if game.num_successors == 1:
+        # A new pair ends the rollout, so that `_update_model` writes what is known of it.
+        known, fresh = active & ~was_known, jnp.bool_(False)
+    else:
+        entry = (*place, successor_slot(game, s, action, successor))
+        # Written before it is read, else the whole array would be copied.
+        counts = counts.at[entry].add(active.astype(jnp.int32), mode="promise_in_bounds")
+        row = take(counts, place)
+        single = jnp.sum(take(game.mdp.probability, place) > 0) == 1
+        enough = single | (jnp.sum(row).astype(game.dtype) >= rules.enough)
+        first = active & (row[entry[-1]] == 1)
+        known, fresh = active & ~was_known & enough, first & was_known & every
+        reward = _note_reward(reward, entry, observed, first if every else known)
     wrong = active & ~((observed >= 0) & (observed <= rules.hparams.reward_bound))
     pair = s * game.num_actions + action
     after = replace(
@@ -282,7 +288,7 @@ def _record(rollout: _Rollout, seen: _Transition, rules: _Rules, active: jax.Arr
         moves=state.moves + active,
         position=jnp.where(active, successor, state.position),
         counts=counts,
-        reward=state.reward.at[entry].min(least, mode="promise_in_bounds"),
+        reward=reward,
         fault=jnp.where(wrong & (state.fault < 0), pair, state.fault),
     )
     rest = jnp.where(known | fresh, 0, rollout.remaining - 1)
@@ -290,9 +296,18 @@ def _record(rollout: _Rollout, seen: _Transition, rules: _Rules, active: jax.Arr
         state=after,
         remaining=jnp.where(active, rest, rollout.remaining),
         pair=jnp.where(active, pair, rollout.pair),
+        observed=jnp.where(active, observed, rollout.observed),
         known=known | (~active & rollout.known),
         fresh=fresh | (~active & rollout.fresh),
     )
+
+
+def _note_reward(
+    reward: jax.Array, entry: tuple[jax.Array | int, ...], observed: jax.Array, noted: jax.Array
+) -> jax.Array:
+    """Writes an observed reward in place of the optimistic one, which is larger."""
+    least = jnp.where(noted, observed, jnp.inf).astype(reward.dtype)
+    return reward.at[entry].min(least, mode="promise_in_bounds")
 
 
 # --- the optimistic model ----------------------------------------------------------------------
@@ -302,6 +317,10 @@ def _update_model(rollout: _Rollout, problem: Problem, hparams: Hparams) -> Stat
     """The state after a rollout, with the model solved again if it changed."""
     state, game, changed = rollout.state, problem.game, rollout.known | rollout.fresh
     place = jnp.divmod(rollout.pair, game.num_actions)
+    if game.num_successors == 1:
+        counts = state.counts.at[(*place, 0)].add(rollout.known, mode="promise_in_bounds")
+        reward = _note_reward(state.reward, (*place, 0), rollout.observed, rollout.known)
+        state = replace(state, counts=counts, reward=reward)
     # Every listed successor counts as observed at least once, which keeps the graph.
     listed = take(game.mdp.probability, place) > 0
     count = jnp.where(listed, jnp.maximum(take(state.counts, place), 1), 0)

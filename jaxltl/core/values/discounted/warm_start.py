@@ -16,6 +16,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.values.engine.iterate import side_by_side
 
 _MOST_SWEEPS = 100_000
+_FEWEST = 16  # lanes of the last sweeps
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
@@ -65,14 +66,36 @@ def span_iteration(
 
 
 def _solved(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
+    lanes = models.active.shape
+    # Most models need few sweeps and some need many, which then continue with a quarter of the lanes.
+    few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
+    change = _change(graph, models, models.value)
+    start = _Sweeps(models.value, change, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
+    sweeps = _swept(graph, models, start, few)
+    if few:
+        active = _is_active(models, sweeps)
+        chosen = jnp.nonzero(active, size=few, fill_value=0)[0]
+        fewer, rest = jax.tree.map(lambda x: x[..., chosen] if x.ndim else x, (models, sweeps))
+        place = jnp.cumsum(active) - 1
+        last = _swept(graph, fewer._replace(active=jnp.arange(few) <= place[-1]), rest, 0)
+        place = jnp.maximum(place, 0)
+        sweeps = jax.tree.map(
+            lambda x, y: jnp.where(active, x[..., place], y) if y.ndim else x, last, sweeps
+        )
+    return sweeps.value, sweeps.error, jnp.stack(_quantities(graph, models, sweeps.value), axis=1)
+
+
+def _is_active(models: Models, sweeps: _Sweeps) -> jax.Array:
+    return models.active & (sweeps.error > models.enough) & (sweeps.number < _MOST_SWEEPS)
+
+
+def _swept(graph: _Graph, models: Models, start: _Sweeps, few: int) -> _Sweeps:
+    """Sweeps until at most `few` lanes are active."""
     live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
 
-    def is_active(now: _Sweeps) -> jax.Array:
-        return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
-
     def sweep(now: _Sweeps) -> _Sweeps:
-        active = is_active(now)
+        active = _is_active(models, now)
         top = jnp.where(live, now.change, -jnp.inf).max(axis=0)
         bottom = jnp.where(live, now.change, jnp.inf).min(axis=0)
         moved = now.value + now.change + ahead * (top + bottom) / 2
@@ -80,10 +103,7 @@ def _solved(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Ar
         error = jnp.where(active, ahead * (top - bottom) / 2, now.error)
         return _Sweeps(value, _change(graph, models, value), error, now.number + 1)
 
-    change = _change(graph, models, models.value)
-    start = _Sweeps(models.value, change, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
-    value, _, error, _ = lax.while_loop(lambda now: jnp.any(is_active(now)), sweep, start)
-    return value, error, jnp.stack(_quantities(graph, models, value), axis=1)
+    return lax.while_loop(lambda now: jnp.sum(_is_active(models, now)) > few, sweep, start)
 
 
 def _beside(models: Models, x: jax.Array) -> jax.Array:
