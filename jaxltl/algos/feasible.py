@@ -246,11 +246,11 @@ def _bounds(problem: Problem, model: SparseMDP, tolerance: float) -> tuple[float
         "depth": problem.model.roundings,
     }
     if problem.reward is None:
-        found = optimal.reachability(model.host, problem.target, stay=problem.stay, **options)
+        solution = optimal.reachability(model.host, problem.target, stay=problem.stay, **options)
     else:
         earned = choice_reward(model, problem.reward)
-        found = optimal.total_reward(model.host, earned, problem.target, **options)
-    return safe_ends(model, found, highest=problem.highest)
+        solution = optimal.total_reward(model.host, earned, problem.target, **options)
+    return safe_ends(model, solution, highest=problem.highest)
 
 
 _FINEST = 1e-12  # the width of bounds if those of the requested width contain the threshold
@@ -355,10 +355,10 @@ def evaluate(
     if problem.prepared.num_rows == problem.prepared.num_states:  # a chain
         value, status = evaluate_prepared(problem.prepared, probability=probability, reward=reward)
     else:
-        found = solve_prepared(
+        solution = solve_prepared(
             problem.prepared, probability=probability, reward=reward, tolerance=hparams.tolerance
         )
-        value, status = found.value, found.status
+        value, status = solution.value, solution.status
     return jnp.sum(problem.weight * jnp.where(problem.weight > 0, value, 0)), status
 
 
@@ -515,7 +515,7 @@ def feasible(
     # A little beyond the threshold, so that rounding does not decide.
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
     goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
-    most = np.int32(budget.num_steps)
+    max_steps = np.int32(budget.num_steps)
     points = None
     if np.ndim(starts) == 0:
         keys = jax.random.split(
@@ -528,7 +528,7 @@ def feasible(
     nothing: PyTree = None
     numbers = ParametricMDP(nothing, problem.model.numbers, None, None, None, ())
     lean = replace(problem, target=None, stay=None, model=numbers)
-    return _prove(problem, threshold, _search(keys, points, lean, hparams, goal, most), budget)
+    return _prove(problem, threshold, _search(keys, points, lean, hparams, goal, max_steps), budget)
 
 
 @jax.jit
@@ -538,7 +538,7 @@ def _search(
     problem: Problem,
     hparams: Hparams,
     goal: jax.Array,
-    most: jax.Array,
+    max_steps: jax.Array,
 ) -> loops.Learned:
     """Searches from all starts: in parallel, or sequentially if their costs differ."""
     until = Partial(_met, problem.sign * goal, problem.sign)
@@ -547,7 +547,7 @@ def _search(
         state = (
             init(key, problem, hparams) if point is None else start_at(point, key, problem, hparams)
         )
-        return run_until(state, problem, hparams, until=until, num_steps=most)
+        return run_until(state, problem, hparams, until=until, num_steps=max_steps)
 
     prepared = problem.prepared
     # The work of a solve depends on the numbers.
@@ -570,7 +570,7 @@ def _prove(problem: Problem, threshold: float, learned: loops.Learned, budget: B
     value = np.clip(value, 0, 1) if problem.reward is None else value
     size = value.size
     last = np.maximum(learned.metrics.status, Status.NONFINITE)
-    found = Feasible(
+    result = Feasible(
         parameters=np.asarray(best.parameters, np.float64),
         value=value,
         lower=np.zeros(size),
@@ -582,19 +582,19 @@ def _prove(problem: Problem, threshold: float, learned: loops.Learned, budget: B
     )
     gap = problem.sign * (threshold - value)
     claimed = np.flatnonzero(gap <= slack * max(abs(threshold), slack))
-    found.status[claimed] = Status.UNCERTIFIED
+    result.status[claimed] = Status.UNCERTIFIED
     for i in claimed[np.argsort(gap[claimed], kind="stable")]:
-        if budget.num_proofs is not None and found.feasible.sum() >= budget.num_proofs:
+        if budget.num_proofs is not None and result.feasible.sum() >= budget.num_proofs:
             break
         try:
-            low, high = certify(problem, found.parameters[i], tolerance=budget.tolerance)
+            low, high = certify(problem, result.parameters[i], tolerance=budget.tolerance)
             if low < threshold < high:
-                low, high = certify(problem, found.parameters[i], tolerance=_FINEST)
+                low, high = certify(problem, result.parameters[i], tolerance=_FINEST)
         except ValueError:  # no model in double precision
-            found.status[i] = Status.INVALID
+            result.status[i] = Status.INVALID
             continue
-        found.lower[i], found.upper[i] = low, high
-        found.feasible[i] = low >= threshold if problem.sign > 0 else high <= threshold
+        result.lower[i], result.upper[i] = low, high
+        result.feasible[i] = low >= threshold if problem.sign > 0 else high <= threshold
         open_ = Status.PRECISION if low < threshold < high else Status.MAX_STEPS
-        found.status[i] = Status.CONVERGED if found.feasible[i] else open_
-    return found
+        result.status[i] = Status.CONVERGED if result.feasible[i] else open_
+    return result

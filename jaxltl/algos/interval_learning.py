@@ -372,10 +372,10 @@ def wins_almost_surely(problem: Problem, policy: jax.Array) -> bool:
 @jax.jit
 def _wins(problem: Problem, policy: jax.Array) -> jax.Array:
     model, used = problem.model, policy > 0
-    kept = used.any(-1) & (~used | forall_successor(model, problem.winning)).all(-1)
+    stays = used.any(-1) & (~used | forall_successor(model, problem.winning)).all(-1)
     bottom = bottom_components(model, used).inside.any(-1)
     accepting = accepting_bottom_components(model, used.astype(model.dtype))
-    return jnp.all((kept & (~bottom | accepting)) | ~problem.winning)
+    return jnp.all((stays & (~bottom | accepting)) | ~problem.winning)
 
 
 # --- value iteration ----------------------------------------------------------------------------
@@ -434,13 +434,13 @@ def _soonest(
 ) -> tuple[jax.Array, jax.Array]:
     """Discounted probability of winning by optimistic actions and frequencies; its best ones."""
     slack = 64 * jnp.finfo(moves.dtype).eps
-    near = problem.allowed & (problem.staying | (moves >= value[..., None] - slack))
-    near = jnp.where((problem.winning | problem.losing)[..., None], problem.allowed, near)
-    ahead = jnp.where(near, ahead, -1)
-    most = jnp.max(ahead, axis=-1)
-    best = near & (ahead >= (most * (1 - slack))[..., None])
+    optimal = problem.allowed & (problem.staying | (moves >= value[..., None] - slack))
+    optimal = jnp.where((problem.winning | problem.losing)[..., None], problem.allowed, optimal)
+    ahead = jnp.where(optimal, ahead, -1)
+    highest = jnp.max(ahead, axis=-1)
+    best = optimal & (ahead >= (highest * (1 - slack))[..., None])
     best = jnp.where(problem.winning[..., None], problem.allowed, best)
-    speed = jnp.asarray(hparams.discount, moves.dtype) * jnp.maximum(most, 0)
+    speed = jnp.asarray(hparams.discount, moves.dtype) * jnp.maximum(highest, 0)
     return _with_decided(problem, speed), best
 
 

@@ -153,14 +153,14 @@ def make_plan(
     `depth` is D, as in training, and `most` is M, the number of sequences for each state. Not
     differentiable. Raises as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
-    found = sequences.reach_avoid_sequences(
+    table = sequences.reach_avoid_sequences(
         task if isinstance(task, Automaton) else to_automaton(task),
         events,
         validation.distinct_names("propositions", propositions),
         depth=depth,
         most=most,
     )
-    return Plan(found.reach, found.avoid, found.length)
+    return Plan(table.reach, table.avoid, table.length)
 
 
 def stack_plans(plans: Sequence[Plan]) -> Plan:
@@ -177,12 +177,12 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
         raise ValueError(
             f"plans have the shapes {shapes}; give some, all of one depth and of the same events."
         )
-    states, most = (max(shape[i] for shape in shapes) for i in range(2))
+    states, width = (max(shape[i] for shape in shapes) for i in range(2))
 
     def padded(x: ArrayLike) -> np.ndarray:
         x = np.asarray(x)
         rest = [(0, 0)] * (x.ndim - 2)
-        return np.pad(x, [(0, states - x.shape[0]), (0, most - x.shape[1]), *rest])
+        return np.pad(x, [(0, states - x.shape[0]), (0, width - x.shape[1]), *rest])
 
     return jax.tree.map(lambda *rows: jnp.stack([padded(x) for x in rows]), *plans)
 
@@ -304,14 +304,18 @@ def _judged(
         jnp.asarray(plan.avoid)[state],
         jnp.asarray(plan.length)[state],
     )
-    found = jax.vmap(lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
-    if not isinstance(found, tuple) or len(found) != 2 or jnp.shape(found[1]) != rows.length.shape:
-        shapes = jax.tree.map(lambda x: jnp.shape(x)[1:], found)
+    output = jax.vmap(lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
+    if (
+        not isinstance(output, tuple)
+        or len(output) != 2
+        or jnp.shape(output[1]) != rows.length.shape
+    ):
+        shapes = jax.tree.map(lambda x: jnp.shape(x)[1:], output)
         raise ValueError(
             f"network returns {shapes} for an observation; return (parameters of the action, "
             "value), the value a scalar."
         )
-    actions, values = found
+    actions, values = output
     return actions, jnp.where(rows.length > 0, values, -jnp.inf)
 
 
@@ -336,10 +340,12 @@ def _act(
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, values = _judged(network, plan, seen, state)
     best = jnp.argmax(values)
-    kept = (memory.state == state) & ~((best != memory.sequence) & (values[best] > memory.worth))
-    taken = jnp.where(kept, memory.sequence, best).astype(jnp.int32)
+    continues = (memory.state == state) & ~(
+        (best != memory.sequence) & (values[best] > memory.worth)
+    )
+    taken = jnp.where(continues, memory.sequence, best).astype(jnp.int32)
     late = (1 - _FORGETS) * memory.worth + _FORGETS * values[taken]
-    worth = jnp.where(kept, late, values[best]).astype(memory.worth.dtype)
+    worth = jnp.where(continues, late, values[best]).astype(memory.worth.dtype)
     said = jax.tree.map(lambda x: x[taken], actions)
     action = action_distributions.chosen(
         key,

@@ -118,8 +118,8 @@ def enclose(problem: Problem, low: Corner = None, high: Corner = None) -> tuple[
     ends, rewards = model.numbers.ranges(low, high)
     interval = make_interval(model.model, ends.lower, ends.upper)
     reward = None if problem.reward is None else rewards[problem.reward]
-    least, most = (_bounds(problem, interval, reward, large) for large in (False, True))
-    return least[0], most[1]
+    least, largest = (_bounds(problem, interval, reward, large) for large in (False, True))
+    return least[0], largest[1]
 
 
 def _box(problem: Problem, low: Corner, high: Corner) -> tuple[Point, Point]:
@@ -143,11 +143,11 @@ def _bounds(
     """Bounds of the mean over the initial distribution with maximising or minimising nature."""
     query = Query(problem.objective == "max", large, depth=problem.model.roundings)
     if problem.reward is None:
-        found = reachability(model.host, problem.target, query, stay=problem.stay)
+        enclosure = reachability(model.host, problem.target, query, stay=problem.stay)
     else:
         earned = reward.upper if large else np.maximum(reward.lower, 0)
-        found = total_reward(model.host, earned, problem.target, query)
-    return safe_ends(model, found, highest=problem.highest)
+        enclosure = total_reward(model.host, earned, problem.target, query)
+    return safe_ends(model, enclosure, highest=problem.highest)
 
 
 def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:
@@ -213,13 +213,13 @@ def _require_problem(problem: object) -> None:
 
 def _limit(threshold: ArrayLike) -> float:
     """A threshold, which may be infinite."""
-    found = validation.float_array("threshold", threshold)
-    if found.ndim or np.isnan(found):
-        what = (
-            f"threshold={validation.shorten(threshold)}" if found.ndim else "the threshold is NaN"
+    number = validation.float_array("threshold", threshold)
+    if number.ndim or np.isnan(number):
+        place = (
+            f"threshold={validation.shorten(threshold)}" if number.ndim else "the threshold is NaN"
         )
-        raise ValueError(f"{what}; give a number.")
-    return float(found)
+        raise ValueError(f"{place}; give a number.")
+    return float(number)
 
 
 def prove_around(
@@ -242,16 +242,16 @@ def prove_around(
     model = problem.model
     (point,) = model.valid_points("point", validation.float_array("point", point)[None])
     sides = model.high - model.low
-    found, share, move = None, 1.0, 0.5
+    box, share, move = None, 1.0, 0.5
     for _ in range(num_halvings):
         low = np.maximum(point - share * sides, model.low)
         high = np.minimum(point + share * sides, model.high)
         if verdict_of(problem, threshold, *enclose(problem, low, high)) == ACCEPTED:
-            found = low, high
+            box = low, high
             if share == 1.0:
                 break
             share += move
         else:
             share -= move
         move /= 2
-    return found
+    return box

@@ -352,7 +352,7 @@ def objective(
         problem.model,
         problem.observation,
     )
-    found = trees.each_world(
+    likelihoods = trees.each_world(
         partial(_likelihoods, hparams),
         problem.model,
         rewards,
@@ -360,7 +360,7 @@ def objective(
         _initial(problem, initial),
         problem.predecessors,
     )
-    demonstrated, other, satisfaction, value, error, status = found
+    demonstrated, other, satisfaction, value, error, status = likelihoods
     weight = problem.weight
     pairs, other_pairs = (weight @ x.reshape(len(weight), -1).sum(1) for x in (counts, held_out))
     neg = -weight @ demonstrated

@@ -120,7 +120,7 @@ def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Met
         problem,
         hparams,
         lambda state, likeliest: make(cce.policy(state, problem, hparams)),
-        ("objective", "cost", "best_objective", "num_feasible", "spread"),
+        ("objective", "cost", "best_objective", "num_feasible", "max_deviation"),
         ("family",),
         hparams.population * table.episodes * num_steps,
         f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters",

@@ -158,10 +158,10 @@ def planned(kind: NDArray[np.int32], kinds: Kinds) -> NDArray[np.int64]:
                 f"the patch of {kinds[kind[row, column]][0]} in cell {(row + 1, column + 1)} "
                 "overlaps with another that wants other colours; plan them 3 cells apart."
             )
-    found = find_kinds(colors, codes_of(kinds))
-    for row, column in np.argwhere(found != kind)[:1]:
+    actual = find_kinds(colors, codes_of(kinds))
+    for row, column in np.argwhere(actual != kind)[:1]:
         raise ValueError(
-            f"cell {(int(row) + 1, int(column) + 1)} would be {kinds[found[row, column]][0]}, "
+            f"cell {(int(row) + 1, int(column) + 1)} would be {kinds[actual[row, column]][0]}, "
             "which the plan does not say: the patches around it leave no choice. Add it, or "
             "move them."
         )
@@ -231,8 +231,8 @@ def placed(
     for i, (count, distance) in enumerate(zip(placement.counts, placement.distances, strict=True)):
         open_ = kind < 0
         for row, column in objects:
-            near = slice(max(row - distance + 1, 0), row + distance)
-            open_[near, max(column - distance + 1, 0) : column + distance] = False
+            rows_around = slice(max(row - distance + 1, 0), row + distance)
+            open_[rows_around, max(column - distance + 1, 0) : column + distance] = False
         for cell in random.permutation(np.flatnonzero(open_)):
             if not count:
                 break
@@ -261,10 +261,10 @@ def _adds(
         return False
     kind[row, column] = number
     # Only cells up to two away see the patch.
-    top, left = max(row - 2, 0), max(column - 2, 0)
-    planned = kind[top : row + 3, left : column + 3]
+    top, first_column = max(row - 2, 0), max(column - 2, 0)
+    planned = kind[top : row + 3, first_column : column + 3]
     if np.array_equal(
-        find_kinds(colors[top : row + 5, left : column + 5], placement.codes), planned
+        find_kinds(colors[top : row + 5, first_column : column + 5], placement.codes), planned
     ):
         return True
     patch[:], kind[row, column] = before, -1

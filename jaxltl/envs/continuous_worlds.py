@@ -136,10 +136,10 @@ def _collision_step(state: jax.Array, action: jax.Array, noise: jax.Array) -> ja
     control = 2 * jnp.clip(action, -1, 1)
     up = jnp.asarray([0.0, 1.0], state.dtype)
 
-    def near(place: jax.Array) -> jax.Array:
+    def distance(place: jax.Array) -> jax.Array:
         return jnp.clip(jnp.linalg.norm(place - state) / 0.3, 0, 1)
 
-    above, below = near(up), near(-up)
+    above, below = distance(up), distance(-up)
     pushed = below * (above * control + (1 - above) * up) - (1 - below) * up
     return state + 0.2 * pushed + 0.05 * noise
 

@@ -131,7 +131,7 @@ def flat_world(
         reset = Partial(_begin_at, np.asarray(start, np.float32))
     else:
         reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
-    most = extent + time_step  # of the step that leaves the square the place outside is seen
+    bound = extent + time_step  # of the step that leaves the square the place outside is seen
     world = make_environment(
         reset,
         Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None),
@@ -139,7 +139,7 @@ def flat_world(
         actions=9 if discrete else make_box(-1, 1, (2,), np.float32),
         labels=Partial(_labels, scene),
         propositions=names,
-        observations=make_box(-most, most, (2,), np.float32),
+        observations=make_box(-bound, bound, (2,), np.float32),
     )
     return world if horizon is None else with_time_limit(world, horizon)
 
@@ -203,9 +203,9 @@ def events_around(
             f"events has shape {list(rows.shape)}; give Booleans "
             f"[E, {len(environment.propositions)}], a column for each colour."
         )
-    far = validation.float_array("radii", radii)
-    if far.ndim != 1 or not ((far > 0) & np.isfinite(far)).all():
-        raise ValueError(f"radii={far.tolist()}; give distances, all positive.")
+    distances = validation.float_array("radii", radii)
+    if distances.ndim != 1 or not ((distances > 0) & np.isfinite(distances)).all():
+        raise ValueError(f"radii={distances.tolist()}; give distances, all positive.")
     discs = [
         (*center, radius, color)
         for center, radius, color in zip(
@@ -219,21 +219,21 @@ def events_around(
         tuple(map(tuple, rows.tolist())),
         tuple(discs),
         float(scene.extent),
-        tuple(far.tolist()),
+        tuple(distances.tolist()),
         validation.integer("directions", directions, least=1, most=2**10),
     )
 
 
 def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarray:
     """``float32[count, 2]``, uniform outside of all discs."""
-    random, found, rounds = np.random.default_rng(seed), [np.zeros((0, 2), np.float32)], 0
-    while (have := sum(map(len, found))) < count:
+    random, free, rounds = np.random.default_rng(seed), [np.zeros((0, 2), np.float32)], 0
+    while (have := sum(map(len, free))) < count:
         if (rounds := rounds + 1) > 20 and have < 0.01 * rounds * count:
             raise ValueError("flat_world: the discs hardly leave a place to begin; give start.")
         places = random.uniform(-extent, extent, (count, 2)).astype(np.float32)
         apart = ((places[:, None] - scene.center) ** 2).sum(axis=-1)
-        found.append(places[(apart >= scene.radius**2).all(axis=1)])
-    return np.concatenate(found)[:count]
+        free.append(places[(apart >= scene.radius**2).all(axis=1)])
+    return np.concatenate(free)[:count]
 
 
 def _begin(places: Array, key: Key) -> FlatState:
@@ -252,8 +252,8 @@ def _move(
     del key
     velocity = jnp.clip(action, -1, 1) if moves is None else jnp.asarray(moves)[action]
     place = (world.place + number[1] * velocity).astype(jnp.float32)
-    left = (jnp.abs(place) > number[0]).any()
-    return Timestep(FlatState(place), jnp.where(left, -1.0, 0.0), left)
+    outside = (jnp.abs(place) > number[0]).any()
+    return Timestep(FlatState(place), jnp.where(outside, -1.0, 0.0), outside)
 
 
 def _see(world: FlatState) -> jax.Array:

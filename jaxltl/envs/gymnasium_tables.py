@@ -102,9 +102,11 @@ class _Table(NamedTuple):
 def _read(env: object) -> _Table:
     table, name = getattr(env, "P", None), type(env).__name__
     if not isinstance(table, Mapping) or not table or set(table) != set(range(len(table))):
-        found = "none" if table is None else f"a {type(table).__name__} that is not such a table"
+        description = (
+            "none" if table is None else f"a {type(table).__name__} that is not such a table"
+        )
         raise ValueError(
-            f"{name}: expected a table P[state][action] for states 0, 1, ...; it has {found}. "
+            f"{name}: expected a table P[state][action] for states 0, 1, ...; it has {description}. "
             "Only environments of toy text have one."
         )
     choices: list[tuple[int, int]] = []
@@ -139,23 +141,23 @@ def _branch(
 ) -> tuple[float, int, float, bool]:
     try:
         probability, successor, reward, terminated = branch
-        found = float(probability), int(successor), float(reward), bool(terminated)
+        values = float(probability), int(successor), float(reward), bool(terminated)
     except (TypeError, ValueError):
         raise ValueError(
             f"{place} has the branch {branch!r:.80}; expected (probability, next state, reward, "
             "terminated)."
         ) from None
-    if not 0 <= found[1] < len(table):
-        raise ValueError(f"{place} leads to state {found[1]}; states are 0 to {len(table) - 1}.")
-    return found
+    if not 0 <= values[1] < len(table):
+        raise ValueError(f"{place} leads to state {values[1]}; states are 0 to {len(table) - 1}.")
+    return values
 
 
 def _labels(
-    given: Mapping[str, Sequence[int]], ended: np.ndarray, count: int
+    states_of: Mapping[str, Sequence[int]], ended: np.ndarray, count: int
 ) -> dict[str, list[int]]:
     """Labels by proposition; an added state has the labels of its original."""
-    found: dict[str, list[int]] = {}
-    for name, states in given.items():
+    labels: dict[str, list[int]] = {}
+    for name, states in states_of.items():
         wrong = [s for s in states if not 0 <= s < count]
         if wrong or name == TERMINATED:
             raise ValueError(
@@ -163,5 +165,5 @@ def _labels(
                 if wrong
                 else f"labels: {TERMINATED!r} is where an episode has ended; choose another name."
             )
-        found[name] = [*states, *(count + np.flatnonzero(np.isin(ended, states))).tolist()]
-    return {**found, TERMINATED: list(range(count, count + ended.size))}
+        labels[name] = [*states, *(count + np.flatnonzero(np.isin(ended, states))).tolist()]
+    return {**labels, TERMINATED: list(range(count, count + ended.size))}

@@ -133,17 +133,17 @@ class _Steps:
         return self._observe(seen), total, ended, bool(cut), details
 
     def _letter(self, seen: PyTree, info: PyTree) -> int:
-        shown = self._labels(seen, info)
-        if isinstance(shown, str) or (unknown := sorted({*shown} - {*self._names})):
-            what = repr(shown) if isinstance(shown, str) else f"{unknown[0]!r}"
+        label = self._labels(seen, info)
+        if isinstance(label, str) or (unknown := sorted({*label} - {*self._names})):
+            wrong = repr(label) if isinstance(label, str) else f"{unknown[0]!r}"
             raise ValueError(
-                f"labels returned {what}; expected a collection of names among "
+                f"labels returned {wrong}; expected a collection of names among "
                 f"{', '.join(self._names)}."
             )
         code = sum(
             int(w)
             for w, name in zip(self._tables.weight, self._names, strict=True)
-            if name in shown
+            if name in label
         )
         return int(self._tables.letter[code])
 

@@ -133,7 +133,7 @@ def letter_world(
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
     shape = (size * size * (count + 1),) if flat else (size, size, count + 1)
-    made = make_environment(
+    world = make_environment(
         reset,
         Partial(_move, _neighbors(size)),
         Partial(_see, views, np.zeros(shape, np.float32), np.arange(count + 1, dtype=np.int8)),
@@ -143,7 +143,7 @@ def letter_world(
         observations=make_box(0, 1, shape, np.float32),
         starts=starts,
     )
-    return made if horizon is None else with_time_limit(made, horizon)
+    return world if horizon is None else with_time_limit(world, horizon)
 
 
 def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
@@ -191,16 +191,16 @@ def _given(
 
 def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarray:
     """Uniform sets ``bool[count, C]`` of `used` cells of the torus, with a connected complement."""
-    random, found, tries = np.random.default_rng(seed), [np.zeros((0, size * size), bool)], 0
-    while (have := sum(map(len, found))) < count:
+    random, connected, tries = np.random.default_rng(seed), [np.zeros((0, size * size), bool)], 0
+    while (have := sum(map(len, connected))) < count:
         if (tries := tries + 1) > 200 + 200 * have:
             raise ValueError(
                 f"letter_world: connected maps of {size} x {size} cells, {used} of them with "
                 "letters, are too rare; take fewer letters, or connected=False."
             )
         some = random.permuted(np.tile(np.arange(size * size) < used, (8192, 1)), axis=1)
-        found.append(some[is_connected(some.reshape(-1, size, size))])
-    return np.concatenate(found)[:count]
+        connected.append(some[is_connected(some.reshape(-1, size, size))])
+    return np.concatenate(connected)[:count]
 
 
 def is_connected(used: np.ndarray) -> np.ndarray:

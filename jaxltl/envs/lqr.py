@@ -114,15 +114,15 @@ def lqr(
     a, b, q, r = (np.asarray(x, float) for x in (dynamics, control, state_cost, control_cost))
     x = np.asarray(start, float)
     n, m = len(a), b.shape[-1]
-    for name, found, shape in (
+    for name, matrix, shape in (
         ("dynamics", a, (n, n)),
         ("control", b, (n, m)),
         ("state_cost", q, (n, n)),
         ("control_cost", r, (m, m)),
         ("start", x, (n,)),
     ):
-        if found.shape != shape:
-            raise ValueError(f"{name} has shape {list(found.shape)}; expected {list(shape)}.")
+        if matrix.shape != shape:
+            raise ValueError(f"{name} has shape {list(matrix.shape)}; expected {list(shape)}.")
     _check_definite(q, r)
     bounds = np.broadcast_to(np.asarray(low, float), m), np.broadcast_to(np.asarray(high, float), m)
     if not (bounds[0] <= bounds[1]).all():
@@ -283,8 +283,8 @@ def _lanes_last(
     # Earlier lanes are already last; all are merged into one axis.
     lanes = parameters.shape[2:]
     parameters = jnp.moveaxis(parameters, 0, -1).reshape(parameters.shape[1], -1)
-    found = _scores(network, world, parameters)
-    return tuple(jnp.moveaxis(x.reshape(*lanes, size), -1, 0) for x in found), (True, True)
+    scores = _scores(network, world, parameters)
+    return tuple(jnp.moveaxis(x.reshape(*lanes, size), -1, 0) for x in scores), (True, True)
 
 
 # --- by steps ---------------------------------------------------------------------------------
@@ -371,7 +371,7 @@ def optimum(world: LQR) -> Optimum:
     u = bounds[0].copy()
     if not pinned.all():
         free = ~pinned
-        found = lsq_linear(
+        solution = lsq_linear(
             matrix[:, free],
             -offset - matrix[:, pinned] @ u[pinned],
             (bounds[0][free], bounds[1][free]),
@@ -379,9 +379,9 @@ def optimum(world: LQR) -> Optimum:
             tol=1e-15,
             max_iter=100 * len(u),
         )
-        if not found.success:
-            raise ValueError(f"the best controls were not found: {found.message}")
-        u[free] = found.x
+        if not solution.success:
+            raise ValueError(f"the best controls were not found: {solution.message}")
+        u[free] = solution.x
     # At an optimum a step down the gradient is undone by the bounds.
     residual = np.abs(u - np.clip(u - (2 * matrix.T @ (matrix @ u + offset)), *bounds)).max()
     controls = u.reshape(world.horizon, -1)

@@ -121,14 +121,14 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
             f"{'-'.join(map(str, network.sizes))} with{'' if network.biases else 'out'} biases has "
             f"{network.num_parameters} parameters, on the first axis."
         )
-    found, place, lanes = [], 0, parameters.shape[1:]
+    parts, place, lanes = [], 0, parameters.shape[1:]
     for n, m in pairwise(network.sizes):
         weight = parameters[place : place + n * m].reshape(n, m, *lanes)
         place += n * m
         bias = parameters[place : place + m] if network.biases else None
         place += m if network.biases else 0
-        found.append((weight, bias))
-    return found
+        parts.append((weight, bias))
+    return parts
 
 
 def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
@@ -179,13 +179,13 @@ def padded(parts: Layers, multiple: int = 16) -> Layers:
     >>> [weight.shape for weight, _ in padded(parts)]
     [(3, 16), (16, 1)]
     """
-    found, inputs = [], parts[0][0].shape[0]
+    wide_layers, inputs = [], parts[0][0].shape[0]
     for i, (weight, bias) in enumerate(parts):
         more = 0 if i == len(parts) - 1 else -weight.shape[1] % multiple
         weight = jnp.pad(weight, ((0, inputs - weight.shape[0]), (0, more)))
-        found.append((weight, None if bias is None else jnp.pad(bias, (0, more))))
+        wide_layers.append((weight, None if bias is None else jnp.pad(bias, (0, more))))
         inputs = weight.shape[1]
-    return found
+    return wide_layers
 
 
 def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
@@ -265,9 +265,10 @@ def network_agent(network: Network, environment: Environment) -> Partial:
     >>> act((), jnp.ones(2), None, None)[0].tolist()
     1
     """
-    actions, shown = environment.actions, environment.observations
+    actions, observations = environment.actions, environment.observations
     inputs = sum(
-        math.prod(x.shape) for x in jax.tree.leaves(shown, is_leaf=lambda x: isinstance(x, Box))
+        math.prod(x.shape)
+        for x in jax.tree.leaves(observations, is_leaf=lambda x: isinstance(x, Box))
     )
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
     if (network.sizes[0], network.sizes[-1]) != (inputs, outputs):

@@ -253,8 +253,8 @@ def random_worlds(
     for seed in seeds:
         random = np.random.default_rng(seed)
         for _ in range(max_tries):
-            found = placed(random, placement)
-            if found is not None and _is_feasible(family, found[1]):
+            layout = placed(random, placement)
+            if layout is not None and _is_feasible(family, layout[1]):
                 break
         else:
             raise ValueError(
@@ -262,8 +262,8 @@ def random_worlds(
                 "objects had no room, or the task could not be done from every distractor cell. "
                 "Use a larger grid or fewer obstacles, or check the task."
             )
-        colors = filled(random, *found, placement.codes, margin)
-        worlds.append(_assemble(blank, colors, found[1], kinds, margin))
+        colors = filled(random, *layout, placement.codes, margin)
+        worlds.append(_assemble(blank, colors, layout[1], kinds, margin))
     return worlds
 
 
@@ -282,8 +282,8 @@ def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, names, "the task")
-        shown = [frozenset({n} & set(formula.propositions)) for n in [*names, ""]]
-        task = to_automaton(formula, letters=list(dict.fromkeys(shown)))
+        labels = [frozenset({n} & set(formula.propositions)) for n in [*names, ""]]
+        task = to_automaton(formula, letters=list(dict.fromkeys(labels)))
     require_known(task.propositions, names, "the task")
     read = [letter_index(task, {n} & set(task.propositions)) for n in [*names, ""]]
     return task, np.asarray(task.delta)[:, read].T

@@ -148,8 +148,8 @@ def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.n
     Uniform with a keepout of .55 of a zone and .4 of the robot; maps without a place for all are
     dropped.
     """
-    random, found, rounds = np.random.default_rng(seed), [np.zeros((0, count + 1, 2))], 0
-    while (have := sum(map(len, found))) < num_maps:
+    random, batches, rounds = np.random.default_rng(seed), [np.zeros((0, count + 1, 2))], 0
+    while (have := sum(map(len, batches))) < num_maps:
         rounds += 1
         too_many = count * _KEEPOUT[0] ** 2 * np.pi > 4 * extent**2
         if (rounds > 4 and have < 2 * rounds) or too_many or extent <= _KEEPOUT[0]:
@@ -165,8 +165,8 @@ def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.n
             free = (apart >= own + _KEEPOUT[0]).all(axis=-1)
             maps[:, i] = tries[np.arange(512), free.argmax(axis=1), 0]
             good &= free.any(axis=1)
-        found.append(maps[good])
-    return np.concatenate(found)[:num_maps]
+        batches.append(maps[good])
+    return np.concatenate(batches)[:num_maps]
 
 
 # --- of one trajectory ----------------------------------------------------------------------------
@@ -198,12 +198,12 @@ def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: Key) -> Timeste
     heading = world.heading + turning * n.time_step
     thrust = n.thrust * jnp.clip(action[0] / n.saturation, -1, 1)
     toward = thrust / n.drag * _ahead(world.heading + turning * n.time_step / 2)
-    kept = jnp.exp(-n.drag * n.time_step)
-    velocity = toward + kept * (world.velocity - toward)
-    place = world.place + n.time_step * toward + ((1 - kept) / n.drag * (world.velocity - toward))
-    most = n.extent - _ROBOT
-    velocity = jnp.where(jnp.abs(place) > most, 0, velocity)
-    place = jnp.clip(place, -most, most)
+    decay = jnp.exp(-n.drag * n.time_step)
+    velocity = toward + decay * (world.velocity - toward)
+    place = world.place + n.time_step * toward + ((1 - decay) / n.drag * (world.velocity - toward))
+    bound = n.extent - _ROBOT
+    velocity = jnp.where(jnp.abs(place) > bound, 0, velocity)
+    place = jnp.clip(place, -bound, bound)
     acceleration = (velocity - world.velocity) / n.time_step
     heading = heading % np.float32(2 * np.pi)
     return Timestep(
@@ -224,13 +224,13 @@ def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
 def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
     """``float32[P, 16]``: lidar with bin i at the i-th sixteenth of a turn to the left."""
     seen = _own_frame(world.heading, world.zone - world.place)
-    near = jnp.exp(-n.gain * jnp.linalg.norm(seen, axis=-1))
+    proximity = jnp.exp(-n.gain * jnp.linalg.norm(seen, axis=-1))
     turn = jnp.arctan2(seen[..., 1], seen[..., 0]) / (2 * np.pi) * _BINS % _BINS
     bin_, bins = jnp.floor(turn), jnp.arange(_BINS)
     rest = (turn - bin_)[..., None]
     at = (bins - bin_[..., None]) % _BINS
     share = jnp.where(at == 0, 1, jnp.where(at == 1, rest, jnp.where(at == _BINS - 1, 1 - rest, 0)))
-    return (near[..., None] * share).max(axis=-2).astype(jnp.float32)
+    return (proximity[..., None] * share).max(axis=-2).astype(jnp.float32)
 
 
 def _see(n: _Numbers, world: ZoneState) -> jax.Array:

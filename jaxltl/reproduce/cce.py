@@ -127,7 +127,7 @@ def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple
         _keys(seeds, 0), problem, cce.Hparams(rate=0.1, population=100, rho=0.2), plan.lqr_steps
     )
     # The regulator is deterministic: one evaluation is exact.
-    sampled = jnp.where(state.best.found[:, None], state.best.parameters, state.least.parameters)
+    sampled = jnp.where(state.best.valid[:, None], state.best.parameters, state.least.parameters)
     both = jnp.stack([families.center(state.family), sampled], 1)
     objective, cost = jax.vmap(jax.vmap(lambda p: problem.evaluate(p, None)))(both)
     allowed = cost <= 0
@@ -235,8 +235,8 @@ def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTre
         num_steps, trust_steps = plan.feasible_steps
     if method == "CCE":
         state, metrics = _train(keys, robot.problem, robot.hparams, num_steps, pretrained)
-        made, cost = metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.cost[..., 0]
-        return Search(method, keys, made, metrics.objective, cost, state, robot.hparams)
+        trajectories, cost = metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.cost[..., 0]
+        return Search(method, keys, trajectories, metrics.objective, cost, state, robot.hparams)
     hparams = replace(
         _TRUST,
         method="cpo" if method == "CPO" else "trpo",
@@ -325,12 +325,12 @@ def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Record, Record, R
     path: Any = None
     objective, cost, interval = [], [], []
     for agent in _agents(robot, run, plan):
-        found = _episodes(
+        episodes = _episodes(
             jax.random.key(10**6), robot.environment, agent, plan.fresh, robot.world.horizon
         )
-        path = found.world.state if path is None else path
-        total = found.cost.sum(1)
-        objective.append(float(found.reward.sum(1).mean()))
+        path = episodes.world.state if path is None else path
+        total = episodes.cost.sum(1)
+        objective.append(float(episodes.reward.sum(1).mean()))
         cost.append(float(total.mean()))
         margin = 1.96 * float(total.std(ddof=1)) / np.sqrt(plan.fresh)
         interval.append((cost[-1] - margin, cost[-1] + margin))

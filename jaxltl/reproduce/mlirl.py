@@ -135,11 +135,13 @@ def _case(model: Product, learned: tuple[np.ndarray, jax.Array, float]) -> Recor
     return {**_evaluated(model, policy)[0], "theta": theta, "neg_log_likelihood": likelihood}
 
 
-def _missing_safety(world: MDP, shown: Trajectories) -> Record:
+def _missing_safety(world: MDP, demonstrations: Trajectories) -> Record:
     """A policy learned with a task that does not forbid red, evaluated under the true task."""
     incomplete = product(world, TASK_WITHOUT_SAFETY)
-    features = irl.task_features(incomplete, shown, avoid=["r"])
-    [(_, policy, _)] = learn_cases(irl.make_problem(incomplete, features.values, shown), (None,))
+    features = irl.task_features(incomplete, demonstrations, avoid=["r"])
+    [(_, policy, _)] = learn_cases(
+        irl.make_problem(incomplete, features.values, demonstrations), (None,)
+    )
     reached = restrict(incomplete)
     true = product(reached.model, TASK)
     row, each = _evaluated(true, lift_policy(true, policy[reached.base_state, reached.memory]))
@@ -151,14 +153,16 @@ def _missing_safety(world: MDP, shown: Trajectories) -> Record:
 @experiment
 def measure(progress: Callable[[str], None]) -> Record:
     """Section 2.5: three cases, the sweep of mu, and the task without its safety part."""
-    world, shown = two_goals()
+    world, demonstrations = two_goals()
     model = product(world, TASK)
     progress("case 1: in the world, without the task")
-    features = irl.world_features(world, shown, goal=["y"], progress=["g1", "g2"], avoid=["r"])
-    [first] = learn_cases(irl.make_problem(world, features.values, shown), (None,))
+    features = irl.world_features(
+        world, demonstrations, goal=["y"], progress=["g1", "g2"], avoid=["r"]
+    )
+    [first] = learn_cases(irl.make_problem(world, features.values, demonstrations), (None,))
     progress("case 2: in the product")
-    features = irl.task_features(model, shown, avoid=["r"])
-    problem = irl.make_problem(model, features.values, shown)
+    features = irl.task_features(model, demonstrations, avoid=["r"])
+    problem = irl.make_problem(model, features.values, demonstrations)
     [second] = learn_cases(problem, (None,))
     progress(f"case 3: with the satisfaction term, for {len(MUS)} weights mu in parallel")
     sweep = [_case(model, case) for case in learn_cases(problem, MUS)]
@@ -168,7 +172,7 @@ def measure(progress: Callable[[str], None]) -> Record:
         "case2": _case(model, second),
         "case3": sweep[MUS.index(MU)],
         "mu_sweep": [{"mu": mu, **case} for mu, case in zip(MUS, sweep, strict=True)],
-        "missing_safety": _missing_safety(world, shown),
+        "missing_safety": _missing_safety(world, demonstrations),
     }
 
 

@@ -100,12 +100,14 @@ def _known_model(model: Patrol) -> tuple[Record, dict[str, jax.Array], jax.Array
     game = model.game
     optimal = check(minimax_value(game, model.reward, DISCOUNT)).value
     quantity = model.reward + DISCOUNT * expectation(game, optimal)
-    near = pac.near_optimal(quantity, game.available, pac.action_tolerance(EPSILON, DISCOUNT))
+    near_optimal = pac.near_optimal(
+        quantity, game.available, pac.action_tolerance(EPSILON, DISCOUNT)
+    )
     p = pac.exploration(EPSILON, DISCOUNT, REWARD_BOUND)
-    hat = pac.hat_game(game, near, p)
+    hat = pac.hat_game(game, near_optimal, p)
     action = almost_sure_buchi(hat, jnp.pad(model.accepting, (0, 2 * game.num_states))).action
     of_hat = pac.recover_hat_strategy(hat, jax.nn.one_hot(action, hat.num_actions))
-    uniform_hat = pac.hat_strategy(near, game.available, p)
+    uniform_hat = pac.hat_strategy(near_optimal, game.available, p)
     values, counts = np.unique(
         np.round(np.asarray(optimal)[np.asarray(game.system)], 6), return_counts=True
     )
@@ -140,39 +142,41 @@ def _learn_all(keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams) ->
 
 @jax.jit
 def _learn(
-    key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
+    key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, max_moves: jax.Array
 ) -> loops.Learned:
     """Learning until the strategy is stable, or a number of moves was made."""
-    return rmax.train_until(key, problem, hparams, until=Partial(_is_stable, most), num_steps=10**6)
+    return rmax.train_until(
+        key, problem, hparams, until=Partial(_is_stable, max_moves), num_steps=10**6
+    )
 
 
 def _is_stable(
-    most: jax.Array, before: rmax.State, after: rmax.State, metrics: rmax.Metrics
+    max_moves: jax.Array, before: rmax.State, after: rmax.State, metrics: rmax.Metrics
 ) -> jax.Array:
-    return (after.moves - after.last_update >= REST) | (after.moves >= most)
+    return (after.moves - after.last_update >= REST) | (after.moves >= max_moves)
 
 
 def _single_run_seconds(
-    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: loops.Learned
+    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, learned: loops.Learned
 ) -> tuple[float, float]:
     """Median seconds of single runs, until they end and until their last update."""
-    most = jnp.full_like(found.state.last_update, loops.MAX_STEPS)
+    max_moves = jnp.full_like(learned.state.last_update, loops.MAX_STEPS)
 
     def median(limits: jax.Array) -> float:
         pairs = zip(keys, limits, strict=True)
         runs = [run_seconds(partial(_learn, k, problem, hparams, limit))[1] for k, limit in pairs]
         return float(np.median(runs))
 
-    return median(most), median(found.state.last_update)
+    return median(max_moves), median(learned.state.last_update)
 
 
 def _evaluated(
-    found: loops.Learned, problem: rmax.Problem, hparams: rmax.Hparams
+    learned: loops.Learned, problem: rmax.Problem, hparams: rmax.Hparams
 ) -> tuple[list[Record], rmax.Evidence]:
     """A row for each seed, and the evidence of the first; all strategies of a run have one support."""
     rows, every = [], []
-    for seed in range(len(found.num_steps)):
-        one = jax.tree.map(lambda x, i=seed: x[i], found)
+    for seed in range(len(learned.num_steps)):
+        one = jax.tree.map(lambda x, i=seed: x[i], learned)
         check(one)
         evidence = rmax.evidence(one.state, problem, hparams)
         every.append(evidence)
@@ -231,12 +235,12 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Rec
         maps[place] = np.where(reached[:, None], rows, np.nan)
         return maps
 
-    near = np.zeros((2, 4, 9), bool)
-    near[place] = np.asarray(learned.epsilon_optimal)[system] & reached
+    epsilon_optimal = np.zeros((2, 4, 9), bool)
+    epsilon_optimal[place] = np.asarray(learned.epsilon_optimal)[system] & reached
     return {
         "initial": on_maps(winning),
         "learned": on_maps(learned.strategy),
-        "epsilon_optimal": near,
+        "epsilon_optimal": epsilon_optimal,
     }
 
 
@@ -245,12 +249,12 @@ def pictures(result: Record) -> Record:
     from jaxltl import plot
 
     task = surveillance()
-    kept = ~task.letters.all(axis=1)  # without the letter that no cell has, for shorter guards
-    letters, delta, priority = task.letters[kept], task.delta[:, kept], task.priority[:, kept]
+    occurs = ~task.letters.all(axis=1)  # without the letter that no cell has, for shorter guards
+    letters, delta, priority = task.letters[occurs], task.delta[:, occurs], task.priority[:, occurs]
     task = replace(task, letters=letters, delta=delta, priority=priority)
     best = np.asarray(result["figure17"]["best"], float)
     danger = np.array([np.isin(np.arange(9), cells) for cells in _DANGER.values()])
-    shown, maps = result["figure18"], result["figure19"]
+    values, maps = result["figure18"], result["figure19"]
     titles = [f"light {light}, q{q}" for light in _DANGER for q in (1, 2, 3, 4)]
     laid_out = {k: np.asarray(maps[k], float).reshape(8, 9, -1) for k in ("initial", "learned")}
     return {
@@ -264,12 +268,12 @@ def pictures(result: Record) -> Record:
         ),
         "figure_18_values": plot.compare(
             {
-                "optimal": shown["optimal"],
-                "learned": shown["learned"],
-                "initial (uniform)": shown["initial"],
-                "winning, by the graph only": shown["winning"],
+                "optimal": values["optimal"],
+                "learned": values["learned"],
+                "initial (uniform)": values["initial"],
+                "winning, by the graph only": values["winning"],
             },
-            groups=["reachable" if x else "unreachable" for x in shown["reachable"]],
+            groups=["reachable" if x else "unreachable" for x in values["reachable"]],
             label="worst-case value",
         ),
         "figure_19_initial": plot.strategies(_MAP, laid_out["initial"], titles=titles),

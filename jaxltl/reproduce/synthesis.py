@@ -137,8 +137,12 @@ def _learning_curve(
 
 def _counters(bound: int | None) -> Record:
     game = robots(3)
-    found = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound).model
-    return {"bound": bound, "states": found.num_states, "max_value": float(_value(found).max())}
+    restricted = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound).model
+    return {
+        "bound": bound,
+        "states": restricted.num_states,
+        "max_value": float(_value(restricted).max()),
+    }
 
 
 def _example_2() -> Record:
@@ -150,9 +154,9 @@ def _example_2() -> Record:
         safe="!collision",
     )
     strategy = permissive_strategy(game, task)
-    found = apply_strategy(strategy)
-    value = _value(found.model)
-    initial = np.asarray(found.model.initial) > 0
+    restricted = apply_strategy(strategy)
+    value = _value(restricted.model)
+    initial = np.asarray(restricted.model.initial) > 0
     here = value[initial]
     return {
         "summary": {
@@ -162,7 +166,7 @@ def _example_2() -> Record:
             "mean": here.mean(),
             "maximal": strategy.maximal,
         },
-        "values": {"n": 4, "state": np.asarray(found.base_state)[initial], "value": here},
+        "values": {"n": 4, "state": np.asarray(restricted.base_state)[initial], "value": here},
     }
 
 
@@ -179,9 +183,9 @@ def _figure_12() -> Record:
     delays = []
     for bound in (2, 4, 8, 16, 32):
         strategy = permissive_strategy(game, "F b2", method="parity", bound=bound)
-        found = apply_strategy(strategy)
-        paid = reward[strategy.base_state[found.base_state]]
-        value = check(optimal_value(found.model.mdp, paid, DISCOUNT)).value
+        restricted = apply_strategy(strategy)
+        paid = reward[strategy.base_state[restricted.base_state]]
+        value = check(optimal_value(restricted.model.mdp, paid, DISCOUNT)).value
         delays.append({"bound": bound, "value": float(value.max())})
     return {"supremum": float(best.value.max()), "attained": bool(won), "delays": delays}
 

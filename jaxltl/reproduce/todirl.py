@@ -75,7 +75,7 @@ class Setting(NamedTuple):
     test: list[grid.World]
     task: Automaton  # the automaton of the whole task
     # demonstrations in each training world, the largest number of the plan
-    shown: list[Trajectories]
+    demonstrations: list[Trajectories]
 
 
 def _setting(num_seeds: int, plan: Plan) -> Setting:
@@ -86,8 +86,8 @@ def _setting(num_seeds: int, plan: Plan) -> Setting:
     policies = jax.vmap(lambda m: grid.expert_policy(m, _DISCOUNT))(models)
     keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
     draw = partial(grid.demonstrations, num=max(plan.demonstrations), horizon=100)
-    shown = jax.vmap(draw)(keys, models, policies)
-    return Setting(train, test, task, [_lane(shown, i) for i in range(num_seeds)])
+    demonstrations = jax.vmap(draw)(keys, models, policies)
+    return Setting(train, test, task, [_lane(demonstrations, i) for i in range(num_seeds)])
 
 
 def _automaton(formula: str, worlds: list[grid.World]) -> Automaton:
@@ -140,9 +140,11 @@ def _learned(
     radius = _RADIUS.get(method, 1)
     learner, hparams = (cloning, _CLONING) if method == "cloning" else (todirl, _HPARAMS)
     models, seen = _stacked(setting.train, memory), _observed(setting.train, radius)
-    shown = [jax.tree.map(lambda x: x[:number], t) for t in setting.shown]
+    demonstrations = [jax.tree.map(lambda x: x[:number], t) for t in setting.demonstrations]
     # Each seed learns in its own world only.
-    problems = jax.tree.map(lambda x: x[:, None], learner.make_problem(models, seen, shown))
+    problems = jax.tree.map(
+        lambda x: x[:, None], learner.make_problem(models, seen, demonstrations)
+    )
     keys = jax.vmap(jax.random.key)(1000 + jnp.arange(len(setting.train)))
     states = _begin(learner, keys, problems, hparams)
     evaluate = partial(_evaluated, setting, memory, method, radius)
@@ -215,12 +217,17 @@ def _performance(
     if memory is not setting.task:
         models = _stacked(worlds, synchronize(memory, setting.task))
         policies = lift_memory_policy(policies, setting.task)
-    found = task_performances(models, policies)
-    return np.stack([np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)])
+    performance = task_performances(models, policies)
+    return np.stack(
+        [
+            np.asarray(x, float)
+            for x in (performance.mean, (performance.upper - performance.lower) / 2)
+        ]
+    )
 
 
-def _row(found: Performance, states: PyTree) -> Record:
-    (train, train_width), (test, test_width) = found
+def _row(performance: Performance, states: PyTree) -> Record:
+    (train, train_width), (test, test_width) = performance
     return {
         "train_mean": train.mean(),
         "train_std": _deviation(train),

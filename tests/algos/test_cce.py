@@ -319,7 +319,7 @@ def test_variance_floors_noise_and_restarts_do_what_they_say():
     assert (noisier.family.variance >= 3.0).all()
     again, metrics = searched(problem(), Hparams(rate=0.9, restart_below=1e-2))
     assert again.num_restarts >= 2
-    assert metrics.spread.max() == 1.0, "back at the first distribution"
+    assert metrics.max_deviation.max() == 1.0, "back at the first distribution"
     assert (np.diff(metrics.best_objective) >= 0).all(), "what was found is kept"
     assert metrics.best_objective[-1] > -2.01
 

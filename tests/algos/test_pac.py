@@ -415,7 +415,7 @@ def test_every_move_that_stays_in_the_region_is_enough():  # lemma 6
 
 def test_errors_of_the_hat_game():
     game = Game(from_dense([[[0.5, 0.5], [1, 0]], [[1, 0], [0, 1]]]), jnp.array([True, False]))
-    with pytest.raises(ValueError, match=r"near has shape \(2, 3\); expected \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"near_optimal has shape \(2, 3\); expected \(2, 2\)"):
         pac.hat_game(game, jnp.ones((2, 3), bool), 0.1)
     with pytest.raises(ValueError, match="on a DenseMDP; of a product pass restrict"):
         pac.hat_game(replace(game, mdp=to_dense(game.mdp)), game.available, 0.1)

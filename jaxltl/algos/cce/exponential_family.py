@@ -152,11 +152,11 @@ def _like(name: str, x: ArrayLike, model: jax.Array) -> jax.Array:
 def _require_positive(name: str, x: jax.Array) -> None:
     if isinstance(x, jax.core.Tracer):
         return
-    given = np.asarray(x)
-    wrong = np.flatnonzero(~((given > 0) & np.isfinite(given)))
+    numbers = np.asarray(x)
+    wrong = np.flatnonzero(~((numbers > 0) & np.isfinite(numbers)))
     if wrong.size:
         raise ValueError(
-            f"{name}[{wrong[0]}] = {float(given[wrong[0]])!r}; it must be positive and finite."
+            f"{name}[{wrong[0]}] = {float(numbers[wrong[0]])!r}; it must be positive and finite."
         )
 
 
@@ -276,9 +276,9 @@ def _normal(key: Key, num_samples: int, like: jax.Array) -> jax.Array:
     stream = splitmix.streams(key, (*like.shape, 1))
     word = splitmix.words(stream, jnp.arange(num_samples, dtype=jnp.uint32))
     # The middles of equal intervals of (-1, 1), as many as are exact.
-    kept = 32 if jnp.finfo(like.dtype).nmant >= 32 else jnp.finfo(like.dtype).nmant
-    middle = (word >> (32 - kept)).astype(like.dtype) + 0.5
-    noise = math.sqrt(2) * lax.erf_inv(middle * 2.0 ** (1 - kept) - 1)
+    num_bits = 32 if jnp.finfo(like.dtype).nmant >= 32 else jnp.finfo(like.dtype).nmant
+    middle = (word >> (32 - num_bits)).astype(like.dtype) + 0.5
+    noise = math.sqrt(2) * lax.erf_inv(middle * 2.0 ** (1 - num_bits) - 1)
     return noise.T  # computed with the samples last, the longer axis where policies are small
 
 

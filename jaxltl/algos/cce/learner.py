@@ -26,7 +26,7 @@ Example: the point nearest to (1, 1) with a first coordinate of at most 0.5.
   >>> key, fresh = jax.random.split(jax.random.key(0))
   >>> hparams = cce.Hparams(rate=0.5)
   >>> state, metrics = cce.train(key, problem, hparams, num_steps=50)
-  >>> metrics.spread.shape, cce.policy(state, problem, hparams).shape
+  >>> metrics.max_deviation.shape, cce.policy(state, problem, hparams).shape
   ((50,), (2,))
   >>> solved = cce.result(state, problem, hparams, fresh)
   >>> solved.solution.round(2).tolist(), bool(solved.solution[0] <= 0.5)
@@ -147,14 +147,14 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     if hparams.elite_reuse:
         pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
     chosen = select(
-        jnp.where(pool.found, pool.objective, jnp.inf),
+        jnp.where(pool.valid, pool.objective, jnp.inf),
         pool.cost,
         limit,
         num=num_elites(hparams.rho, hparams.population),
         count=count,
         scale=problem.scale,
     )
-    elites = replace(rows_of(pool, chosen.index), found=chosen.taken)
+    elites = replace(rows_of(pool, chosen.index), valid=chosen.taken)
     rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)
     family = _moved(state, hparams, fresh, elites, chosen.enough_feasible, rate)
     family, restarted = _restarted(family, problem, hparams)
@@ -186,7 +186,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         cost=jnp.sum(jnp.where(usable[:, None], cost, 0), axis=0) / num_usable,
         best_objective=new.best.objective,
         least_excess=new.least.excess,
-        spread=jnp.max(families.standard_deviation(family)),
+        max_deviation=jnp.max(families.standard_deviation(family)),
         rate=rate,
         num_restarts=new.num_restarts,
         status=new.status,
@@ -204,12 +204,12 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
 def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
     """n_l and k_l."""
-    most, rho = hparams.population, hparams.rho
+    population, rho = hparams.population, hparams.rho
     if hparams.num_samples is None:
-        return jnp.int32(most), jnp.int32(num_elites(rho, most))
+        return jnp.int32(population), jnp.int32(num_elites(rho, population))
     requested = jnp.round(jnp.asarray(at(hparams.num_samples, step), float))
-    num_samples = jnp.clip(requested, math.ceil(1 / rho - SLACK), most).astype(jnp.int32)
-    counts = jnp.asarray([num_elites(rho, n) for n in range(most + 1)], jnp.int32)
+    num_samples = jnp.clip(requested, math.ceil(1 / rho - SLACK), population).astype(jnp.int32)
+    counts = jnp.asarray([num_elites(rho, n) for n in range(population + 1)], jnp.int32)
     return num_samples, counts[num_samples]
 
 
@@ -224,17 +224,17 @@ def _moved(
     """The distribution after (4.14) and the options that add variance."""
     weights = elite_weights(
         elites.objective,
-        elites.found,
+        elites.valid,
         enough,
         weighting=hparams.weighting,
         temperature=hparams.temperature,
     )
-    some = jnp.any(elites.found)
+    some = jnp.any(elites.valid)
     samples, total = elites.parameters, rate
     if hparams.sample_share is not None:
         share = (1 - rate) * at(hparams.sample_share, state.step)
         total = jnp.asarray(rate + share, rate.dtype)
-        own = fresh.found / jnp.sum(fresh.found, dtype=rate.dtype)
+        own = fresh.valid / jnp.sum(fresh.valid, dtype=rate.dtype)
         samples = jnp.concatenate([samples, fresh.parameters])
         weights = jnp.concatenate([rate * weights, share * own])
     weights = jnp.where(some, weights, 1)
@@ -255,10 +255,10 @@ def _restarted(family: PyTree, problem: Problem, hparams: Hparams) -> tuple[PyTr
 
 def _require_state(state: State, problem: Problem) -> None:
     require_own((state, State))
-    found, own = (families.center(x.family).shape for x in (state, problem))
-    if found != own or state.best.cost.shape != problem.limit.shape:
+    shape, own = (families.center(x.family).shape for x in (state, problem))
+    if shape != own or state.best.cost.shape != problem.limit.shape:
         raise ValueError(
-            f"state is of policies float{[*found]} with {len(state.best.cost)} costs, the problem "
+            f"state is of policies float{[*shape]} with {len(state.best.cost)} costs, the problem "
             f"of float{[*own]} with {len(problem.limit)}; give the state of a run on this problem."
         )
 
@@ -419,19 +419,19 @@ def result(
             "the rollout or in the parameters that are drawn."
         )
     keys = jax.random.split(key)
-    sampled = state.best if bool(state.best.found) else state.least
+    sampled = state.best if bool(state.best.valid) else state.least
     look = partial(assess, problem, num_evaluations=num_evaluations)
     both = {
         "mean": look(families.center(state.family), keys[0]),
         "best": look(sampled.parameters, keys[1]),
     }
-    if not bool(sampled.found):  # no step was made
+    if not bool(sampled.valid):  # no step was made
         both["best"] = both["mean"]
     feasible = [name for name in both if bool(both[name].feasible)]
     name = max(feasible, key=lambda n: float(both[n].objective), default=None)
     violation = float(np.fmin.reduce([float(a.excess) for a in both.values()]))
     if name is None:
-        seen = "" if bool(state.best.found) else " and no sample was"
+        seen = "" if bool(state.best.valid) else " and no sample was"
         message = (
             f"No feasible policy: neither the mean nor the best sample is feasible on "
             f"{num_evaluations} fresh evaluations{seen}; the least violation is {violation:.4g}."

@@ -29,14 +29,14 @@ from jaxltl.core.validation import Range
 class Sample:
     """An evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess; or n of them.
 
-    `excess` is ``max_c (cost_c - limit_c) / scale_c``; `found` whether there is such a policy.
+    `excess` is ``max_c (cost_c - limit_c) / scale_c``; `valid` whether there is such a policy.
     """
 
     parameters: jax.Array
     objective: jax.Array
     cost: jax.Array
     excess: jax.Array
-    found: jax.Array
+    valid: jax.Array
 
 
 def num_elites(rho: float, num_samples: int) -> int:
@@ -90,8 +90,8 @@ def select(
     enough = jnp.sum(feasible) >= count
     rank = jnp.where(enough, objective, -excess)
     # Unusable samples rank after all usable ones, and -0 equals 0.
-    most = jnp.finfo(rank.dtype).max
-    rank = jnp.where(rank == 0, 0, jnp.clip(rank, -most, most))
+    largest = jnp.finfo(rank.dtype).max
+    rank = jnp.where(rank == 0, 0, jnp.clip(rank, -largest, largest))
     rank = jnp.where(jnp.where(enough, feasible, usable), rank, -jnp.inf)
     top, index = lax.top_k(rank, num)
     taken = (top > -jnp.inf) & (jnp.arange(num) < count)
@@ -126,8 +126,8 @@ def better(
 ) -> Sample:
     """The old sample, or the one with the highest score if that exceeds the record."""
     i = jnp.argmax(jnp.where(among, score, -jnp.inf))
-    new = replace(rows_of(fresh, i), found=among[i])
-    beats = among[i] & (~old.found | (score[i] > record))
+    new = replace(rows_of(fresh, i), valid=among[i])
+    beats = among[i] & (~old.valid | (score[i] > record))
     return jax.tree.map(lambda x, y: jnp.where(beats, x, y), new, old)
 
 
@@ -346,7 +346,7 @@ class Metrics:
       objective, cost: means over this step's usable samples; the cost is ``float[C]``.
       best_objective: of the best feasible sample so far; minus infinity without any.
       least_excess: of the sample of the least violation so far.
-      spread: the largest standard deviation after the step.
+      max_deviation: the largest standard deviation after the step.
       rate, num_restarts, status: alpha_l, and see :class:`State`.
     """
 
@@ -358,7 +358,7 @@ class Metrics:
     cost: jax.Array
     best_objective: jax.Array
     least_excess: jax.Array
-    spread: jax.Array
+    max_deviation: jax.Array
     rate: jax.Array
     num_restarts: jax.Array
     status: jax.Array

@@ -83,17 +83,17 @@ def orthogonal(scale: float) -> Callable[..., jax.Array]:
 
     def start(key: Key, shape: Sequence[int], dtype: DTypeLike | None = None) -> jax.Array:
         rows, columns = shape
-        most, least = max(rows, columns), min(rows, columns)
-        drawn = jax.random.normal(key, (least, most), dtype)
+        length, least = max(rows, columns), min(rows, columns)
+        drawn = jax.random.normal(key, (least, length), dtype)
 
-        def add(i: jax.Array, found: jax.Array) -> jax.Array:
+        def add(i: jax.Array, basis: jax.Array) -> jax.Array:
             row = drawn[i]
             for _ in range(2):
-                row = row - (found @ row) @ found
-            return found.at[i].set(row / jnp.linalg.norm(row))
+                row = row - (basis @ row) @ basis
+            return basis.at[i].set(row / jnp.linalg.norm(row))
 
-        found = lax.fori_loop(0, least, add, jnp.zeros_like(drawn))
-        return scale * (found.T if rows == most else found)
+        basis = lax.fori_loop(0, least, add, jnp.zeros_like(drawn))
+        return scale * (basis.T if rows == length else basis)
 
     return start
 
@@ -163,8 +163,10 @@ def action_parameters(module: nn.Module, layer: Callable[[int], jax.Array]) -> P
     if module.num_actions:
         return layer(module.num_actions)
     start = nn.initializers.constant(np.log(module.initial_deviation))
-    spread = module.param("log_deviation", start, tuple(module.shape), jnp.result_type(float))
-    return layer(int(np.prod(module.shape))).reshape(module.shape), spread
+    log_deviation = module.param(
+        "log_deviation", start, tuple(module.shape), jnp.result_type(float)
+    )
+    return layer(int(np.prod(module.shape))).reshape(module.shape), log_deviation
 
 
 def _heads(module: nn.Module, x: jax.Array) -> tuple[PyTree, jax.Array]:
@@ -251,18 +253,18 @@ def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
     if memory is None:
         return jax.tree.map(jnp.asarray, begin())
     try:
-        found = jax.tree.map(jnp.asarray, memory)
+        arrays = jax.tree.map(jnp.asarray, memory)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
             f"memory is {validation.shorten(memory)}; give a tree of arrays of numbers."
         ) from None
-    own = begin() if hasattr(network, "initial_memory") else found
-    if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):
+    own = begin() if hasattr(network, "initial_memory") else arrays
+    if jax.tree.map(jnp.shape, arrays) != jax.tree.map(jnp.shape, own):
         raise ValueError(
-            f"memory has the shapes {jax.tree.map(jnp.shape, found)}, and that of the network "
+            f"memory has the shapes {jax.tree.map(jnp.shape, arrays)}, and that of the network "
             f"{jax.tree.map(jnp.shape, own)}; give one of those shapes, or none."
         )
-    return found
+    return arrays
 
 
 def has_memory(problem: HasNetwork) -> bool:
@@ -326,7 +328,7 @@ def require_network(
     wanted = "logits float[A]" if finite else "(mean, log_deviation)"
     form = f"(memory, ({wanted}, value))" if recurrent else f"({wanted}, value)"
     try:
-        found, variables = jax.eval_shape(
+        output, variables = jax.eval_shape(
             lambda *x: network.init_with_output(jax.random.key(0), *x), *read
         )
     except TypeError as problem:  # what a function says that is called with other arguments
@@ -346,8 +348,8 @@ def require_network(
 
     expected: PyTree = (space.shape if finite else (space.shape, space.shape), ())
     expected = (shapes(memory), expected) if recurrent else expected
-    if shapes(found) != expected:
+    if shapes(output) != expected:
         raise ValueError(
-            f"network returns shapes {shapes(found)} for one observation; expected {expected}, "
+            f"network returns shapes {shapes(output)} for one observation; expected {expected}, "
             f"{form}. It reads a single observation: many are a vmap."
         )

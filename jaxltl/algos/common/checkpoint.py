@@ -9,9 +9,9 @@ read onto any other mesh by any number of processes.
 >>> import numpy as np
 >>> from jaxltl.algos.common import checkpoint
 >>> path = os.path.join(tempfile.mkdtemp(), "state.npz")
->>> state, given = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
->>> checkpoint.save(path, state, given)
->>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
+>>> state, description = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
+>>> checkpoint.save(path, state, description)
+>>> checkpoint.load(path, {"step": np.int32(0)}, description)["step"].item()
 3
 >>> checkpoint.remove(path)
 """
@@ -41,16 +41,16 @@ from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.models.ops.array_namespace import to_jax
 
 
-_GIVEN = "given"  # the fingerprint's name in the file
+_DESCRIPTION = "given"  # the fingerprint's name in the file
 _PARTS = "parts"  # name of the index of arrays in other files
 
 
 def save(
-    path: str | os.PathLike[str], state: PyTree, given: Mapping[str, str] | None = None
+    path: str | os.PathLike[str], state: PyTree, description: Mapping[str, str] | None = None
 ) -> None:
     """Writes a learner's `state`, a tree of arrays, as an ``.npz`` at `path`, atomically.
 
-    `given` is the :func:`fingerprint` of the problem and hyperparameters. With several processes all
+    `description` is the :func:`fingerprint` of the problem and hyperparameters. With several processes all
     call it, with a shared directory. Each writes its part of arrays on the devices of several, and the
     first process writes the file last.
     """
@@ -60,14 +60,14 @@ def save(
     stored = _write_parts(path, apart) if apart else {}
     if jax.process_index() and any(_is_shared(leaf) for _, leaf in named):
         return
-    arrays: dict[str, PyTree] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
+    arrays: dict[str, PyTree] = {_DESCRIPTION: np.array(json.dumps(dict(description or {})))}
     arrays |= {name: np.asarray(leaf) for name, leaf in named if name not in apart}
     if stored:
         arrays[_PARTS] = np.array(json.dumps({name: list(x) for name, x in stored.items()}))
     with atomic_write(path) as file:
         np.savez(file, **arrays)
-    kept = {file for x in stored.values() for *_, file, _ in x.pieces}
-    _unlink([part for part in before if part.name not in kept])
+    current = {file for x in stored.values() for *_, file, _ in x.pieces}
+    _unlink([part for part in before if part.name not in current])
 
 
 def remove(path: str | os.PathLike[str]) -> None:
@@ -80,13 +80,13 @@ def remove(path: str | os.PathLike[str]) -> None:
 
 
 def load(
-    path: str | os.PathLike[str], like: PyTree, given: Mapping[str, str] | None = None
+    path: str | os.PathLike[str], like: PyTree, description: Mapping[str, str] | None = None
 ) -> PyTree:
     """The state saved by :func:`save` at `path`, bit for bit, as a tree like `like`.
 
     `like` is a state of the same learner and problem, for example from ``init``; a first axis of length
     zero matches any length. Arrays are placed on its devices, and each process reads its parts.
-    `given` is as for :func:`save`.
+    `description` is as for :func:`save`.
 
     Raises:
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
@@ -97,7 +97,7 @@ def load(
             # An open file of our own is closed even where a damaged archive is given up.
             with open(path, "rb") as file:
                 arrays: dict[str, PyTree] = read_arrays(file)
-            before = json.loads(str(arrays.pop(_GIVEN)))
+            before = json.loads(str(arrays.pop(_DESCRIPTION)))
             stored = json.loads(str(arrays.pop(_PARTS, "{}")))
             arrays |= {name: _Stored(*x) for name, x in stored.items()}
             leaves = [
@@ -108,7 +108,7 @@ def load(
             raise ValueError(str(error)) from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
-    _require_same(str(path), before, dict(given or {}))
+    _require_same(str(path), before, dict(description or {}))
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
@@ -116,11 +116,11 @@ class _Another(Exception):
     """An array of another learner or problem."""
 
 
-def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: _Parts) -> PyTree:
+def _loaded(path: str, name: str, leaf: PyTree, array: PyTree, others: _Parts) -> PyTree:
     """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
-    if found is None or not _fits(found, expected):
-        is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
+    if array is None or not _fits(array, expected):
+        is_ = "missing" if array is None else f"{array.dtype}{list(array.shape)}"
         raise _Another(
             f"{path!r} does not belong to this run: {name} is {is_}, expected "
             f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
@@ -128,22 +128,22 @@ def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: _Parts) -
     if isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1:
 
         def block(index: tuple[slice, ...] | None) -> np.ndarray:
-            stored = isinstance(found, _Stored)
-            return others.read(found, index) if stored else found[index or ()]
+            stored = isinstance(array, _Stored)
+            return others.read(array, index) if stored else array[index or ()]
 
-        value = jax.make_array_from_callback(tuple(found.shape), expected.sharding, block)
+        value = jax.make_array_from_callback(tuple(array.shape), expected.sharding, block)
     else:
-        value = to_jax(others.read(found) if isinstance(found, _Stored) else found)
+        value = to_jax(others.read(array) if isinstance(array, _Stored) else array)
     if expected is not leaf:
         value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
     return value
 
 
-def _fits(found: np.ndarray | _Stored, expected: jax.Array) -> bool:
+def _fits(array: np.ndarray | _Stored, expected: jax.Array) -> bool:
     shape = expected.shape
     if shape[:1] == (0,):
-        shape = (*found.shape[:1], *shape[1:])
-    return tuple(found.shape) == shape and found.dtype == expected.dtype
+        shape = (*array.shape[:1], *shape[1:])
+    return tuple(array.shape) == shape and array.dtype == expected.dtype
 
 
 def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> None:
@@ -181,8 +181,8 @@ def _data(leaf: jax.Array) -> jax.Array:
 # --- fingerprints ---------------------------------------------------------------------------
 
 
-def fingerprint(**given: object) -> dict[str, str]:
-    """A description of each part of `given`: types, static fields, and arrays by a hash of their bytes.
+def fingerprint(**parts: object) -> dict[str, str]:
+    """A description of each of the `parts`: types, static fields, and arrays by a hash of their bytes.
 
     Functions are described by their code, so that other processes find the same.
 
@@ -190,7 +190,7 @@ def fingerprint(**given: object) -> dict[str, str]:
     >>> sorted(one), [name for name in one if one[name] != two[name]]
     (['x[0]', "x[1]['b']"], ["x[1]['b']"])
     """
-    return dict(pair for name, value in given.items() for pair in _described(name, value))
+    return dict(pair for name, value in parts.items() for pair in _described(name, value))
 
 
 def _described(name: str, value: PyTree) -> Iterator[tuple[str, str]]:
@@ -228,8 +228,8 @@ def _array(value: object) -> str:
     value = _data(value) if isinstance(value, jax.Array) else value
     array = np.asarray(value)
     digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
-    shown = f" = {array.tolist()}" if array.size <= 4 else ""
-    return f"{array.dtype}{list(array.shape)}{shown} #{digest}"
+    text = f" = {array.tolist()}" if array.size <= 4 else ""
+    return f"{array.dtype}{list(array.shape)}{text} #{digest}"
 
 
 def _function(name: str, value: types.FunctionType) -> Iterator[tuple[str, str]]:
@@ -348,12 +348,12 @@ class _Parts(contextlib.ExitStack):
     def read(self, stored: _Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
         """A block of an array, or all of it, from its pieces; ValueError if a part is missing or damaged."""
         begin, end = _ends(index or (), stored.shape)
-        found = np.zeros([b - a for a, b in zip(begin, end, strict=True)], stored.dtype)
+        block = np.zeros([b - a for a, b in zip(begin, end, strict=True)], stored.dtype)
         for first, last, file, name in stored.pieces:
             low, high = np.maximum(begin, first), np.minimum(end, last)
             if (low < high).all():
-                found[_block(low, high, begin)] = self._piece(file, name)[_block(low, high, first)]
-        return found
+                block[_block(low, high, begin)] = self._piece(file, name)[_block(low, high, first)]
+        return block
 
     def _piece(self, file: str, name: str) -> np.ndarray:
         if (file, name) not in self._pieces:
@@ -363,8 +363,8 @@ class _Parts(contextlib.ExitStack):
                     self._files[file] = np.load(opened, allow_pickle=False)
                 self._pieces[file, name] = self._files[file][name]
             except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
-                what = "missing" if isinstance(error, FileNotFoundError) else "damaged"
-                raise ValueError(f"its part {file!r} is {what}.") from None
+                fault = "missing" if isinstance(error, FileNotFoundError) else "damaged"
+                raise ValueError(f"its part {file!r} is {fault}.") from None
         return self._pieces[file, name]
 
 

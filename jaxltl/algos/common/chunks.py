@@ -119,11 +119,11 @@ def run_in_chunks(
     until = until if until is None or isinstance(until, Partial) else Partial(until)
     now = _begin(step, state, problem, hparams, num_lanes)
     rows = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
-    given: PyTree = None
+    fingerprint: PyTree = None
     if checkpoint is not None:
-        given = files.fingerprint(step=step, problem=problem, hparams=hparams)
+        fingerprint = files.fingerprint(step=step, problem=problem, hparams=hparams)
         if os.path.exists(checkpoint):
-            now, rows = files.load(checkpoint, (now, rows), given)
+            now, rows = files.load(checkpoint, (now, rows), fingerprint)
     advance: Callable[..., tuple[PyTree, PyTree]]
     single = _progress_step(step, options.keep)
     if not lanes:
@@ -132,18 +132,18 @@ def run_in_chunks(
         advance = partial(_run_lanes, single)
     else:
         advance = _run_over_mesh(options.mesh, single)
-    ended, made = on_host((now.done, now.count))
-    while made.max() < num_steps and not ended.all():
-        lengths = block_lengths(min(chunk, num_steps - int(made.max())), options.max_rows)
+    ended, counts = on_host((now.done, now.count))
+    while counts.max() < num_steps and not ended.all():
+        lengths = block_lengths(min(chunk, num_steps - int(counts.max())), options.max_rows)
         now, fresh = advance(strong(now), problem, (hparams, until), lengths)
         rows = jax.tree.map(
             lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh)
         )
-        ended, made = on_host((now.done, now.count))
+        ended, counts = on_host((now.done, now.count))
         if checkpoint is not None:
-            files.save(checkpoint, (now, rows), given)
+            files.save(checkpoint, (now, rows), fingerprint)
         if options.report is not None:
-            options.report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
+            options.report(int(counts.max()), jax.tree.map(lambda x: x[-1], rows[1]))
     step_of = np.asarray(rows[0])
     return Chunks(
         now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended
@@ -176,8 +176,8 @@ def _metrics_of(
 def _progress_step(step: Step, keep: str) -> Step:
     """A step of :class:`Progress`, with rows of counts and metrics."""
 
-    def one(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
-        hparams, until = given
+    def one(now: Progress, problem: PyTree, settings: PyTree) -> tuple[Progress, PyTree]:
+        hparams, until = settings
 
         def go(now: Progress) -> Progress:
             after, metrics = step(now.state, problem, hparams)
@@ -196,17 +196,17 @@ def _progress_step(step: Step, keep: str) -> Step:
 
 @partial(jax.jit, static_argnames="step")
 def _run_lanes(
-    step: Step, now: Progress, problem: PyTree, given: PyTree, lengths: np.ndarray
+    step: Step, now: Progress, problem: PyTree, settings: PyTree, lengths: np.ndarray
 ) -> tuple[Progress, PyTree]:
     """Blocks of steps of all lanes; the rows lie along the first axis."""
 
     def run(now: Progress, hparams: PyTree) -> tuple[Progress, PyTree]:
-        return run_blocks(step, now, problem, (hparams, given[1]), lengths)
+        return run_blocks(step, now, problem, (hparams, settings[1]), lengths)
 
     if len(now.count) > 1:
-        return jax.vmap(run, out_axes=(0, 1))(now, given[0])
+        return jax.vmap(run, out_axes=(0, 1))(now, settings[0])
     # Without vmap: its loops and branches take several times as long to compile.
-    last, rows = run(*jax.tree.map(lambda x: x[0], (now, given[0])))
+    last, rows = run(*jax.tree.map(lambda x: x[0], (now, settings[0])))
     return jax.tree.map(lambda x: x[None], last), jax.tree.map(lambda x: x[:, None], rows)
 
 
@@ -215,8 +215,8 @@ def _spread(hparams: PyTree, state: PyTree) -> PyTree:
     size = len(state.step)
     floats = [x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def one(given: ArrayLike) -> np.ndarray:
-        x = np.asarray(given)
+    def one(number: ArrayLike) -> np.ndarray:
+        x = np.asarray(number)
         x = x.astype(floats[0]) if floats and np.issubdtype(x.dtype, np.floating) else x
         return np.broadcast_to(x, (size, *x.shape[1:]))
 
@@ -227,8 +227,8 @@ def _run_over_mesh(mesh: Mesh, step: Step) -> Callable[..., tuple[PyTree, PyTree
     """Blocks of steps of lanes over the devices of a mesh, with metrics on the host."""
     lanes = vmap_over_mesh(_blocks_of(step), mesh, in_axes=(0, None, (0, None), None))
 
-    def advance(*given: PyTree) -> tuple[PyTree, PyTree]:
-        state, rows = lanes(*given)
+    def advance(*arguments: PyTree) -> tuple[PyTree, PyTree]:
+        state, rows = lanes(*arguments)
         return state, jax.tree.map(lambda x: np.swapaxes(x, 0, 1), on_host(rows))
 
     return advance

@@ -115,14 +115,14 @@ def generalized_advantages(
     after each step, and A = 0 after the last step and after the end of an episode.
     """
     error = reward + discount * following - value
-    kept = jnp.broadcast_to(jnp.where(ended, 0, discount * gae_lambda), error.shape)
+    decay = jnp.broadcast_to(jnp.where(ended, 0, discount * gae_lambda), error.shape)
 
     def back(later: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        error, kept = row
-        now = error + kept * later
+        error, decay = row
+        now = error + decay * later
         return now, now
 
-    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True)[1]
+    return lax.scan(back, jnp.zeros_like(error[0]), (error, decay), reverse=True)[1]
 
 
 def masked_advantages(

@@ -240,12 +240,12 @@ def bind(
     array. `keep` is the default of that argument of ``run_until``.
     """
 
-    def checked(made: Callable[..., tuple[StateT, MetricsT]]) -> Callable[..., Any]:
+    def checked(function: Callable[..., tuple[StateT, MetricsT]]) -> Callable[..., Any]:
         def call(
             state: StateT, problem: ProblemT, hparams: HparamsT, *going: jax.Array
         ) -> tuple[StateT, MetricsT]:
             require_hparams(hparams)
-            after, metrics = made(state, problem, hparams, *going)
+            after, metrics = function(state, problem, hparams, *going)
             return after, flag_invalid(metrics, hparams, state.step)
 
         return call

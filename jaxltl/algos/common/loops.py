@@ -25,7 +25,7 @@ HparamsT = TypeVar("HparamsT")
 StateT = TypeVar("StateT")
 MetricsT = TypeVar("MetricsT")
 CarryT = TypeVar("CarryT")
-GivenT = TypeVar("GivenT")
+ConstantsT = TypeVar("ConstantsT")
 
 Step = Callable[[StateT, ProblemT, HparamsT], tuple[StateT, MetricsT]]
 Until = Callable[[StateT, StateT, MetricsT], Numeric]
@@ -120,17 +120,17 @@ class Learned:
 def run_until(
     step: Callable[..., tuple[StateT, MetricsT]],
     state: StateT,
-    given: tuple[ProblemT, HparamsT, Until[StateT, MetricsT], Numeric],
+    arguments: tuple[ProblemT, HparamsT, Until[StateT, MetricsT], Numeric],
     *,
     check_every: int = 1,
     keep: str = "after",
     idle: bool = False,
 ) -> Learned:
-    """The ``run_until`` of a learner, `given` the problem, hyperparameters, condition and most steps.
+    """The ``run_until`` of a learner; `arguments`: problem, hyperparameters, condition and maximal steps.
 
     With `idle`, a fourth argument False of `step` keeps the state.
     """
-    problem, hparams, until, num_steps = given
+    problem, hparams, until, num_steps = arguments
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
     if idle and (check_every, keep) != (1, "after"):
@@ -159,12 +159,12 @@ class Progress:
 def _run_until(
     step: Callable[..., tuple[PyTree, PyTree]],
     state: PyTree,
-    given: tuple[PyTree, ...],
+    arguments: tuple[PyTree, ...],
     check_every: int,
     keep: str,
     idle: bool,
 ) -> Learned:
-    return over_cores(partial(_loop, step, check_every, keep, idle), state, given)
+    return over_cores(partial(_loop, step, check_every, keep, idle), state, arguments)
 
 
 def _loop(
@@ -173,13 +173,15 @@ def _loop(
     keep: str,
     idle: bool,
     state: PyTree,
-    given: tuple[PyTree, ...],
+    arguments: tuple[PyTree, ...],
 ) -> Learned:
-    def active(carry: tuple[Progress, PyTree], given: tuple[PyTree, ...]) -> jax.Array:
-        return ~carry[0].done & (carry[0].count < given[-1])
+    def active(carry: tuple[Progress, PyTree], arguments: tuple[PyTree, ...]) -> jax.Array:
+        return ~carry[0].done & (carry[0].count < arguments[-1])
 
-    def body(carry: tuple[Progress, PyTree], given: tuple[PyTree, ...]) -> tuple[Progress, PyTree]:
-        going, (problem, hparams, until, _) = active(carry, given), given
+    def body(
+        carry: tuple[Progress, PyTree], arguments: tuple[PyTree, ...]
+    ) -> tuple[Progress, PyTree]:
+        going, (problem, hparams, until, _) = active(carry, arguments), arguments
         now, window = carry
         before = now.state if window is None else window
         after, metrics = step(now.state, problem, hparams, *([going] if idle else []))
@@ -195,10 +197,10 @@ def _loop(
             new = choose(going, new, now)
         return new, None if window is None else choose(due, new.state, window)
 
-    problem, hparams, *_ = given
+    problem, hparams, *_ = arguments
     empty = _zero_metrics(step, state, problem, hparams, *([jnp.bool_(True)] if idle else []))
     begin = Progress(state, empty, jnp.int32(0), jnp.bool_(False))
-    end, _ = while_active(active, body, (begin, None if check_every == 1 else state), given)
+    end, _ = while_active(active, body, (begin, None if check_every == 1 else state), arguments)
     status = jnp.where(end.done, Status.COMPLETED, Status.MAX_STEPS).astype(jnp.int32)
     return Learned(
         end.state, end.metrics, end.count, worst(status, getattr(end.metrics, "status", status))
@@ -206,34 +208,36 @@ def _loop(
 
 
 def while_active(
-    active: Callable[[CarryT, GivenT], jax.Array],
-    body: Callable[[CarryT, GivenT], CarryT],
+    active: Callable[[CarryT, ConstantsT], jax.Array],
+    body: Callable[[CarryT, ConstantsT], CarryT],
     carry: CarryT,
-    given: GivenT,
+    constants: ConstantsT,
 ) -> CarryT:
-    """``while active(carry, given): carry = body(carry, given)`` without masking under ``vmap``.
+    """``while active(carry, constants): carry = body(carry, constants)`` without masking under ``vmap``.
 
     A vmapped ``lax.while_loop`` copies all arrays of finished lanes in every iteration. Here `body`
     must return the carry of an inactive lane unchanged, so that only written entries are touched.
     """
-    carry, given = jax.tree.map(jnp.asarray, (carry, given))
+    carry, constants = jax.tree.map(jnp.asarray, (carry, constants))
 
     @jax.custom_batching.custom_vmap
-    def loop(carry: CarryT, given: GivenT) -> CarryT:
-        return lax.while_loop(lambda c: active(c, given), lambda c: body(c, given), carry)
+    def loop(carry: CarryT, constants: ConstantsT) -> CarryT:
+        return lax.while_loop(lambda c: active(c, constants), lambda c: body(c, constants), carry)
 
     @loop.def_vmap
-    def _(size: int, batched: PyTree, carry: CarryT, given: GivenT) -> tuple[CarryT, PyTree]:
+    def _(
+        size: int, batched: PyTree, carry: CarryT, constants: ConstantsT
+    ) -> tuple[CarryT, PyTree]:
         lanes, shared = batched
         carry = jax.tree.map(
             lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes
         )
         axes = (0, jax.tree.map(lambda b: 0 if b else None, shared))
         last = lax.while_loop(
-            lambda c: jnp.any(jax.vmap(active, axes)(c, given)),
-            lambda c: jax.vmap(body, axes)(c, given),
+            lambda c: jnp.any(jax.vmap(active, axes)(c, constants)),
+            lambda c: jax.vmap(body, axes)(c, constants),
             carry,
         )
         return last, jax.tree.map(lambda _: True, lanes)
 
-    return loop(carry, given)
+    return loop(carry, constants)

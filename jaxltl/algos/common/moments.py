@@ -49,8 +49,10 @@ def updated_moments(
 
 def scale_of(moments: Moments) -> jax.Array:
     """The standard deviation; 1 where it is zero."""
-    spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
-    return jnp.where(spread > 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean), spread, 1)
+    deviation = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
+    return jnp.where(
+        deviation > 8 * jnp.finfo(deviation.dtype).eps * jnp.abs(moments.mean), deviation, 1
+    )
 
 
 def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:

@@ -219,33 +219,33 @@ def near_optimal(q: Array, allowed: Array, tolerance: Numeric) -> jax.Array:
     return allowed & ((best - q <= tolerance) | (q == best))
 
 
-def hat_strategy(near: Array, allowed: Array, exploration: Numeric) -> jax.Array:
+def hat_strategy(near_optimal: Array, allowed: Array, exploration: Numeric) -> jax.Array:
     """The mixture of uniform strategies over allowed and near-optimal actions: ``float[S, A]``.
 
-    ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near(s))`` with p the `exploration`
-    (remark 4; algorithm 4, line 12), for masks `near` and `allowed`, ``bool[S, A]``. If `allowed`
+    ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near_optimal(s))`` with p the `exploration`
+    (remark 4; algorithm 4, line 12), for masks `near_optimal` and `allowed`, ``bool[S, A]``. If `allowed`
     are the actions that stay in the almost-sure winning region, the strategy wins almost surely
     (lemma 6) and is near-optimal (lemma 8). Rows without allowed actions are zero.
 
-    >>> near, allowed = jnp.array([[True, False]]), jnp.array([[True, True]])
-    >>> [round(p, 3) for p in hat_strategy(near, allowed, 0.1)[0].tolist()]
+    >>> best, allowed = jnp.array([[True, False]]), jnp.array([[True, True]])
+    >>> [round(p, 3) for p in hat_strategy(best, allowed, 0.1)[0].tolist()]
     [0.95, 0.05]
     """
     p = jnp.asarray(exploration, jnp.result_type(float))
-    return p * _uniform(allowed) + (1 - p) * _uniform(near)
+    return p * _uniform(allowed) + (1 - p) * _uniform(near_optimal)
 
 
-def hat_game(game: Game, near: Array, exploration: Numeric) -> Game:
+def hat_game(game: Game, near_optimal: Array, exploration: Numeric) -> Game:
     """The hat game, every strategy of which mostly plays near-optimal actions (algorithm 4).
 
     A system state s has one action, number A, which draws a copy of s: with probability p, the
     `exploration`, state ``S + s``, which has all actions of s, else ``2 S + s``, which has those of
-    `near`, ``bool[S, A]``. Copies keep labels; those of environment states are unreachable. Plays
+    `near_optimal`, ``bool[S, A]``. Copies keep labels; those of environment states are unreachable. Plays
     take an additional move at each system state of `game`, so discounted values do not carry over,
     but almost-sure winning does (lemma 9).
 
     Raises:
-      ValueError: the game's model is not an MDP, or `near` has the wrong shape.
+      ValueError: the game's model is not an MDP, or `near_optimal` has the wrong shape.
 
     >>> from jaxltl import from_dense
     >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
@@ -258,12 +258,12 @@ def hat_game(game: Game, near: Array, exploration: Numeric) -> Game:
             f"hat_game needs a game on an MDP, not on a {type(mdp).__name__}; "
             "of a product pass restrict(game).model."
         )
-    require_shape("near", near, mdp.available.shape)
+    require_shape("near_optimal", near_optimal, mdp.available.shape)
     num_states, num_actions = mdp.available.shape
     extra = max(0, 2 - mdp.num_successors)
     system = game.system[:, None]
     choice = jnp.concatenate(
-        [mdp.available & ~system, mdp.available, mdp.available & (near | ~system)]
+        [mdp.available & ~system, mdp.available, mdp.available & (near_optimal | ~system)]
     )
     draws = jnp.concatenate([system, jnp.zeros((2 * num_states, 1), bool)])
     available = jnp.concatenate([choice, draws], axis=1)
@@ -276,11 +276,11 @@ def hat_game(game: Game, near: Array, exploration: Numeric) -> Game:
         jnp.stack([num_states + state, 2 * num_states + state], axis=1)
     )
     probability = probability.at[:num_states, num_actions, :2].set(jnp.stack([p, 1 - p]))
-    kept = available[:, :, None]
+    available_entry = available[:, :, None]
     mdp = replace(
         mdp,
-        successor=jnp.where(kept, successor, 0),
-        probability=jnp.where(kept, probability, 0),
+        successor=jnp.where(available_entry, successor, 0),
+        probability=jnp.where(available_entry, probability, 0),
         available=available,
         initial=jnp.pad(mdp.initial, (0, 2 * num_states)),
         label=jnp.tile(mdp.label, (3, 1)),

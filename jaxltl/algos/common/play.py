@@ -30,10 +30,10 @@ def explicit_game(game: Model) -> Game:
 
 def start_distribution(game: Game, start: ArrayLike | None) -> NDArray[np.float64]:
     """The checked distribution over initial states, ``float64[S]``; default the game's."""
-    found = np.asarray(game.initial if start is None else start, float)
-    require_shape("start", found, (game.num_states,))
-    check_distributions("start", found[None], np.ones((1, game.num_states), bool))
-    return found
+    distribution = np.asarray(game.initial if start is None else start, float)
+    require_shape("start", distribution, (game.num_states,))
+    check_distributions("start", distribution[None], np.ones((1, game.num_states), bool))
+    return distribution
 
 
 def uniform_rows(mask: NDArray[np.bool_]) -> NDArray[np.float64]:

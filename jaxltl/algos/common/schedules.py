@@ -56,23 +56,23 @@ class Linear:
 
     def __call__(self, l: jax.Array | int) -> jax.Array:  # noqa: E741
         """The number in step l = 1, 2, ..."""
-        made = jnp.asarray(l, jnp.result_type(float)) - 1
-        share = jnp.clip(made / jnp.asarray(self.num_steps), 0, 1)
+        steps = jnp.asarray(l, jnp.result_type(float)) - 1
+        share = jnp.clip(steps / jnp.asarray(self.num_steps), 0, 1)
         return self.first + (self.last - self.first) * share
 
 
 Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
 
 
-def is_schedule(given: object) -> bool:
-    """``True`` if `given` is a schedule of the step, a pytree that is traced, and not a number.
+def is_schedule(value: object) -> bool:
+    """``True`` if `value` is a schedule of the step, a pytree that is traced, and not a number.
 
     >>> import math
     >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
     [True, True, False, False]
     """
-    own = isinstance(given, Polynomial) or callable(given)
-    return own and not jax.tree_util.all_leaves([given])
+    own = isinstance(value, Polynomial) or callable(value)
+    return own and not jax.tree_util.all_leaves([value])
 
 
 def at(schedule: Schedule, step: jax.Array | int) -> Any:
@@ -145,7 +145,7 @@ def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Cond
     growth, samples = _samples_condition(hparams, num_steps)
     decay, share = _share_condition(hparams.sample_share)
     both = None if growth is None or decay is None else growth + 2 * decay > 1
-    found = (
+    conditions = (
         samples,
         *_rate_conditions(hparams.rate),
         share,
@@ -160,9 +160,11 @@ def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Cond
             for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
         ),
     )
-    failing = tuple(c.name for c in found if c.holds is False)
-    unknown = any(c.holds is None for c in found)
-    return Conditions(False if failing else None if unknown else True, failing, found, _ASSUMED)
+    failing = tuple(c.name for c in conditions if c.holds is False)
+    unknown = any(c.holds is None for c in conditions)
+    return Conditions(
+        False if failing else None if unknown else True, failing, conditions, _ASSUMED
+    )
 
 
 def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
@@ -179,10 +181,10 @@ def _samples_condition(hparams: PyTree, num_steps: int | None) -> tuple[float | 
     name = "samples grow"
     if hparams.num_samples is None:
         return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
-    found = _polynomial(hparams.num_samples)
-    if found is None:
+    polynomial = _polynomial(hparams.num_samples)
+    if polynomial is None:
         return None, Condition(name, None, f"num_samples: {_FUNCTION}")
-    scale, power, offset = found
+    scale, power, offset = polynomial
     if not (scale > 0 and power > 0):
         return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
     full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + SLACK), 0)
@@ -192,10 +194,10 @@ def _samples_condition(hparams: PyTree, num_steps: int | None) -> tuple[float | 
 
 def _rate_conditions(rate: Schedule) -> list[Condition]:
     names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
-    found = _polynomial(rate)
-    if found is None:
+    polynomial = _polynomial(rate)
+    if polynomial is None:
         return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
-    scale, power, offset = found
+    scale, power, offset = polynomial
     first = scale * (1 + offset) ** power if offset > -1 else math.nan
     decays = power < 0 and scale > 0
     holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
@@ -205,10 +207,10 @@ def _rate_conditions(rate: Schedule) -> list[Condition]:
 
 def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
     name = "sample share decays"
-    found = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
-    if found is None:
+    polynomial = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
+    if polynomial is None:
         return None, Condition(name, None, f"sample_share: {_FUNCTION}")
-    scale, power, offset = found
+    scale, power, offset = polynomial
     if scale == 0:  # of any order
         return math.inf, Condition(name, True, "lambda_l = 0")
     first = scale * (1 + offset) ** power if offset > -1 else math.nan

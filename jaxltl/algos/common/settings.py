@@ -159,8 +159,8 @@ def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> Metrics
     return dataclasses.replace(cast(Any, metrics), status=status)
 
 
-def require_own(*given: tuple[object, type]) -> None:
-    """Validation that each object of `given` is of a learner's type: State, Problem or Hparams.
+def require_own(*objects: tuple[object, type]) -> None:
+    """Validation that each of the `objects` is of a learner's type: State, Problem or Hparams.
 
     Raises:
       ValueError: naming the function that makes such an object.
@@ -171,7 +171,7 @@ def require_own(*given: tuple[object, type]) -> None:
     ValueError: hparams is float; give ppo.Hparams.
     """
     makers = {"State": "one of {0}.init or {0}.train", "Problem": "one of {0}.make_problem"}
-    for value, kind in given:
+    for value, kind in objects:
         learner, name = kind.__module__.split(".")[2], kind.__name__
         remedy = makers.get(name, "{0}.Hparams").format(learner)
         validation.instance(name.lower(), value, kind, remedy)
@@ -200,25 +200,25 @@ def _is_array(leaf: object) -> bool:
     if isinstance(leaf, bool | float | complex | jax.Array):
         return True
     if isinstance(leaf, int):
-        most = jnp.iinfo(jnp.result_type(int)).max
-        return -most <= leaf <= most
+        largest = jnp.iinfo(jnp.result_type(int)).max
+        return -largest <= leaf <= largest
     return isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind in "biufc"
 
 
 def require_output(
-    what: str, network: nn.Module, inputs: PyTree, expected: tuple[int, ...], rows: str
+    subject: str, network: nn.Module, inputs: PyTree, expected: tuple[int, ...], rows: str
 ) -> None:
-    """Validation of the shape that a `network` returns for `inputs`; `what` and `rows` are for the text.
+    """Validation of the shape that a `network` returns for `inputs`; `subject` and `rows` are for the text.
 
     Raises:
       ValueError: with the shapes returned and expected.
 
     >>> require_output("logits have", nn.Dense(2), (np.zeros(3),), (2,), "one a symbol.")
     """
-    found = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
-    shape = getattr(found, "shape", type(found).__name__)
+    output = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
+    shape = getattr(output, "shape", type(output).__name__)
     if shape != expected:
-        raise ValueError(f"{what} shape {shape}; expected {expected}, {rows}")
+        raise ValueError(f"{subject} shape {shape}; expected {expected}, {rows}")
 
 
 def applied(network: nn.Module, parameters: PyTree, *read: PyTree) -> PyTree:

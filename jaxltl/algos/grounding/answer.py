@@ -128,8 +128,8 @@ def with_labels(world: MDP, labels: np.ndarray, symbols: Sequence[str]) -> MDP:
     return replace(world, label=label, propositions=tuple(symbols))
 
 
-def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> list[Row]:
-    """A :class:`Row` of the posterior `found` for each symbol: meaning, alternatives, deciding steps.
+def grounding_table(problem: Problem, hparams: Hparams, posterior: Posterior) -> list[Row]:
+    """A :class:`Row` of the `posterior` for each symbol: meaning, alternatives, deciding steps.
 
     Of a `problem` with `hparams`, as for :func:`~jaxltl.algos.grounding.posterior`.
     """
@@ -137,13 +137,15 @@ def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> lis
     automaton, rows = automaton_of(problem), []
 
     def by_step(index: int) -> np.ndarray:
-        letter = jnp.asarray(letters_of(automaton, found.labels(index)))
-        return np.asarray(steps(problem, hparams.discount, letter, jnp.asarray(found.scale[index])))
+        letter = jnp.asarray(letters_of(automaton, posterior.labels(index)))
+        return np.asarray(
+            steps(problem, hparams.discount, letter, jnp.asarray(posterior.scale[index]))
+        )
 
     best = by_step(0)
-    for p, symbol in enumerate(found.symbols):
-        column = found.assignment[:, p]
-        weight = np.bincount(column, found.weight, minlength=len(found.names))
+    for p, symbol in enumerate(posterior.symbols):
+        column = posterior.assignment[:, p]
+        weight = np.bincount(column, posterior.weight, minlength=len(posterior.names))
         order = [int(m) for m in np.argsort(-weight, kind="stable") if weight[m] > 0]
         chosen = int(column[0])
         decisive: list[tuple[int, int, float]] = []
@@ -153,33 +155,33 @@ def grounding_table(problem: Problem, hparams: Hparams, found: Posterior) -> lis
                 n, t = divmod(i, gain.shape[1])
                 if gain[n, t] > 0:
                     decisive.append((n, t, float(gain[n, t])))
-        more = tuple((found.names[m], float(weight[m])) for m in order if m != chosen)
-        row = Row(symbol, found.names[chosen], float(weight[chosen]), more, tuple(decisive))
+        more = tuple((posterior.names[m], float(weight[m])) for m in order if m != chosen)
+        row = Row(symbol, posterior.names[chosen], float(weight[chosen]), more, tuple(decisive))
         rows.append(row)
     return rows
 
 
-def best_query(found: Posterior) -> Query:
+def best_query(posterior: Posterior) -> Query:
     """The (first) state with the label that gives most information about the grounding, a :class:`Query`.
 
     A grounding determines all labels, so that the mutual information of a state's label and the
-    grounding is the entropy of the label under the posterior `found`.
+    grounding is the entropy of the label under the `posterior`.
     """
-    num_states = found.meaning.shape[2]
-    power = 1 << np.arange(len(found.symbols))
-    heavy = np.flatnonzero(found.weight > 1e-9)
-    codes = np.stack([found.labels(i) @ power for i in heavy.tolist()]).reshape(len(heavy), -1)
+    num_states = posterior.meaning.shape[2]
+    power = 1 << np.arange(len(posterior.symbols))
+    heavy = np.flatnonzero(posterior.weight > 1e-9)
+    codes = np.stack([posterior.labels(i) @ power for i in heavy.tolist()]).reshape(len(heavy), -1)
     patterns, inverse = np.unique(codes.T, axis=0, return_inverse=True)
     entropy = []
     for pattern in patterns:
-        mass = np.bincount(pattern, found.weight[heavy])
+        mass = np.bincount(pattern, posterior.weight[heavy])
         mass = mass[mass > 0] / mass.sum()
         entropy.append(-float(mass @ np.log(mass)))
     state = int(np.argmax(np.array(entropy)[inverse.ravel()]))
-    mass = np.bincount(codes[:, state], found.weight[heavy])
+    mass = np.bincount(codes[:, state], posterior.weight[heavy])
     mass = mass / mass.sum()
     labels = tuple(
-        (frozenset(s for p, s in enumerate(found.symbols) if code >> p & 1), float(mass[code]))
+        (frozenset(s for p, s in enumerate(posterior.symbols) if code >> p & 1), float(mass[code]))
         for code in np.argsort(-mass, kind="stable").tolist()
         if mass[code] > 0
     )
@@ -263,6 +265,6 @@ def probability_under(
     for share, weight in zip(robust.share, robust.front.policies, strict=True):
         if share > 0:
             policy = np.repeat(np.asarray(weight)[:, None], model.num_memory, axis=1)
-            found = satisfaction_probability(model, jnp.asarray(policy))
-            total += share * float(np.sum(np.asarray(model.initial) * np.asarray(found.lower)))
+            solution = satisfaction_probability(model, jnp.asarray(policy))
+            total += share * float(np.sum(np.asarray(model.initial) * np.asarray(solution.lower)))
     return total

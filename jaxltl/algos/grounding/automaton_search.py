@@ -110,10 +110,10 @@ def learn_automaton(
         features=jnp.zeros((0,), model.dtype),
         network=LinearGrounding(len(worlds[0].propositions)),
     )
-    near = _sequences(num_memory, letters, np.random.default_rng(seed))
-    tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
+    candidates = _sequences(num_memory, letters, np.random.default_rng(seed))
+    tables = np.stack([n[0] for n in candidates]), np.stack([n[1] for n in candidates])
     order = np.argsort(-_scores(problem, discount, *tables).max(1), kind="stable")[:num_starts]
-    runs = [_climb(problem, discount, *near[i]) for i in order.tolist()]
+    runs = [_climb(problem, discount, *candidates[i]) for i in order.tolist()]
     score, moves, event, scale = max(runs, key=lambda run: run[0])
     automaton = _as_automaton(moves, event, letters, worlds[0].propositions)
     total = score + _PENALTY * _size(moves, event)
@@ -125,21 +125,21 @@ def _sequences(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Automata of the sequences of letters: all states in order, then the end or the first again."""
     moving = np.flatnonzero(letters.any(1)).tolist()
-    found = []
+    candidates = []
     for cyclic in (False, True):
         length = num_memory if cyclic else num_memory - 1
         count = len(moving) ** length
-        kept = (
+        codes = (
             range(count) if count <= _SEQUENCES else rng.integers(count, size=_SEQUENCES).tolist()
         )
-        for code in kept:
+        for code in codes:
             word = [moving[code // len(moving) ** i % len(moving)] for i in range(length)]
             moves = np.repeat(np.arange(num_memory)[:, None], len(letters), axis=1)
             moves[range(length), word] = (np.arange(length) + 1) % num_memory
             event = np.zeros(moves.shape, bool)
             event[range(length) if cyclic else length - 1, word if cyclic else word[-1]] = True
-            found.append((moves, event))
-    return found
+            candidates.append((moves, event))
+    return candidates
 
 
 def _size(moves: np.ndarray, event: np.ndarray) -> int:
@@ -152,20 +152,20 @@ def _climb(
     """Steepest ascent over changes of one transition: score, table, events and scale."""
     score, best, scale = -np.inf, (moves, event), SCALES[0]
     for _ in range(_MOST_STEPS):
-        near = _neighbours(*best)
-        tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
-        found = _scores(problem, discount, *tables)
-        value = found.max(1) - _PENALTY * np.array([_size(*n) for n in near])
+        neighbours = _neighbours(*best)
+        tables = np.stack([n[0] for n in neighbours]), np.stack([n[1] for n in neighbours])
+        scores = _scores(problem, discount, *tables)
+        value = scores.max(1) - _PENALTY * np.array([_size(*n) for n in neighbours])
         top = int(value.argmax())
         if value[top] <= score + 1e-6:
             break
-        score, best, scale = float(value[top]), near[top], SCALES[int(found[top].argmax())]
+        score, best, scale = float(value[top]), neighbours[top], SCALES[int(scores[top].argmax())]
     return score, *best, scale
 
 
 def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """The candidate and those with one other transition in which all states are reachable."""
-    found, (num_memory, width) = [(moves, event)], moves.shape
+    candidates, (num_memory, width) = [(moves, event)], moves.shape
     for q, letter, to in np.ndindex(num_memory, width, num_memory):
         for rewarded in (False, True):
             if (moves[q, letter] == to and event[q, letter] == rewarded) or (rewarded and to == q):
@@ -173,8 +173,8 @@ def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, 
             new, events = moves.copy(), event.copy()
             new[q, letter], events[q, letter] = to, rewarded
             if _all_reachable(new):
-                found.append((new, events))
-    return found
+                candidates.append((new, events))
+    return candidates
 
 
 def _all_reachable(moves: np.ndarray) -> bool:

@@ -162,9 +162,9 @@ def objective(
     Differentiable in the `parameters` of a `problem` with `hparams`.
     """
     start, emit, move, status = _chains(parameters, problem, hparams)
-    found = jax.vmap(forward, (None, 0, 0, 0))(start, emit, move, problem.length)
+    log_likelihoods = jax.vmap(forward, (None, 0, 0, 0))(start, emit, move, problem.length)
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
-    return hparams.l2 / 2 * squares - jnp.sum(found), (found, status)
+    return hparams.l2 / 2 * squares - jnp.sum(log_likelihoods), (log_likelihoods, status)
 
 
 def _chains(parameters: PyTree, problem: Problem, hparams: Hparams) -> tuple[jax.Array, ...]:
@@ -392,8 +392,8 @@ def _symbols(
 
 
 def _counts(row: np.ndarray, action: np.ndarray, num_rows: int, width: int) -> np.ndarray:
-    found = np.bincount(row * width + action, minlength=num_rows * width)
-    return found.reshape(num_rows, width).astype(float)
+    counts = np.bincount(row * width + action, minlength=num_rows * width)
+    return counts.reshape(num_rows, width).astype(float)
 
 
 def _own(code: np.ndarray, action: np.ndarray, mask: np.ndarray, width: int) -> np.ndarray:

@@ -118,7 +118,7 @@ def posterior(
         table = score(np.asarray(rows, np.int32))
     else:
         rows, table = _beam(score, len(meaning), len(problem.symbols), symmetries)
-    found = _weighed(
+    result = _weighed(
         Posterior(
             assignment=np.asarray(rows, np.int32),
             weight=np.zeros(len(rows)),
@@ -131,34 +131,36 @@ def posterior(
             complete=count <= _MOST,
         )
     )
-    _require_explained(problem, hparams, found, table)
-    return found
+    _require_explained(problem, hparams, result, table)
+    return result
 
 
-def _weighed(found: Posterior) -> Posterior:
+def _weighed(posterior: Posterior) -> Posterior:
     """The groundings with the weights of their likelihoods, in decreasing order."""
-    total = found.log_likelihood.sum(-1)  # [C, B]
+    total = posterior.log_likelihood.sum(-1)  # [C, B]
     logs = np.logaddexp.reduce(total, axis=1)
     order = np.argsort(-logs, kind="stable")
     return replace(
-        found,
-        assignment=found.assignment[order],
+        posterior,
+        assignment=posterior.assignment[order],
         weight=np.exp(logs - np.logaddexp.reduce(logs))[order],
-        scale=found.scales[total.argmax(1)[order]],
-        log_likelihood=found.log_likelihood[order],
+        scale=posterior.scales[total.argmax(1)[order]],
+        log_likelihood=posterior.log_likelihood[order],
     )
 
 
-def select_demonstrations(found: Posterior, chosen: ArrayLike) -> Posterior:
-    """The :class:`Posterior` of those of N demonstrations of `found` that count, without new scores.
+def select_demonstrations(posterior: Posterior, chosen: ArrayLike) -> Posterior:
+    """The :class:`Posterior` of those of N demonstrations of `posterior` that count, without new scores.
 
     They are `chosen` by ``int[]`` or ``bool[N]``; groundings are in the order of their new weights.
     """
-    return _weighed(replace(found, log_likelihood=found.log_likelihood[..., np.asarray(chosen)]))
+    return _weighed(
+        replace(posterior, log_likelihood=posterior.log_likelihood[..., np.asarray(chosen)])
+    )
 
 
-def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
-    """The rows ``int[]`` of `found` in the smallest set of groundings with a weight of at least `level`.
+def credible_set(posterior: Posterior, level: float = 0.95) -> np.ndarray:
+    """The rows ``int[]`` of `posterior` in the smallest set of groundings with a weight of at least `level`.
 
     Raises:
       ValueError: a level that is not above 0 and below 1.
@@ -169,16 +171,16 @@ def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
     """
     if not 0 < level < 1:
         raise ValueError(f"level={level}; it must be above 0 and below 1.")
-    count = int(np.searchsorted(np.cumsum(found.weight), level)) + 1
-    return np.arange(min(count, len(found.weight)))
+    count = int(np.searchsorted(np.cumsum(posterior.weight), level)) + 1
+    return np.arange(min(count, len(posterior.weight)))
 
 
-def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
-    """The symbols with several meanings, likeliest first, in the credible set of `found` of a `level`."""
-    rows = found.assignment[credible_set(found, level)]
+def ambiguous_symbols(posterior: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
+    """The symbols with several meanings, likeliest first, in the credible set of `posterior` of a `level`."""
+    rows = posterior.assignment[credible_set(posterior, level)]
     several = {}
-    for p, symbol in enumerate(found.symbols):
-        chosen = tuple(dict.fromkeys(found.names[m] for m in rows[:, p]))
+    for p, symbol in enumerate(posterior.symbols):
+        chosen = tuple(dict.fromkeys(posterior.names[m] for m in rows[:, p]))
         if len(chosen) > 1:
             several[symbol] = chosen
     return several
@@ -194,12 +196,12 @@ def symbol_symmetries(automaton: Automaton) -> list[tuple[int, ...]]:
     count = len(automaton.propositions)
     if count > 5:  # 720 comparisons and more
         return [tuple(range(count))]
-    found = []
+    symmetries = []
     for order in itertools.permutations(range(count)):
         renamed = replace(automaton, propositions=tuple(automaton.propositions[i] for i in order))
         if order == tuple(range(count)) or is_equivalent(automaton, renamed):
-            found.append(order)
-    return found
+            symmetries.append(order)
+    return symmetries
 
 
 def _canonical(row: Sequence[int], symmetries: list[tuple[int, ...]]) -> tuple[int, ...]:
@@ -217,18 +219,18 @@ def _meanings(
     observation = np.asarray(problem.observation)
     if meanings is None:
         binary = ((observation == 0) | (observation == 1)).all((0, 1))
-        kept = np.flatnonzero(binary & (observation != 0).any((0, 1)))
-        if not kept.size:
+        entries = np.flatnonzero(binary & (observation != 0).any((0, 1)))
+        if not entries.size:
             raise ValueError(
                 "no entry of the observations is 0 or 1 in every state; give meanings=bool[M, W, S], "
                 "such as those of cluster_meanings."
             )
-        table = np.moveaxis(observation[..., kept] > 0, -1, 0)
+        table = np.moveaxis(observation[..., entries] > 0, -1, 0)
         width = observation.shape[-1]
         if names is not None and len(names) != width:
             raise ValueError(f"there are {len(names)} names for {width} entries of observations.")
         titles = names if names is not None else [f"observation {i}" for i in range(width)]
-        return table, tuple(titles[i] for i in kept.tolist())
+        return table, tuple(titles[i] for i in entries.tolist())
     table = np.asarray(meanings)
     if table.dtype != bool or table.ndim != 3 or table.shape[1:] != observation.shape[:2]:
         raise ValueError(
@@ -256,11 +258,11 @@ def _scores(
     """Log-likelihoods ``float64[C, B, N]`` of assignments ``int32[C, P]``."""
     letters = letters_of(automaton_of(problem), np.moveaxis(meaning[rows], 1, -1))  # [C, W, S]
     possible = (letters >= 0).all((1, 2))
-    found = np.full((len(rows), len(scales), len(problem.length)), -np.inf)
-    found[possible] = batch_log_likelihood(
+    table = np.full((len(rows), len(scales), len(problem.length)), -np.inf)
+    table[possible] = batch_log_likelihood(
         _with_letters, problem, discount, scales, letters[possible]
     )
-    return found
+    return table
 
 
 def _with_letters(problem: Problem, letter: jax.Array) -> Problem:
@@ -277,14 +279,14 @@ def batch_log_likelihood(
     """Log-likelihoods ``float64[C, B, N]`` of candidates, each made of a problem and a row of `changes`."""
     count = len(jax.tree.leaves(changes)[0])
     size = min(_BATCH, 1 << max(count - 1, 0).bit_length())
-    grid, found = jnp.asarray(scales, problem.model.dtype), []
+    grid, tables = jnp.asarray(scales, problem.model.dtype), []
     for first in range(0, count, size):
         part = np.arange(first, min(first + size, count))
         filled = np.resize(part, size)  # one program for all batches
         rows = jax.tree.map(lambda x, filled=filled: jnp.asarray(x[filled]), changes)
         table = _batch(candidate, problem, discount, grid, rows)
-        found.append(np.asarray(table, float)[: len(part)])
-    return np.concatenate(found) if found else np.zeros((0, len(grid), len(problem.length)))
+        tables.append(np.asarray(table, float)[: len(part)])
+    return np.concatenate(tables) if tables else np.zeros((0, len(grid), len(problem.length)))
 
 
 @partial(jax.jit, static_argnames="candidate")
@@ -296,8 +298,10 @@ def _batch(
     changes: PyTree,
 ) -> jax.Array:
     def one(change: PyTree) -> jax.Array:
-        made = candidate(problem, change)
-        likelihood = partial(step_log_likelihood, made, discount, jnp.asarray(made.model.letter))
+        changed = candidate(problem, change)
+        likelihood = partial(
+            step_log_likelihood, changed, discount, jnp.asarray(changed.model.letter)
+        )
         return jnp.sum(jax.vmap(likelihood)(scales), axis=2)
 
     return jax.vmap(one)(changes)
@@ -318,8 +322,10 @@ def step_log_likelihood(
         model = jax.tree.map(lambda x: x[world], models)
         return log_policy[world, state, certain_memory(model, state), action]
 
-    found = jax.vmap(demonstration)(problem.world, problem.state, problem.action)
-    return jnp.where(jnp.arange(found.shape[1]) < problem.length[:, None], found, 0)
+    log_likelihoods = jax.vmap(demonstration)(problem.world, problem.state, problem.action)
+    return jnp.where(
+        jnp.arange(log_likelihoods.shape[1]) < problem.length[:, None], log_likelihoods, 0
+    )
 
 
 def _beam(
@@ -348,7 +354,7 @@ def _beam(
 
 
 def _require_explained(
-    problem: Problem, hparams: Hparams, found: Posterior, table: np.ndarray
+    problem: Problem, hparams: Hparams, posterior: Posterior, table: np.ndarray
 ) -> None:
     """Raises ValueError for a demonstration less likely under each grounding than random actions."""
     available = np.asarray(problem.model.mdp.available)
@@ -362,9 +368,9 @@ def _require_explained(
     lost = uniform.sum(1) - best
     n = int(lost.argmax())
     if lost[n] > _UNEXPLAINED:
-        letter = letters_of(automaton_of(problem), found.labels(0))
+        letter = letters_of(automaton_of(problem), posterior.labels(0))
         steps = jax.jit(step_log_likelihood)(
-            problem, hparams.discount, jnp.asarray(letter), jnp.asarray(found.scale[0])
+            problem, hparams.discount, jnp.asarray(letter), jnp.asarray(posterior.scale[0])
         )
         t = int((np.asarray(steps) - uniform)[n].argmin())
         raise ValueError(

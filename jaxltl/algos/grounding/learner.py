@@ -136,14 +136,14 @@ def objective(
         moves = log_moves[world, state]  # [T, Q, Q]
         return forward(moves[0, initial], log_policy[world, state, :, action], moves[1:], length)
 
-    found = jax.vmap(one)(problem.world, problem.state, problem.action, problem.length)
+    log_likelihoods = jax.vmap(one)(problem.world, problem.state, problem.action, problem.length)
     entropy = -jnp.mean(jnp.sum(jax.scipy.special.xlogy(letter, letter), axis=-1))
     penalized = (parameters["grounding"], parameters["weights"])
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(penalized))
-    loss = -jnp.sum(found) + hparams.l2 / 2 * squares
+    loss = -jnp.sum(log_likelihoods) + hparams.l2 / 2 * squares
     loss += hparams.hardness * jnp.sum(problem.length) * entropy
     parts = Objective(
-        log_likelihood=found,
+        log_likelihood=log_likelihoods,
         entropy=entropy,
         policy=jnp.exp(log_policy),
         letter=letter,
@@ -230,26 +230,26 @@ def cluster_meanings(problem: Problem, num_clusters: int, *, seed: int = 0) -> n
     """
     table = np.asarray(problem.observation, float)
     rows = table.reshape(-1, table.shape[-1])
-    most = len(np.unique(rows, axis=0))
-    if not 2 <= num_clusters <= most:
+    num_distinct = len(np.unique(rows, axis=0))
+    if not 2 <= num_clusters <= num_distinct:
         raise ValueError(
-            f"num_clusters={num_clusters}; it must be at least 2 and at most {most}, the number of "
+            f"num_clusters={num_clusters}; it must be at least 2 and at most {num_distinct}, the number of "
             "distinct observations."
         )
     best = np.inf
-    far = [int(((rows - rows.mean(0)) ** 2).sum(1).argmin())]  # rare kinds: the farthest first
+    farthest = [int(((rows - rows.mean(0)) ** 2).sum(1).argmin())]  # rare kinds: the farthest first
     nearest = np.full(len(rows), np.inf)
     for _ in range(num_clusters - 1):
-        nearest = np.minimum(nearest, ((rows - rows[far[-1]]) ** 2).sum(1))
-        far.append(int(nearest.argmax()))
-    starts = [(rows[far], "matrix"), *[(num_clusters, "++")] * _STARTS]
+        nearest = np.minimum(nearest, ((rows - rows[farthest[-1]]) ** 2).sum(1))
+        farthest.append(int(nearest.argmax()))
+    starts = [(rows[farthest], "matrix"), *[(num_clusters, "++")] * _STARTS]
     for start, (first, minit) in enumerate(starts):
         centers, index = kmeans2(rows, first, minit=minit, seed=seed + start, missing="warn")
         distortion = float(((rows - centers[index]) ** 2).sum())
         if distortion < best and len(np.unique(index)) == num_clusters:
-            best, kept = distortion, index
-    order = np.argsort(-np.bincount(kept, minlength=num_clusters), kind="stable")
-    return np.stack([(kept == k).reshape(table.shape[:2]) for k in order])
+            best, cluster = distortion, index
+    order = np.argsort(-np.bincount(cluster, minlength=num_clusters), kind="stable")
+    return np.stack([(cluster == k).reshape(table.shape[:2]) for k in order])
 
 
 def fit_labels(

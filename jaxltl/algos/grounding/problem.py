@@ -150,8 +150,8 @@ def make_problem(
     world, state, action, length = joined_demonstrations(worlds, several)
     network = LinearGrounding(len(automaton.propositions)) if network is None else network
     logits = (*observation.shape[:-1], len(automaton.propositions))
-    what = "the grounding's logits have"
-    require_output(what, network, (observation,), logits, "one for each symbol.")
+    subject = "the grounding's logits have"
+    require_output(subject, network, (observation,), logits, "one for each symbol.")
     return Problem(
         model=model,
         observation=observation,
@@ -215,8 +215,8 @@ def joined_demonstrations(
             f"there are demonstrations in {len(several)} worlds; expected {len(worlds)}."
         )
     batches, number = [], []
-    for w, (world, given) in enumerate(zip(worlds, several, strict=True)):
-        columns = (np.asarray(x).tolist() for x in (given.state, given.action, given.length))
+    for w, (world, batch) in enumerate(zip(worlds, several, strict=True)):
+        columns = (np.asarray(x).tolist() for x in (batch.state, batch.action, batch.length))
         rows = [list(zip(s[:n], a[:n], strict=True)) for s, a, n in zip(*columns, strict=True) if n]
         if rows:
             with errors_in(f"demonstrations in world {w}: "):
@@ -236,23 +236,23 @@ def joined_demonstrations(
 def _padded(observation: ArrayLike | Sequence[ArrayLike], worlds: Sequence[MDP]) -> np.ndarray:
     """Observations ``[W, S, O]`` of worlds padded to the largest; ValueError names the world."""
     if isinstance(observation, list | tuple):
-        given = [np.asarray(x) for x in observation]
-        given = given if given and given[0].ndim > 1 else [np.asarray(observation)]
+        tables = [np.asarray(x) for x in observation]
+        tables = tables if tables and tables[0].ndim > 1 else [np.asarray(observation)]
     else:
         table = np.asarray(observation)
-        given = list(table) if table.ndim == 3 else [table]
-    if len(given) != len(worlds):
-        raise ValueError(f"there are observations of {len(given)} worlds; expected {len(worlds)}.")
-    width = given[0].shape[1] if given[0].ndim == 2 else "O"
-    most = max(world.num_states for world in worlds)
-    for w, (x, world) in enumerate(zip(given, worlds, strict=True)):
+        tables = list(table) if table.ndim == 3 else [table]
+    if len(tables) != len(worlds):
+        raise ValueError(f"there are observations of {len(tables)} worlds; expected {len(worlds)}.")
+    width = tables[0].shape[1] if tables[0].ndim == 2 else "O"
+    num_states = max(world.num_states for world in worlds)
+    for w, (x, world) in enumerate(zip(tables, worlds, strict=True)):
         if x.ndim != 2 or x.shape != (world.num_states, width):
             raise ValueError(
                 f"world {w}: observation has shape {x.shape}; "
                 f"expected ({world.num_states}, {width}), one row for each state."
             )
     # As in the last state: padding adds no kind of observation.
-    return np.stack([np.pad(x, ((0, most - len(x)), (0, 0)), "edge") for x in given])
+    return np.stack([np.pad(x, ((0, num_states - len(x)), (0, 0)), "edge") for x in tables])
 
 
 def _features(model: Product, features: ArrayLike | None) -> jax.Array:

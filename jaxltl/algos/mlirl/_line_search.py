@@ -118,17 +118,17 @@ def step(evaluate: Callable[[PyTree, Point], Point], search: Search) -> tuple[Se
         jnp.bool_(False),
         jnp.int32(0),
     )
-    found = lax.while_loop(lambda k: ~k.done, trial, begin)
-    new = found.best
+    end = lax.while_loop(lambda k: ~k.done, trial, begin)
+    new = end.best
     moved, memory = _directions().update(new.gradient, search.memory, new.parameters)
     # No descent direction, or no progress: restart from the gradient.
-    fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
+    fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~end.moved
     scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
     moved = trees.either(fresh, optax.tree.scale(scale, new.gradient), moved)
     memory = trees.either(
         fresh & ~jnp.isnan(new.loss), trees.strong(_directions().init(new.parameters)), memory
     )
-    return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
+    return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), end.base
 
 
 def _ahead(base: Point, direction: PyTree, size: jax.Array) -> PyTree:

@@ -52,15 +52,15 @@ def constrained_points(
     evaluate: Callable[[np.ndarray], Point],
     starts: Sequence[np.ndarray],
     required: float,
-    most: int,
+    max_evaluations: int,
 ) -> list[Point]:
-    """Points of SLSQP (Kraft 1988) from several starts, by at most `most` evaluations.
+    """Points of SLSQP (Kraft 1988) from several starts, by at most `max_evaluations` evaluations.
 
     The last start gets the evaluations that earlier ones leave.
     """
     points: list[Point] = []
     for i, start in enumerate(starts):
-        budget = most * (i + 1) // len(starts) - len(points)
+        budget = max_evaluations * (i + 1) // len(starts) - len(points)
         points += _search(evaluate, np.asarray(start, float), required, budget)
     return [point for point in points if point.is_finite]
 

@@ -34,20 +34,20 @@ from jaxltl.core.values.undiscounted.satisfaction import as_reachability, until_
 
 
 def pair_counts(
-    model: ActionModel, trajectories: Trajectories, kept: Array | None = None
+    model: ActionModel, trajectories: Trajectories, counted: Array | None = None
 ) -> jax.Array:
     """The state-action counts ``float[S, A]`` of `trajectories` of a `model`.
 
-    Only steps that are `kept`, ``bool[N, T]``, count; default all.
+    Only steps that are `counted`, ``bool[N, T]``, enter; default all.
     """
-    xp, steps, kept = namespace(trajectories, trajectories.mask if kept is None else kept)
+    xp, steps, counted = namespace(trajectories, trajectories.mask if counted is None else counted)
     actions = (*model.state_shape, model.num_actions)
-    pair, kept = steps.state * model.num_actions + steps.action, kept.astype(model.dtype)
+    pair, counted = steps.state * model.num_actions + steps.action, counted.astype(model.dtype)
     flat = xp.zeros(int(np.prod(actions)), model.dtype)
     if xp is jnp:
-        flat = flat.at[pair].add(kept)
+        flat = flat.at[pair].add(counted)
     else:
-        np.add.at(flat, pair, kept)
+        np.add.at(flat, pair, counted)
     return to_jax(flat.reshape(actions))
 
 
@@ -138,18 +138,20 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     sparse = rows_of_model(model)
     mdp, row = sparse.host, row_of_action(sparse, best.policy)
     ahead = expected_steps(mdp, row, reached | lost)
-    far: np.ndarray | None = np.zeros(reached.size)
+    visit_steps: np.ndarray | None = np.zeros(reached.size)
     visits = mdp
     if problem.accepting is not None:
         visits = until_visit(problem, mdp)
-        far = expected_steps(visits, np.append(row, mdp.num_rows), np.append(~reached, True))
-    if ahead is None or far is None:
+        visit_steps = expected_steps(
+            visits, np.append(row, mdp.num_rows), np.append(~reached, True)
+        )
+    if ahead is None or visit_steps is None:
         return None
-    inside = np.where(reached, far[: reached.size], 0)
-    most = inside.max(initial=0)  # outside of the component, a longest visit inside is added
-    ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + most
+    inside = np.where(reached, visit_steps[: reached.size], 0)
+    longest = inside.max(initial=0)  # outside of the component, a longest visit inside is added
+    ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + longest
     way = np.where(reached, inside, ahead)
-    entered = np.where(reached, most, ahead)
+    entered = np.where(reached, longest, ahead)
     # Differences of expected steps are rounded by about this much; the best action's one is 1.
     if not np.finfo(np.float64).eps * max(way.max(), entered.max()) < 0.1:
         return None

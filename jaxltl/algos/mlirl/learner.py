@@ -231,7 +231,7 @@ def make_problem(
     if (wrong := ~np.isfinite(np.asarray(features))).any():
         *pair, feature = np.argwhere(wrong)[0].tolist()
         raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
-    kept = allowed_steps(model, demonstrations)
+    counted = allowed_steps(model, demonstrations)
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
     weight: PyTree = satisfaction_over
@@ -251,7 +251,7 @@ def make_problem(
     return Problem(
         model=model,
         features=features,
-        counts=pair_counts(model, demonstrations, kept),
+        counts=pair_counts(model, demonstrations, counted),
         start=start,
         satisfaction_weight=weight,
         reward=reward,

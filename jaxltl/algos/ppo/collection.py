@@ -226,12 +226,14 @@ def collected(
         reward = jnp.clip(reward / scale_of(returns), -10, 10)
     if moments is not None:
         moments = jax.tree.map(lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
-    found = generalized_advantages(reward, value, following, discount, hparams.gae_lambda, ended)
+    advantage = generalized_advantages(
+        reward, value, following, discount, hparams.gae_lambda, ended
+    )
     seen = normalized(state.moments, path.observation)
-    rows = Rows(seen, record.start, path.allowed, path.raw, path.log_density, value, found)
+    rows = Rows(seen, record.start, path.allowed, path.raw, path.log_density, value, advantage)
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
-    spread = jnp.var(found + value)
+    variance = jnp.var(advantage + value)
     figures = {
         "reward": path.reward.astype(dtype).mean(),
         "cost": path.cost.astype(dtype).mean(),
@@ -239,10 +241,10 @@ def collected(
         "episode_return": jnp.sum(jnp.where(ended, record.episode_return, 0)) * mean_of,
         "episode_length": jnp.sum(jnp.where(ended, record.episode_length, 0)) * mean_of,
         "explained_variance": jnp.where(
-            spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan
+            variance > 0, 1 - jnp.var(advantage) / jnp.where(variance > 0, variance, 1), jnp.nan
         ),
         "permitted": jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
-        "finite": jnp.all(jnp.isfinite(found)),
+        "finite": jnp.all(jnp.isfinite(advantage)),
     }
     after = replace(state, walkers=walkers, moments=moments, return_moments=returns)
     return after, state.walkers.memory, rows, figures
@@ -269,25 +271,25 @@ def _walk(
     rank: jax.Array,
     walkers: Walkers,
     rows: PyTree,
-    given: PyTree,
+    step: PyTree,
     *,
     sharding: NamedSharding | None,
 ) -> tuple[Walkers, _Record]:
     """Transitions of all environments, or of one device's."""
-    run, hparams, pool = given
+    run, hparams, pool = step
     problem, environment = run[0], run[0].environment
 
     def one(walker: Walkers, noise: jax.Array, key: Key) -> tuple[Walkers, _Record]:
         before = (walker.world, walker.memory)
-        world, memory, made = transition(
+        world, memory, record = transition(
             environment, partial(evaluate, run), hparams.squash, before, noise, key
         )
         row = _Record(
-            of=made,
+            of=record,
             start=walker.episode_length == 0,
-            episode_return=walker.episode_return + made.reward,
+            episode_return=walker.episode_return + record.reward,
             episode_length=walker.episode_length + 1,
-            discounted=walker.discounted + made.reward.astype(walker.discounted.dtype),
+            discounted=walker.discounted + record.reward.astype(walker.discounted.dtype),
         )
         return replace(walker, world=world, memory=memory), row
 
@@ -300,9 +302,9 @@ def _walk(
         ended = row.of.terminated | row.of.truncated
         return jax.tree.map(partial(jnp.where, ended), restarted, goes_on)
 
-    def move(carry: PyTree, given: PyTree) -> PyTree:
+    def move(carry: PyTree, inputs: PyTree) -> PyTree:
         walkers, used = carry
-        start, *chance = given
+        start, *chance = inputs
         walkers, row = jax.vmap(one)(walkers, *chance)
         if pool is not None:
             number, last = lanes.running_sum(row.of.terminated | row.of.truncated, rank, sharding)

@@ -156,10 +156,10 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
     if size % hparams.num_minibatches:
-        what = "environments" if recurrent else "num_envs times num_steps"
+        unit = "environments" if recurrent else "num_envs times num_steps"
         raise ValueError(
             f"num_minibatches={hparams.num_minibatches} does not divide {size}, the number of "
-            f"{what}; choose a divisor."
+            f"{unit}; choose a divisor."
         )
     lanes.require_split(
         "sharding",
@@ -248,14 +248,18 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         permitted, (parameters, optimizer), (state.parameters, state.optimizer)
     )
     status = jnp.where((losses["nonfinite"] > 0) | ~finite, Status.NONFINITE, Status.COMPLETED)
-    made = learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps)
+    transitions = learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps)
     new = replace(
-        after, step=state.step + 1, parameters=parameters, optimizer=optimizer, transitions=made
+        after,
+        step=state.step + 1,
+        parameters=parameters,
+        optimizer=optimizer,
+        transitions=transitions,
     )
     return new, Metrics(
         **figures,
         **losses,
-        transitions=made,
+        transitions=transitions,
         learning_rate=jnp.asarray(hparams.learning_rate, losses["kl"].dtype),
         status=jnp.where(permitted, status, Status.INVALID).astype(jnp.int32),
     )
@@ -301,8 +305,8 @@ def loss(
     target = advantage + rows.value
     if hparams.normalize_advantage:
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    near = jnp.clip(ratio, 1 - hparams.clip, 1 + hparams.clip)
-    gain = jnp.minimum(ratio * advantage, near * advantage).mean()
+    clipped = jnp.clip(ratio, 1 - hparams.clip, 1 + hparams.clip)
+    gain = jnp.minimum(ratio * advantage, clipped * advantage).mean()
     value = said.value.astype(rows.value.dtype)
     error = (value - target) ** 2
     if hparams.value_clip is not None:
@@ -363,11 +367,11 @@ def improved(
         parameters = jax.tree.map(
             lambda x, u: x - (hparams.learning_rate * u).astype(x.dtype), before[0], change
         )
-        made = finite & ~stopped
-        new = trees.choose(made, (parameters, optimizer), tuple(before))
-        return (*new, stopped), (statistics, made, ~finite & ~stopped)
+        applied = finite & ~stopped
+        new = trees.choose(applied, (parameters, optimizer), tuple(before))
+        return (*new, stopped), (statistics, applied, ~finite & ~stopped)
 
-    (parameters, optimizer, _), (statistics, made, lost) = minibatch_epochs(
+    (parameters, optimizer, _), (statistics, applied, lost) = minibatch_epochs(
         key,
         update,
         (state.parameters, state.optimizer, jnp.bool_(False)),
@@ -375,9 +379,9 @@ def improved(
         num_epochs=hparams.num_epochs,
         num_minibatches=hparams.num_minibatches,
     )
-    number = made.sum()
+    number = applied.sum()
     figures = {
-        name: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan)
+        name: jnp.sum(jnp.where(applied, x, 0)) / jnp.where(number > 0, number, jnp.nan)
         for name, x in statistics.items()
     }
     figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.sum().astype(jnp.int32)}

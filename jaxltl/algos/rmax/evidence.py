@@ -92,7 +92,7 @@ def evidence(
     value = partial(strategy_value, inside, strategy, problem.reward, hparams.discount)
     worst_case, played = value(), value(environment=problem.environment)
     optimal = minimax_value(game, problem.reward, hparams.discount, allowed=problem.allowed)
-    near = partial(pac.epsilon_optimal_states, optimal, epsilon=hparams.epsilon)
+    epsilon_optimal = partial(pac.epsilon_optimal_states, optimal, epsilon=hparams.epsilon)
     reached = restrict(game, problem.start, allowed=problem.allowed).base_state
     data = None
     if confidence is not None:
@@ -105,8 +105,8 @@ def evidence(
         optimal=optimal,
         worst_case=worst_case,
         played=played,
-        epsilon_optimal=near(worst_case) & problem.region,
-        epsilon_optimal_played=near(played) & problem.region,
+        epsilon_optimal=epsilon_optimal(worst_case) & problem.region,
+        epsilon_optimal_played=epsilon_optimal(played) & problem.region,
         reachable=jnp.zeros(game.num_states, bool).at[reached].set(True),
         known_at=state.known_at,
         steps=worst_case_steps(game, problem.accepting, strategy),
@@ -125,12 +125,12 @@ def wins_almost_surely(problem: Problem, strategy: jax.Array) -> jax.Array:
     game = problem.game
     used = jnp.where(game.system[:, None], strategy > 0, problem.allowed)
     moves = problem.region & used.any(-1)
-    kept = jnp.all(~used | problem.allowed)
+    stays = jnp.all(~used | problem.allowed)
     accepting = problem.accepting & problem.region
     reached = attractor(
         game, accepting, used & problem.allowed, rule=game.system, chance="some"
     ).region
-    return kept & jnp.all(moves | ~problem.region) & jnp.all(reached | ~problem.region)
+    return stays & jnp.all(moves | ~problem.region) & jnp.all(reached | ~problem.region)
 
 
 def data_evidence(

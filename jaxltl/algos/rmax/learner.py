@@ -373,8 +373,10 @@ def _solve(carry: _Values, model: tuple[jax.Array, jax.Array, Problem, Hparams])
     # Within eps_1 minus twice the error by these values implies within eps_1 by the exact values.
     tolerance = pac.action_tolerance(hparams.epsilon, hparams.discount)
     strict = jnp.maximum(tolerance - 2 * width, 0).astype(dtype)
-    near = pac.near_optimal(quantity, problem.allowed & problem.game.system[:, None], strict)
-    error, best = jnp.where(changed, width, error), jnp.where(changed, near, best)
+    near_optimal = pac.near_optimal(
+        quantity, problem.allowed & problem.game.system[:, None], strict
+    )
+    error, best = jnp.where(changed, width, error), jnp.where(changed, near_optimal, best)
     return value, error, best, jnp.zeros_like(changed)
 
 

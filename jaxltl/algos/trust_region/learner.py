@@ -207,10 +207,10 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     batch = rollout(draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories)
     inputs = normalized(state.moments, hparams, batch.observation)
     inputs = jnp.where(batch.valid[..., None], inputs, 0)
-    value, found = _estimated(state, batch, inputs, hparams)
-    parameters, statistics = _improved(state.parameters, batch, inputs, found, problem, hparams)
+    value, advantage = _estimated(state, batch, inputs, hparams)
+    parameters, statistics = _improved(state.parameters, batch, inputs, advantage, problem, hparams)
     values, optimizer, value_moments = fitted(
-        fit_key, state, value_inputs(inputs), value + found, batch.valid, hparams
+        fit_key, state, value_inputs(inputs), value + advantage, batch.valid, hparams
     )
     moments = state.moments
     if hparams.normalize:
@@ -228,7 +228,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         moments=moments,
         trajectories=learner.saturating_add(state.trajectories, hparams.num_trajectories),
     )
-    (_, left_out), (_, total) = (_moments(x, batch.valid) for x in (found, value + found))
+    (_, left_out), (_, total) = (_moments(x, batch.valid) for x in (advantage, value + advantage))
     return state, replace(
         statistics,
         trajectories=state.trajectories,
@@ -290,10 +290,10 @@ def refolded(network: PyTree, old: Moments, new: Moments) -> PyTree:
     """Parameters of the same function of observations under new moments."""
     first = "hidden_0" if "hidden_0" in network else "out"
     kernel, bias = network[first]["kernel"], network[first]["bias"]
-    size, spread = old.mean.shape[0], scale_of(old)
+    size, deviation = old.mean.shape[0], scale_of(old)
     head = kernel[:size]
-    bias = bias + ((new.mean - old.mean) / spread) @ head
-    head = head * (scale_of(new) / spread)[:, None]
+    bias = bias + ((new.mean - old.mean) / deviation) @ head
+    head = head * (scale_of(new) / deviation)[:, None]
     return {**network, first: {"kernel": kernel.at[:size].set(head), "bias": bias}}
 
 
@@ -344,7 +344,7 @@ def _improved(
     parameters: PyTree,
     batch: Batch,
     inputs: jax.Array,
-    found: jax.Array,
+    advantage: jax.Array,
     problem: Problem,
     hparams: Hparams,
 ) -> tuple[PyTree, Metrics]:
@@ -360,9 +360,9 @@ def _improved(
 
     # Advantages of rewards are weighted evenly, as is usual; those of costs as the limit demands.
     weight = batch.valid.astype(dtype) / number
-    weight = jnp.stack([weight, weight * paid[:, None]][: len(found)])
-    centre = jnp.sum(weight * found, (1, 2)) / positive(weight.sum((1, 2)))
-    weighted = weight * (found - centre[:, None, None])
+    weight = jnp.stack([weight, weight * paid[:, None]][: len(advantage)])
+    centre = jnp.sum(weight * advantage, (1, 2)) / positive(weight.sum((1, 2)))
+    weighted = weight * (advantage - centre[:, None, None])
     samples = jax.tree.map(
         lambda x: x.reshape(-1, *x.shape[2:]), (inputs, batch.action, batch.valid)
     )
@@ -385,13 +385,13 @@ def _improved(
     accepted = scale > 0
     new = jnp.where(accepted, flat + scale * change, flat)
     nonfinite = jnp.sum(~batch.finite).astype(jnp.int32)
-    spread = jnp.sum(jnp.where(batch.finite, (sums - cost) ** 2, 0)) / jnp.maximum(number - 1, 1)
+    variance = jnp.sum(jnp.where(batch.finite, (sums - cost) ** 2, 0)) / jnp.maximum(number - 1, 1)
     usable = (nonfinite == 0) & jnp.all(jnp.isfinite(change))
     return unravel(new), Metrics(
         trajectories=jnp.int32(0),
         reward=batch.reward.sum() / number,
         cost=cost,
-        cost_error=jnp.sqrt(spread / number),
+        cost_error=jnp.sqrt(variance / number),
         length=batch.valid.sum() / number.astype(dtype),
         deviation=jnp.exp(parameters["log_deviation"].mean()),
         kl=kl,
@@ -401,7 +401,7 @@ def _improved(
         case=dual.case,
         trust_multiplier=dual.trust,
         cost_multiplier=dual.cost,
-        unexplained=jnp.zeros(len(found), dtype),
+        unexplained=jnp.zeros(len(advantage), dtype),
         nonfinite=nonfinite,
         status=learner.completion_status(accepted, usable),
     )
@@ -528,8 +528,8 @@ def direction(
     def solved(gradient: jax.Array) -> jax.Array:
         # Scaled to length 1, for tiny gradients would underflow when squared.
         length = jnp.sqrt(jnp.sum(gradient**2))
-        found, _ = cg(damped, gradient / positive(length), tol=1e-10, maxiter=hparams.cg_steps)
-        return found * length
+        solution, _ = cg(damped, gradient / positive(length), tol=1e-10, maxiter=hparams.cg_steps)
+        return solution * length
 
     natural = jax.vmap(solved)(jax.jacrev(lambda x: surrogate_of(x)[0])(flat))
     # With H x for the gradients that conjugate gradients did not quite solve for, the step's
@@ -571,8 +571,8 @@ def line_search(
 
     zero = jnp.zeros((), flat.dtype)
     gains = jnp.zeros(1 + (hparams.method == "cpo"), flat.dtype)
-    _, *after, found = lax.while_loop(
+    _, *after, accepted = lax.while_loop(
         searching, search, (jnp.int32(0), zero, gains, zero, jnp.bool_(False))
     )
-    scale, gains, kl = (jnp.where(found, x, 0) for x in after)
+    scale, gains, kl = (jnp.where(accepted, x, 0) for x in after)
     return scale, gains, kl

@@ -330,12 +330,12 @@ def _rollout(
 
     def move(carry: PyTree, chance: PyTree) -> PyTree:
         world, active, cut = carry
-        after, _, made = transition(environment, evaluate, None, (world, ()), *chance)
+        after, _, record = transition(environment, evaluate, None, (world, ()), *chance)
         world = jax.tree.map(partial(jnp.where, active), after, world)
-        cut |= active & made.truncated & ~made.terminated
-        vectors = flat_observation(made.observation), made.raw.ravel()
-        signals = jnp.stack([made.reward, made.cost, made.discount])
-        active_after = active & ~(made.terminated | made.truncated)
+        cut |= active & record.truncated & ~record.terminated
+        vectors = flat_observation(record.observation), record.raw.ravel()
+        signals = jnp.stack([record.reward, record.cost, record.discount])
+        active_after = active & ~(record.terminated | record.truncated)
         return (world, active_after, cut), (*vectors, signals, active)
 
     def trajectory(world: PyTree, noise: jax.Array | None, keys: jax.Array) -> PyTree:

@@ -77,10 +77,10 @@ def from_brax(
 
 def _step(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
     del key
-    found = held.it.step(copied(world), action)
-    done = found.done > 0
-    truncated = found.info.get("truncation", jnp.zeros_like(found.done)) > 0
-    return timestep(found, world, found.reward, done & ~truncated, truncated)
+    after = held.it.step(copied(world), action)
+    done = after.done > 0
+    truncated = after.info.get("truncation", jnp.zeros_like(after.done)) > 0
+    return timestep(after, world, after.reward, done & ~truncated, truncated)
 
 
 def _observe(world: PyTree) -> PyTree:

@@ -90,9 +90,9 @@ def _choose(
     def wait() -> Timestep:
         return timestep(now.world, now.world, 0.0, False, False)
 
-    found = lax.cond(last, lambda: step(now.world, parts, key), wait)
-    fresh, going = _nothing(counts, found.world), PartWorld(found.world, parts, now.turn + 1)
-    return found._replace(world=jax.tree.map(lambda x, y: jnp.where(last, x, y), fresh, going))
+    after = lax.cond(last, lambda: step(now.world, parts, key), wait)
+    fresh, going = _nothing(counts, after.world), PartWorld(after.world, parts, now.turn + 1)
+    return after._replace(world=jax.tree.map(lambda x, y: jnp.where(last, x, y), fresh, going))
 
 
 def _seen(counts: Held, observe: Callable[..., PyTree], now: PartWorld) -> PartObservation:
@@ -105,20 +105,20 @@ def _seen(counts: Held, observe: Callable[..., PyTree], now: PartWorld) -> PartO
 
 def _allowed(counts: Held, mask: Callable[..., jax.Array] | None, now: PartWorld) -> jax.Array:
     """Mask of values of the current component that extend the components chosen so far."""
-    most = max(counts.it)
-    inside = (jnp.arange(most) < jnp.array(counts.it)[:, None])[now.turn]
+    width = max(counts.it)
+    inside = (jnp.arange(width) < jnp.array(counts.it)[:, None])[now.turn]
     if mask is None:
         return inside
-    found = mask(now.world)
-    if found.shape == counts.it:
+    allowed = mask(now.world)
+    if allowed.shape == counts.it:
         for part, count in enumerate(counts.it):
             own = jnp.arange(count) == now.parts[part]
-            shape = [count if i == part else 1 for i in range(found.ndim)]
-            found &= ((part >= now.turn) | own).reshape(shape)
+            shape = [count if i == part else 1 for i in range(allowed.ndim)]
+            allowed &= ((part >= now.turn) | own).reshape(shape)
         rows = [
-            jnp.pad(found.any([i for i in range(found.ndim) if i != part]), (0, most - count))
+            jnp.pad(allowed.any([i for i in range(allowed.ndim) if i != part]), (0, width - count))
             for part, count in enumerate(counts.it)
         ]
-        found = jnp.stack(rows)
-    row = found[now.turn, :most] & inside
+        allowed = jnp.stack(rows)
+    row = allowed[now.turn, :width] & inside
     return jnp.where(row.any(), row, inside)

@@ -125,9 +125,9 @@ def from_jumanji(
 def _without_limit(env: Foreign) -> PyTree:
     """A copy of an environment without its time limit, in all layers."""
     endless = copy.copy(env)
-    for name, found in vars(env).items():
+    for name, value in vars(env).items():
         if name == "_env":
-            setattr(endless, name, _without_limit(found))
+            setattr(endless, name, _without_limit(value))
         elif name == "time_limit":
             setattr(endless, name, np.iinfo(np.int32).max)
     return endless
@@ -142,8 +142,8 @@ def _parts(env: Foreign) -> tuple[int, ...] | None:
         return None
     low, high = (np.broadcast_to(x, spec.shape).ravel() for x in (spec.minimum, spec.maximum))
     mask = _mask_of(env)
-    most = mask.shape[1] if mask is not None and mask.ndim == 2 else np.inf
-    return tuple(int(min(n, most)) for n in high.astype(int) - low + 1)
+    width = mask.shape[1] if mask is not None and mask.ndim == 2 else np.inf
+    return tuple(int(min(n, width)) for n in high.astype(int) - low + 1)
 
 
 def _actions(spec: Foreign, parts: tuple[int, ...] | None) -> Finite | Box:
@@ -189,15 +189,15 @@ def _allowed_together(world: Seen) -> jax.Array:
 
 
 def _allowed_apart(parts: Held, world: Seen) -> jax.Array:
-    mask, found = world.observation.action_mask, jnp.ones(1, bool)
+    mask, allowed = world.observation.action_mask, jnp.ones(1, bool)
     for row, count in enumerate(parts.it):
-        found = (found[:, None] & mask[row, :count]).ravel()
-    return some_allowed(found)
+        allowed = (allowed[:, None] & mask[row, :count]).ravel()
+    return some_allowed(allowed)
 
 
 def _reset(held: Held, key: Key) -> Seen:
-    state, found = held.it.reset(key)
-    return arrays(Seen(state, found.observation))
+    state, first = held.it.reset(key)
+    return arrays(Seen(state, first.observation))
 
 
 def _step(
@@ -213,9 +213,9 @@ def _moved(held: Held, endless: Held, world: Seen, action: PyTree, key: Key) -> 
     spec = held.it.action_spec
     if spec.shape and jnp.issubdtype(spec.dtype, jnp.integer):
         action = (action.reshape(spec.shape) + getattr(spec, "minimum", 0)).astype(spec.dtype)
-    state, found = held.it.step(copied(world.state), action)
+    state, after = held.it.step(copied(world.state), action)
     _, further = endless.it.step(copied(world.state), action)
     terminated = further.last() & (further.discount == 0)
     return timestep(
-        Seen(state, found.observation), world, found.reward, terminated, found.last() & ~terminated
+        Seen(state, after.observation), world, after.reward, terminated, after.last() & ~terminated
     )
