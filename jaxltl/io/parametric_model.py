@@ -24,7 +24,7 @@ from jaxltl.core.array_types import Integers
 from jaxltl.io.drn.body import Names
 
 # Far above the needs of models; they prevent short texts from exhausting the memory.
-_MOST_TERMS, MOST_POWER, _MOST_BITS = 10_000, 1_000, 20_000
+_MAX_TERMS, MAX_POWER, _MAX_BITS = 10_000, 1_000, 20_000
 
 # The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.
 Polynomial = dict[tuple[int, ...], Fraction]
@@ -52,6 +52,13 @@ class RationalFunction:
         """Exact value at a point; raises ZeroDivisionError at a pole."""
         above, below = (_value(factors, point) for factors in self._factors)
         return above / below
+
+    @property
+    def constant(self) -> Fraction | None:
+        """The value of a constant function; None for another."""
+        if any(map(any, (*self.numerator, *self.denominator))):
+            return None
+        return self.at(())
 
     def __add__(self, other: RationalFunction) -> RationalFunction:
         if self.denominator == other.denominator:
@@ -85,7 +92,7 @@ class RationalFunction:
 
     def __pow__(self, exponent: int) -> RationalFunction:
         terms = max(len(self.numerator), len(self.denominator))
-        if (terms - 1) * abs(exponent) > MOST_POWER:
+        if (terms - 1) * abs(exponent) > MAX_POWER:
             raise Malformed("too large")
         one = {(0,) * len(next(iter(self.denominator))): Fraction(1)}
         result = reduce(mul, [self] * abs(exponent), RationalFunction(one, one))
@@ -335,9 +342,9 @@ def _checked(polynomial: Polynomial) -> Polynomial:
     result = {powers: c for powers, c in polynomial.items() if c}
     bits = (x.bit_length() for c in result.values() for x in (c.numerator, c.denominator))
     if (
-        len(result) > _MOST_TERMS
-        or any(max(powers, default=0) > MOST_POWER for powers in result)
-        or max(bits, default=0) > _MOST_BITS
+        len(result) > _MAX_TERMS
+        or any(max(powers, default=0) > MAX_POWER for powers in result)
+        or max(bits, default=0) > _MAX_BITS
     ):
         raise Malformed("too large")
     return result
@@ -351,7 +358,7 @@ def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
 
 
 def _times(a: Polynomial, b: Polynomial) -> Polynomial:
-    if len(a) * len(b) > _MOST_TERMS:
+    if len(a) * len(b) > _MAX_TERMS:
         raise Malformed("too large")
     result: Polynomial = {}
     for p, c in a.items():

@@ -89,6 +89,25 @@ def test_functions_are_what_their_texts_say(tmp_path):
         assert found.functions[number].at(tuple(point.values())) == value, given
 
 
+def test_signs_and_powers_bind_as_in_storm(tmp_path):
+    """Signs bind less than powers; sums of a thousand terms are within the limits of nesting."""
+    for text, value in {
+        "-p^2": -4,
+        "3-+-p**2": 7,
+        "2^-p": None,
+        "p^-2": Fraction(1, 4),
+        "1" + "+p-q" * 500: -499,
+        "0.12345678901234567890123*p": Fraction("0.24691357802469135780246"),
+    }.items():
+        chain = CHAIN.replace("2*p", text)
+        if value is None:
+            with pytest.raises(ValueError, match="no power with an integer"):
+                read(tmp_path, chain)
+            continue
+        model = read(tmp_path, chain)
+        assert model.functions[model.rewards["cost"][0][0]].at((2, 3)) == value, text
+
+
 def test_models_without_parameters_are_read_as_ever(tmp_path):
     model = full_model(np.random.default_rng(2), transition_rewards=False)
     finite = {
@@ -119,10 +138,12 @@ def test_numbers_alone_are_not_what_such_files_hold(tmp_path):
         ("2*p", "2*", "line 13: .*it is cut"),
         ("2*p", "(2*p", "line 13: .*it is cut"),
         ("2*p", "2/(p-p)", "divided by zero"),
-        ("2*p", "p^p", "no whole power"),
-        ("2*p", "p^2000", "no whole power"),
+        ("2*p", "p^p", "no power with an integer up to 1000"),
+        ("2*p", "p^2000", "no power with an integer up to 1000"),
         ("2*p", "((p+q)^40*(p-q)^40)^40", "too large"),
-        ("2*p", "(" * 9999 + "p" + ")" * 9998, "line 13: .*it is cut"),
+        ("2*p", "(" * 60 + "p" + ")" * 60, "line 13: .*too large: parentheses are nested deeper"),
+        ("2*p", "-" * 9999 + "p", "line 13: .*too large: operators are nested deeper"),
+        ("2*p", "p?p:p", "no rational function"),
         ("2*p", "1e999999999", "malformed"),
         ("2*p", "((9^999)^999)", "too large"),
         ("(p+q)/2", "(p+r)/2", "the placeholder .0 stands for '.p.r./2', which is malformed"),

@@ -62,6 +62,8 @@ _FLAT = ("&", "|", "+", "*")
 class ExpressionParser(TokenReader):
     """Expressions, by precedence climbing."""
 
+    sign_level = 11  # of the operand of a minus sign
+
     def __init__(self, text: str, start: int = 0) -> None:
         super().__init__(text, start)
         self.nesting = 0
@@ -102,8 +104,11 @@ class ExpressionParser(TokenReader):
                 if not is_chain:
                     break
             name = {"^": "pow", "%": "mod"}.get(operator, operator)
-            left = Expression(name, tuple(operands), place=left.place)
+            left = self._node(name, tuple(operands), left.place)
         return left
+
+    def _node(self, operator: str, operands: tuple[Expression, ...], place: int) -> Expression:
+        return Expression(operator, operands, place=place)
 
     def _prefix(self, level: int) -> Expression:
         place = self.place
@@ -114,7 +119,9 @@ class ExpressionParser(TokenReader):
             negated = self.texts[self.at] == "!"
             self.at += 1
             # After a tighter operator, as in a = !b, the negation takes one operand alone.
-            operand = self._climb(SIMPLE) if negated and level <= _NOT else self._prefix(11)
+            operand = (
+                self._climb(SIMPLE) if negated and level <= _NOT else self._climb(self.sign_level)
+            )
             self.nesting -= 1
             return Expression("!" if negated else "neg", (operand,), place=place)
         return self._atom()

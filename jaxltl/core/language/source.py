@@ -50,8 +50,12 @@ class Source:
 class TokenReader:
     """The tokens of a text from an offset on, and a place in them; the last one has the kind "end"."""
 
+    pattern = _TOKEN
+
     def __init__(self, text: str, start: int = 0) -> None:
-        tokens = (found for found in _TOKEN.finditer(text, start) if found.lastgroup != "space")
+        tokens = (
+            found for found in self.pattern.finditer(text, start) if found.lastgroup != "space"
+        )
         found = list(islice(tokens, MAX_TOKENS + 1))
         if len(found) > MAX_TOKENS:
             raise LanguageError(

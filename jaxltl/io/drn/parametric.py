@@ -8,20 +8,19 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import reduce
-from types import SimpleNamespace
-from typing import cast
+from typing import NoReturn, cast
 
 import numpy as np
-from lark import Lark, Token
-from lark.exceptions import UnexpectedInput
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.language.expressions import Expression
+from jaxltl.core.language.parser import ExpressionParser
+from jaxltl.core.language.source import LanguageError
 from jaxltl.core.programs.build import MAX_STATES, build_rows
 from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
 from jaxltl.io.files import read_bytes
 from jaxltl.io.parametric_model import (
-    MOST_POWER,
+    MAX_POWER,
     Malformed,
     ParametricModel,
     RationalFunction,
@@ -76,11 +75,11 @@ def read_parametric(
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
     index_of_text = {b"0": 0}
-    functions, parser = [number(header.parameters, 0)], _parser(header.parameters)
+    functions = [number(header.parameters, 0)]
     placeholders: dict[str, RationalFunction] = {}
     for place, text in header.placeholders.items():
         try:
-            placeholders[place.decode()] = _parsed(text, parser, placeholders)
+            placeholders[place.decode()] = _parsed(text, header.parameters, placeholders)
         except Malformed as error:
             refuse(
                 name,
@@ -93,7 +92,7 @@ def read_parametric(
         indices = numbered(texts, index_of_text)
         for text in list(index_of_text)[len(functions) :]:
             try:
-                functions.append(_parsed(text, parser, placeholders))
+                functions.append(_parsed(text, header.parameters, placeholders))
             except Malformed as error:
                 expected = f"a function of {', '.join(header.parameters) or 'no parameter'}"
                 raise block.error(
@@ -121,9 +120,11 @@ def read_parametric(
         refuse(name, "it is too large for the memory.")
 
 
-def _numbers(given: Numbers | None, size: int) -> Integers:
+def _numbers(values: Numbers | None, size: int) -> Integers:
     """Numbers of functions of a reward; 0, the zero function, where the reward is absent."""
-    return np.zeros(size, np.int32) if given is None or not given.size else given.astype(np.int32)
+    return (
+        np.zeros(size, np.int32) if values is None or not values.size else values.astype(np.int32)
+    )
 
 
 def _starts(owner: Integers, size: int) -> Integers:
@@ -132,61 +133,57 @@ def _starts(owner: Integers, size: int) -> Integers:
 
 # --- functions ------------------------------------------------------------------------------
 
-_GRAMMAR = r"""
-    ?start: product | start "+" product -> add | start "-" product -> sub
-    ?product: sign | product "*" sign -> mul | product "/" sign -> truediv
-    ?sign: power | "+" sign | "-" sign -> neg
-    ?power: atom | atom ("^" | "**") POWER -> pow
-    ?atom: NUMBER -> number | NAME -> name | "(" start ")"
-    POWER: /[^-+*\/()^\s]+/
-    NUMBER: /(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?/
-    NAME: /[A-Za-z_][\w.\[\]]*/
-    %ignore /\s+/
-"""
 
+class _FunctionParser(ExpressionParser):
+    """Parser of the functions of DRN files; ``-p^2`` is ``-(p^2)``, unlike in programs."""
 
-def _parser(parameters: tuple[str, ...]) -> Lark:
-    """The parser of rational functions of some parameters."""
-
-    def exact(children: list[str]) -> RationalFunction:
-        value = as_fraction(children[0].encode())
-        if value is None:
-            raise Malformed(f"malformed at {children[0][:20]!r}")
-        return number(parameters, value)
-
-    def power(children: tuple[RationalFunction, str]) -> RationalFunction:
-        base, exponent = children
-        if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > MOST_POWER:
-            raise Malformed(f"no whole power up to {MOST_POWER}")
-        return base ** int(exponent)
-
-    actions = SimpleNamespace(
-        add=lambda c: c[0] + c[1],
-        sub=lambda c: c[0] - c[1],
-        mul=lambda c: c[0] * c[1],
-        truediv=lambda c: c[0] / c[1],
-        neg=lambda c: -c[0],
-        pow=power,
-        number=exact,
-        name=lambda c: parameter(parameters, str(c[0])),
+    sign_level = 10
+    pattern = re.compile(
+        r"(?P<space>\s+)|(?P<number>(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?)"
+        r"|(?P<word>[A-Za-z_][\w.\[\]]*)|(?P<sign>[-+*/^()])|(?P<unknown>.)"
     )
-    return Lark(_GRAMMAR, parser="lalr", transformer=actions)
+
+    def __init__(self, text: str) -> None:
+        self.text = text.replace("**", "^")
+        super().__init__(self.text)
+
+    def fail(self, expected: str) -> NoReturn:
+        after = self.text[self.place :][:20]
+        raise Malformed(f"malformed at {after!r}" if after else "cut")
+
+    def _node(self, operator: str, operands: tuple[Expression, ...], place: int) -> Expression:
+        if operator == "-":  # as a + (-b), so that long sums are not deep
+            first, second = operands
+            terms = first.operands if first.operator == "+" else (first,)
+            operator, operands = "+", (*terms, Expression("neg", (second,), place=place))
+        return super()._node(operator, operands, place)
+
+    def _prefix(self, level: int) -> Expression:
+        while self.accept("+"):
+            pass
+        return super()._prefix(level)
+
+    def _atom(self) -> Expression:
+        kind, text = self.kinds[self.at], self.texts[self.at]
+        if kind not in ("number", "word"):
+            return super()._atom()
+        if kind == "number" and as_fraction(text.encode()) is None:
+            self.fail("a number")
+        self.at += 1
+        return Expression("literal" if kind == "number" else "name", value=text)
 
 
 def _parsed(
-    text: bytes, parser: Lark, placeholders: Mapping[str, RationalFunction]
+    text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
 ) -> RationalFunction:
     try:
         string = text.decode()
         if not string.startswith("$"):
-            return parser.parse(string)  # type: ignore[return-value]
+            return _Functions(parameters).function(_FunctionParser(string).whole())
     except UnicodeDecodeError:
         raise Malformed("not UTF-8") from None
-    except UnexpectedInput as error:
-        if getattr(error, "token", Token("", "")).type == "$END":
-            raise Malformed("cut") from None
-        at = string[error.pos_in_stream or 0 :][:20]
-        raise Malformed(f"malformed at {at!r}") from None
+    except LanguageError as error:
+        raise Malformed(f"too large: {error.message}") from None
     if string not in placeholders:
         raise Malformed("no placeholder that is defined before")
     return placeholders[string]
@@ -232,9 +229,15 @@ def _of_program(
     )
 
 
+def _power(base: RationalFunction, exponent: RationalFunction) -> RationalFunction:
+    power = exponent.constant
+    if power is None or power.denominator > 1 or abs(power) > MAX_POWER:
+        raise Malformed(f"no power with an integer up to {MAX_POWER}")
+    return base ** int(power)
+
+
 _OPERATORS: dict[str, Callable[..., RationalFunction]] = {
-    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv,
-    "neg": operator.neg,
+    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv, "pow": _power,
 }  # fmt: skip
 
 
@@ -246,22 +249,17 @@ class _Functions:
         self.known: dict[Expression, RationalFunction] = {}
 
     def function(self, e: Expression) -> RationalFunction:
-        if (found := self.known.get(e)) is None:
-            found = self.known[e] = self._function(e)
-        return found
+        if (known := self.known.get(e)) is None:
+            known = self.known[e] = self._function(e)
+        return known
 
     def _function(self, e: Expression) -> RationalFunction:
         if e.operator == "literal":
             return number(self.parameters, Fraction(str(e.value)))  # decimals as they are written
         if e.operator == "name":
             return parameter(self.parameters, str(e.value))
-        if e.operator == "pow":
-            base, exponent = e.operands
-            value = exponent.value
-            if not (exponent.is_literal and isinstance(value, int) and abs(value) <= MOST_POWER):
-                raise Malformed(f"no power with an integer up to {MOST_POWER}")
-            return self.function(base) ** value
+        if e.operator == "neg":
+            return -self.function(e.operands[0])
         if e.operator not in _OPERATORS:
             raise Malformed(f"no rational function, because of {e.operator}")
-        parts = [self.function(x) for x in e.operands]
-        return -parts[0] if e.operator == "neg" else reduce(_OPERATORS[e.operator], parts)
+        return reduce(_OPERATORS[e.operator], (self.function(x) for x in e.operands))
