@@ -817,7 +817,7 @@ def test_words_and_numbers():
         (True, "at least 3"),
     ):
         with pytest.raises(ValueError, match=message):
-            validation.integer("n", given, least=3, most=8)
+            validation.integer("n", given, least=3, limit=8)
     for given in (None, np.inf, [1.0], "x"):
         with pytest.raises(ValueError, match=r"give a finite number|give numbers"):
             validation.finite_number("x", given)

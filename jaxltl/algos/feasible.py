@@ -289,7 +289,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a number is out of range."""
-        validation.integer("num_steps", self.num_steps, least=1, most=loops.MAX_STEPS)
+        validation.integer("num_steps", self.num_steps, least=1, limit=loops.MAX_STEPS)
         if self.num_proofs is not None:
             validation.integer("num_proofs", self.num_proofs, least=1)
         validation.require_in_range("tolerance", self.tolerance)
@@ -519,7 +519,7 @@ def feasible(
     points = None
     if np.ndim(starts) == 0:
         keys = jax.random.split(
-            key, validation.integer("starts", starts, least=1, most=loops.MAX_STEPS)
+            key, validation.integer("starts", starts, least=1, limit=loops.MAX_STEPS)
         )
     else:
         points = problem.model.valid_points("start", starts).astype(problem.low.dtype)

@@ -237,7 +237,7 @@ def prove_around(
     _require_problem(problem)
     threshold, num_halvings = (
         _limit(threshold),
-        validation.integer("num_halvings", num_halvings, most=1000),
+        validation.integer("num_halvings", num_halvings, limit=1000),
     )
     model = problem.model
     (point,) = model.valid_points("point", validation.float_array("point", point)[None])

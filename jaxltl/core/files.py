@@ -73,23 +73,23 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
         raise ValueError(
             "it holds a single array; numpy.savez(path, name=array) writes named ones."
         )
-    arrays, what = {}, "it"
+    arrays, place = {}, "it"
     try:
         if not start.startswith(b"PK"):
             raise zipfile.BadZipFile
         with np.load(file, allow_pickle=False) as archive:
             for name in archive.files:
-                what = f"its array {name!r}"
+                place = f"its array {name!r}"
                 arrays[name] = archive[name]
                 if not isinstance(arrays[name], np.ndarray):  # raw bytes, where it is no array
                     raise zipfile.BadZipFile
     except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
         if "Object arrays" in str(error):
             raise ValueError(
-                f"{what} holds Python objects, such as None; save numbers, truth values or texts."
+                f"{place} holds Python objects, such as None; save numbers, truth values or texts."
             ) from None
         raise ValueError(
-            f"{what} is damaged, or not written by numpy.savez(path, name=array)."
+            f"{place} is damaged, or not written by numpy.savez(path, name=array)."
         ) from None
     return arrays
 

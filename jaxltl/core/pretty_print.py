@@ -51,13 +51,13 @@ def brief(
     """A class decorator for a short ``repr``."""
     if cls is None:
         return functools.partial(brief, facts=facts, drawn=drawn, codes=codes)
-    made: Any = cls
+    target: Any = cls
     plain = functools.partial(fields, codes=codes)
-    made._brief_facts = staticmethod(functools.partial(_safe, facts or plain, plain))
-    made.__repr__ = _repr
+    target._brief_facts = staticmethod(functools.partial(_safe, facts or plain, plain))
+    target.__repr__ = _repr
     if drawn:
-        made._repr_svg_, made._repr_html_ = _svg, _html
-    return made
+        target._repr_svg_, target._repr_html_ = _svg, _html
+    return target
 
 
 def _repr(self: Any) -> str:
@@ -100,12 +100,12 @@ def nested_repr(value: object, width: int = _HEAD) -> str:
     if facts is None:
         return truncate(repr(value), width)
     texts, name = facts(value), type(value).__name__
-    kept = list(texts)
-    while kept and len(f"{name}({', '.join(kept)}, ...)") > width:
-        kept.pop()
-    if len(kept) < len(texts):
-        kept.append("...")
-    return f"{name}({', '.join(kept)})"
+    words = list(texts)
+    while words and len(f"{name}({', '.join(words)}, ...)") > width:
+        words.pop()
+    if len(words) < len(texts):
+        words.append("...")
+    return f"{name}({', '.join(words)})"
 
 
 def truncate(text: str, width: int = _HEAD) -> str:
@@ -132,11 +132,11 @@ def names_text(words: Iterable[Any], width: int = _HEAD) -> str:
     if is_array(words):
         return array_text(words)
     listed = list(words)
-    kept = [str(word) for word in listed[:width]]
-    while len(kept) > 1 and len(", ".join(kept)) > width:
-        kept.pop()
-    text = truncate(", ".join(kept), width)
-    return text if len(kept) == len(listed) else f"{text}, ... ({len(listed)} in all)"
+    names = [str(word) for word in listed[:width]]
+    while len(names) > 1 and len(", ".join(names)) > width:
+        names.pop()
+    text = truncate(", ".join(names), width)
+    return text if len(names) == len(listed) else f"{text}, ... ({len(listed)} in all)"
 
 
 def propositions_text(propositions: Sequence[str]) -> str:
@@ -159,11 +159,11 @@ def is_array(value: object) -> bool:
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
-def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
+def readable(value: Any, limit: int = READ) -> NDArray[Any] | None:
     """The NumPy array of an array that the host can read at once, else None."""
     if isinstance(value, bool | int | float):
         return np.asarray(value)
-    if not is_array(value) or not isinstance(value.dtype, np.dtype) or value.size > most:
+    if not is_array(value) or not isinstance(value.dtype, np.dtype) or value.size > limit:
         return None
     if not isinstance(value, np.ndarray | np.generic):
         jax = sys.modules.get("jax")
@@ -172,10 +172,10 @@ def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
         if value.is_deleted() or not value.is_fully_addressable:
             return None
     try:
-        found = np.asarray(value)
+        array = np.asarray(value)
     except Exception:  # such as a transfer that is forbidden
         return None
-    return None if found.dtype.kind in "OSU" else found
+    return None if array.dtype.kind in "OSU" else array
 
 
 def array_text(value: Any) -> str:
@@ -242,8 +242,8 @@ def bounds_text(lower: object, upper: object) -> str:
     known = np.isfinite(width)
     if not known.any():
         return "no bounds"
-    most = width[known].max()
-    text = f"bounds at most {most:.2g} apart" if most > 0 else "bounds meet"
+    widest = width[known].max()
+    text = f"bounds at most {widest:.2g} apart" if widest > 0 else "bounds meet"
     none = known.size - int(np.count_nonzero(known))
     return f"{text}, none for {none:,} of {known.size:,}" if none else text
 
@@ -263,9 +263,9 @@ def enum_counts(value: object, codes: Iterable[enum.IntEnum]) -> str:
     read = readable(value)
     if read is None or read.dtype.kind not in "iu":
         return array_text(value) if is_array(value) else truncate(str(value))
-    found, times = np.unique(read, return_counts=True)
+    numbers, times = np.unique(read, return_counts=True)
     known = {int(code): code.name for code in codes}
-    words = [known.get(int(n), str(n)) for n in found]
+    words = [known.get(int(n), str(n)) for n in numbers]
     if read.ndim == 0:
         return words[0]
     return ", ".join(f"{n:,} {word}" for n, word in zip(times.tolist(), words, strict=True))
@@ -283,9 +283,9 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
     if keys is None:
         keys = [x.name for x in dataclasses.fields(value) if x.repr]
     for name in keys:
-        given = getattr(value, name)
-        if not (is_array(given) and str(given.dtype).startswith("key<")):  # of random numbers
-            yield field(name, given, (codes or {}).get(name))
+        entry = getattr(value, name)
+        if not (is_array(entry) and str(entry.dtype).startswith("key<")):  # of random numbers
+            yield field(name, entry, (codes or {}).get(name))
 
 
 def field(name: str, value: object, codes: Iterable[enum.IntEnum] | None = None) -> str:
@@ -324,11 +324,11 @@ def _tree(value: object) -> str:
     if not leaves and (callable(value) or not isinstance(value, dict | list | tuple)):
         return truncate(name)
     size = sum(int(np.prod(x.shape)) for x in leaves)
-    what = f"{count(len(leaves), 'array')} of {count(size, 'number')}"
+    text = f"{count(len(leaves), 'array')} of {count(size, 'number')}"
     if isinstance(value, dict) and not leaves:
         return f"{{{names_text(value)}}}"
     plain = isinstance(value, dict | list | tuple) and not hasattr(value, "_fields")
-    return what if plain else f"{truncate(name)}({what})"
+    return text if plain else f"{truncate(name)}({text})"
 
 
 def _leaves(value: object) -> list[Any]:
@@ -350,10 +350,10 @@ def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]
         return
     yield f"the last of {' x '.join(f'{n:,}' for n in shape)} rows"
     for one in dataclasses.fields(value):
-        given, code = getattr(value, one.name), (codes or {}).get(one.name)
-        read = readable(given) if code is None else None
+        entry, code = getattr(value, one.name), (codes or {}).get(one.name)
+        read = readable(entry) if code is None else None
         if read is None or read.ndim < len(shape):
-            yield field(one.name, given, code)
+            yield field(one.name, entry, code)
         else:
             yield f"{one.name}={value_range(np.take(read, -1, axis=len(shape) - 1))}"
 
@@ -371,21 +371,21 @@ def _svg(self: object) -> str | None:
     """The SVG for notebooks; None for text."""
     try:
         importlib.import_module(_DRAWING)  # on first use, since matplotlib is slow to import
-        found = picture(self)
+        drawing = picture(self)
     except Exception:  # a failed picture must not hide the object
         return None
-    return None if found is None or len(found) > _DRAWN else found
+    return None if drawing is None or len(drawing) > _DRAWN else drawing
 
 
 def _html(self: object) -> str | None:
     """The SVG above the text; None without a picture."""
-    found = _svg(self)
-    if found is None:
+    drawing = _svg(self)
+    if drawing is None:
         return None
     text = repr(self).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return (
         '<figure style="margin:0.4em 0"><div style="display:inline-block;max-width:100%;'
-        f'overflow-x:auto;background:#fff;border-radius:6px;padding:4px">{found}</div>'
+        f'overflow-x:auto;background:#fff;border-radius:6px;padding:4px">{drawing}</div>'
         f'<figcaption><pre style="margin:0.3em 0;white-space:pre-wrap">{text}</pre></figcaption>'
         "</figure>"
     )

@@ -69,11 +69,11 @@ def register(
 
     def unflatten(rest: tuple[Any, ...], leaves: Iterable[object]) -> ClassT:
         leaves, (values, texts) = tuple(leaves), rest
-        shown = (
+        private_values = (
             text.values() if any(isinstance(x, jax.core.Tracer) for x in leaves) else texts.values
         )
         names = (*arrays, *static, *text)
-        return cls(**dict(zip(names, (*leaves, *values, *shown), strict=True)))
+        return cls(**dict(zip(names, (*leaves, *values, *private_values), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
@@ -85,11 +85,11 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
 
     Fields made by ``field(pytree_node=False)`` are static: part of the structure, compared by value.
     """
-    made: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
-    made.replace = _replace
-    static = [f.name for f in dataclasses.fields(made) if not f.metadata.get("pytree_node", True)]
-    arrays = [f.name for f in dataclasses.fields(made) if f.name not in static]
-    return register(made, arrays, static)
+    result: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
+    result.replace = _replace
+    static = [f.name for f in dataclasses.fields(result) if not f.metadata.get("pytree_node", True)]
+    arrays = [f.name for f in dataclasses.fields(result) if f.name not in static]
+    return register(result, arrays, static)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))

@@ -228,13 +228,15 @@ def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
     where = int(state[0]) if len(state) == 1 else tuple(int(i) for i in state)
     weights = "[" + ", ".join(f"{x:.4g}" for x in row) + "]"
     if np.isnan(row).any():
-        what = f"takes action {int(np.argmax(np.isnan(row)))}, which is not available (or is NaN)"
+        problem = (
+            f"takes action {int(np.argmax(np.isnan(row)))}, which is not available (or is NaN)"
+        )
     elif (row < 0).any():
-        what = f"has the negative probability {row.min():.4g}"
+        problem = f"has the negative probability {row.min():.4g}"
     else:
-        what = f"sums to {row.sum():.6g}, not 1"
+        problem = f"sums to {row.sum():.6g}, not 1"
     return (
-        f"the policy's row {weights} of state {where} {what}; give each state a distribution "
+        f"the policy's row {weights} of state {where} {problem}; give each state a distribution "
         "over its available actions"
     )
 
@@ -245,21 +247,23 @@ def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} has shape {np.shape(array)}; expected {tuple(shape)}.")
 
 
-def require_states(name: str, given: Any, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless `given` is one bool for each state; the hint is for state numbers."""
+def require_states(name: str, states: Any, shape: tuple[int, ...]) -> None:
+    """Raises ValueError unless `states` is one bool for each state; the hint is for state numbers."""
     wanted = f"give bool[{', '.join(map(str, shape))}], one for each state"
-    if isinstance(given, str):
-        raise ValueError(f"{name}={given!r}; {wanted}, such as that label's column of model.label.")
-    listed = sorted(given) if isinstance(given, set | frozenset) else given
+    if isinstance(states, str):
+        raise ValueError(
+            f"{name}={states!r}; {wanted}, such as that label's column of model.label."
+        )
+    listed = sorted(states) if isinstance(states, set | frozenset) else states
     array: Any = listed if hasattr(listed, "dtype") else np.asarray(listed)
-    if listed is given and array.shape == tuple(shape):
+    if listed is states and array.shape == tuple(shape):
         if (
             isinstance(array, jax.core.Tracer)
             or array.dtype == bool
             or np.isin(array, (0, 1)).all()
         ):
             return
-        wanted = f"{name} is {shorten(given)}; {wanted}"
+        wanted = f"{name} is {shorten(states)}; {wanted}"
     else:
         wanted = f"{name} has shape {array.shape}; expected {tuple(shape)}: {wanted}"
     known = array.dtype.kind in "iu" and not isinstance(array, jax.core.Tracer)

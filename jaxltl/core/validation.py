@@ -159,8 +159,8 @@ def finite_number(name: str, value: object) -> float:
     return float(array)
 
 
-def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> int:
-    """Converts to an int from `least` to `most`."""
+def integer(name: str, value: Any, *, least: int = 0, limit: int = 2**63 - 1) -> int:
+    """Converts to an int from `least` to `limit`."""
     try:
         number = int(value)
         exact = np.ndim(value) == 0 and bool(number == value)
@@ -168,8 +168,8 @@ def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> 
         number, exact = 0, False
     if not exact:
         raise ValueError(f"{name}={shorten(value)}; it must be an integer of at least {least}.")
-    if number < least or number > most:
-        bound = f"at least {least}" if number < least else f"at most {most}"
+    if number < least or number > limit:
+        bound = f"at least {least}" if number < least else f"at most {limit}"
         raise ValueError(f"{name}={shorten(value)}; it must be {bound}.")
     return number
 
@@ -209,8 +209,8 @@ def function(name: str, value: object) -> Callable[..., Any]:
 def instance(name: str, value: Any, kind: Any, remedy: str) -> Any:
     """Returns `value` if it is an instance of a type, or of one of several."""
     if not isinstance(value, kind):
-        found = "an array" if hasattr(value, "aval") else type(value).__name__
-        raise ValueError(f"{name} is {found}; give {remedy}.")
+        kind_name = "an array" if hasattr(value, "aval") else type(value).__name__
+        raise ValueError(f"{name} is {kind_name}; give {remedy}.")
     return value
 
 
@@ -224,13 +224,13 @@ def sequence(name: str, value: object) -> list[Any]:
 
 def distinct_names(name: str, value: object) -> tuple[str, ...]:
     """Converts an iterable of distinct strings to a tuple."""
-    found = sequence(name, value)
-    for one in found:
-        if not isinstance(one, str) or found.count(one) > 1:
+    names = sequence(name, value)
+    for one in names:
+        if not isinstance(one, str) or names.count(one) > 1:
             raise ValueError(
                 f"{name}: {shorten(one)} is not a string, or occurs twice; give distinct names."
             )
-    return tuple(found)
+    return tuple(names)
 
 
 def unsupported_model(model: object) -> str:
@@ -255,14 +255,14 @@ def unsupported_model(model: object) -> str:
     )
 
 
-def options(function: str, given: Mapping[str, object], **defaults: Any) -> tuple[Any, ...]:
+def options(function: str, values: Mapping[str, object], **defaults: Any) -> tuple[Any, ...]:
     """The values of optional keywords with these defaults; TypeError for another, as Python raises."""
-    if unknown := sorted(given.keys() - defaults.keys()):
+    if unknown := sorted(values.keys() - defaults.keys()):
         raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")
-    return tuple({**defaults, **given}.values())
+    return tuple({**defaults, **values}.values())
 
 
-def keywords(function: str, given: Iterable[str], options: type) -> None:
+def keywords(function: str, names: Iterable[str], options: type) -> None:
     """Raises TypeError, as Python does, for a keyword that a TypedDict of options lacks."""
-    if unknown := sorted(set(given) - set(options.__annotations__)):
+    if unknown := sorted(set(names) - set(options.__annotations__)):
         raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")

@@ -32,7 +32,7 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
         for inside in COLORS
         if inside not in (around, "black")
     ]
-    num = validation.integer("num", num, most=len(pairs))
+    num = validation.integer("num", num, limit=len(pairs))
     return {f"o{i + 1}": {a: 5, b: 4} for i, (a, b) in enumerate(pairs[:num])}
 
 

@@ -113,7 +113,7 @@ def flat_world(
         )
     extent = validation.finite_number("extent", extent)
     time_step = validation.finite_number("time_step", time_step)
-    num_starts = validation.integer("num_starts", num_starts, least=1, most=2**26)
+    num_starts = validation.integer("num_starts", num_starts, least=1, limit=2**26)
     seed, discrete = validation.integer("seed", seed), validation.boolean("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
@@ -220,7 +220,7 @@ def events_around(
         tuple(discs),
         float(scene.extent),
         tuple(distances.tolist()),
-        validation.integer("directions", directions, least=1, most=2**10),
+        validation.integer("directions", directions, least=1, limit=2**10),
     )
 
 

@@ -104,9 +104,9 @@ def letter_world(
     flat = validation.boolean("flat", maps.get("flat", False))
     copies = validation.integer("copies", copies)
     num_maps = validation.integer(
-        "num_maps", maps.get("num_maps", 1024), least=int(connected), most=2**24
+        "num_maps", maps.get("num_maps", 1024), least=int(connected), limit=2**24
     )
-    size = validation.integer("size", size, most=2**10)
+    size = validation.integer("size", size, limit=2**10)
     seed = validation.integer("seed", maps.get("seed", 0))
     if layout is None:
         if start is not None:
@@ -128,7 +128,7 @@ def letter_world(
         if start is None and not len(empty):
             raise ValueError("layout: no cell is empty; say where to begin, start=0.")
         if start is not None:
-            start = validation.integer("start", start, most=size * size - 1)
+            start = validation.integer("start", start, limit=size * size - 1)
         places = (empty if start is None else np.array([start])).astype(np.int32)
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)

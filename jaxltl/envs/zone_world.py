@@ -116,7 +116,7 @@ def zone_world(
     num_maps, seed = validation.options("zone_world", placements, num_maps=1024, seed=0)
     names = validation.distinct_names("colors", colors)
     zones, seed = validation.integer("zones", zones), validation.integer("seed", seed)
-    num_maps = validation.integer("num_maps", num_maps, most=2**20)
+    num_maps = validation.integer("num_maps", num_maps, limit=2**20)
     sizes = {"radius": radius, "extent": extent, "saturation": saturation}
     counts = {"zones": zones, "num_maps": num_maps, "colors": len(names)}
     for name, number in (sizes | counts).items():

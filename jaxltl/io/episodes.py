@@ -119,10 +119,10 @@ def _steps(seen: Mapping[str, Sequence[object]] | Sequence[object]) -> list[obje
 def _index(
     value: object, number_of: Callable[..., SupportsIndex] | None, place: str, name: str
 ) -> int:
-    found = np.asarray(value if number_of is None else number_of(value))
-    if found.size != 1 or found.dtype.kind not in "iu":
+    index = np.asarray(value if number_of is None else number_of(value))
+    if index.size != 1 or index.dtype.kind not in "iu":
         raise ValueError(
             f"{place} is {validation.shorten(value)}; give {name}=, a function that returns the "
             f"number of the {name}."
         )
-    return int(found.item())
+    return int(index.item())

@@ -49,11 +49,11 @@ def joined_brackets(block: Block, column: int, lines: Booleans | None = None) ->
     inner = np.zeros(end.size + 1, np.int64)  # 1 on the second to last token of a bracket
     np.add.at(inner, at + 1, 1)
     np.add.at(inner, last + 1, -1)
-    kept = inner.cumsum()[:-1] == 0
+    outer = inner.cumsum()[:-1] == 0
     count = block.count
     count[line] -= last - at
     first[1:] = count.cumsum()
-    return replace(block, start=block.start[kept], end=end[kept], first=first)
+    return replace(block, start=block.start[outer], end=end[outer], first=first)
 
 
 def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:

@@ -116,19 +116,19 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
         return model, plan()
     sure = optimal_actions(model)
     inside = plan(allowed=sure.allowed)
-    factor, least, found = learned.steps_factor or np.inf, 0.0, inside
+    factor, least, solution = learned.steps_factor or np.inf, 0.0, inside
     if not isinstance(requested, str):
         require_attainable(model, sure.best, requested, learned.over, "state {}".format)
         soft, least = plan(), requested
         mixed = reaching(model, soft.policy, inside.policy, sure.best, requested, over=learned.over)
         policy = jnp.asarray(mixed.policy, model.dtype)
-        found = replace(soft, policy=policy, status=worst(soft.status, inside.status))
+        solution = replace(soft, policy=policy, status=worst(soft.status, inside.status))
     if np.isinf(factor):
-        return model, found
-    kept = practical_policy(
-        model, found.policy, factor, actions=sure, probability=least, over=learned.over
+        return model, solution
+    lifted = practical_policy(
+        model, solution.policy, factor, actions=sure, probability=least, over=learned.over
     )
-    return model, replace(found, policy=jnp.asarray(kept.policy, model.dtype))
+    return model, replace(solution, policy=jnp.asarray(lifted.policy, model.dtype))
 
 
 # --- files ----------------------------------------------------------------------------------

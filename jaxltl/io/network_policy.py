@@ -58,16 +58,16 @@ class NetworkPolicy:
         else:
             data = np.asarray(jax.random.key_data(jax.random.key(0) if key is None else key))
         kinds, structure = self.exported.in_avals, self.exported.in_tree
-        given = [data, at.memory, *jax.tree.leaves(at.state)]
-        if len(given) < len(kinds):
-            given.append(np.ones(kinds[-1].shape, bool) if allowed is None else allowed)
-        found, expected = ([np.shape(x) for x in y] for y in (given, kinds))
-        if found != expected:
+        inputs = [data, at.memory, *jax.tree.leaves(at.state)]
+        if len(inputs) < len(kinds):
+            inputs.append(np.ones(kinds[-1].shape, bool) if allowed is None else allowed)
+        shapes, expected = ([np.shape(x) for x in y] for y in (inputs, kinds))
+        if shapes != expected:
             raise ValueError(
-                f"the observation has arrays of the shapes {found[2:]}; the network reads "
+                f"the observation has arrays of the shapes {shapes[2:]}; the network reads "
                 f"{expected[2:]}."
             )
-        leaves = [jax.numpy.asarray(x, y.dtype) for x, y in zip(given, kinds, strict=True)]
+        leaves = [jax.numpy.asarray(x, y.dtype) for x, y in zip(inputs, kinds, strict=True)]
         arguments, _ = jax.tree.unflatten(structure, leaves)
         action: Array = self.exported.call(*arguments)
         return action
@@ -152,11 +152,11 @@ def _program(agent: Agent, environment: Environment, automaton: Automaton | None
     leaves, structure = jax.tree.flatten(observation)
 
     def act(data: jax.Array, memory: jax.Array, leaves: PyTree, allowed: PyTree) -> PyTree:
-        key, shown = jax.random.wrap_key_data(data), jax.tree.unflatten(structure, leaves)
+        key, observation = jax.random.wrap_key_data(data), jax.tree.unflatten(structure, leaves)
         if rows is not None:
-            shown = TaskObservation(shown, jax.numpy.asarray(rows)[memory])
-        return agent.act((), shown, allowed, key)[0]
+            observation = TaskObservation(observation, jax.numpy.asarray(rows)[memory])
+        return agent.act((), observation, allowed, key)[0]
 
     kinds = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-    made = export.export(jax.jit(act), platforms=_PLATFORMS)(*kinds, leaves, allowed)
-    return bytes(made.serialize())
+    exported = export.export(jax.jit(act), platforms=_PLATFORMS)(*kinds, leaves, allowed)
+    return bytes(exported.serialize())

@@ -161,14 +161,14 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
     used &= available[..., None]
     state, action = np.nonzero(available)
     ball: dict[str, Array] = {}
-    for key, kept in (("center", used), ("radius", available)):
+    for key, mask in (("center", used), ("radius", available)):
         if key in arrays:
-            if arrays[key].shape != kept.shape:
+            if arrays[key].shape != mask.shape:
                 raise ValueError(
-                    f"{key} has shape {arrays[key].shape}; expected {kept.shape}, as of "
+                    f"{key} has shape {arrays[key].shape}; expected {mask.shape}, as of "
                     f"{'lower' if key == 'center' else 'available'}."
                 )
-            ball[key] = arrays[key][kept]
+            ball[key] = arrays[key][mask]
     model = interval_rows(
         offsets_from_counts(available.sum(-1)),
         offsets_from_counts(used.sum(-1)[state, action]),

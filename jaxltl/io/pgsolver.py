@@ -118,7 +118,7 @@ class _Reader:
 
     def vertices(self, at: int) -> dict[int, _Vertex]:
         """The vertices from an offset on, by number, in the order of the file."""
-        found: dict[int, _Vertex] = {}
+        table: dict[int, _Vertex] = {}
         while at < len(self.text):
             place, fields = at, []
             for pattern, expected in _FIELDS:
@@ -130,33 +130,33 @@ class _Reader:
                 fields.append(match[1] or "")
                 at = match.end()
             number = self.number(fields[0], "vertex", place)
-            if number in found:
+            if number in table:
                 raise self.error(
                     place,
                     f"vertex {number} is defined a second time, first in line "
-                    f"{self.line(found[number].place)}; keep one of them.",
+                    f"{self.line(table[number].place)}; keep one of them.",
                 )
             priority = self.number(fields[1], "priority", place)
             targets = [self.number(x.strip(), "a successor:", place) for x in fields[3].split(",")]
-            found[number] = _Vertex(place, priority, fields[2], targets, fields[4])
+            table[number] = _Vertex(place, priority, fields[2], targets, fields[4])
             at = self.skipped(_SPACE, at)
-        if not found:
+        if not table:
             raise self.error(
                 at, "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'."
             )
-        return found
+        return table
 
     def game(self) -> ParityGame:
         begin = self.skipped(_SPACE, 0)
         head = _HEAD.match(self.text, begin)
         assert head is not None
-        found = self.vertices(self.skipped(_SPACE, head.end()))
+        vertices = self.vertices(self.skipped(_SPACE, head.end()))
         start = None if head[1] is None else self.number(head[1], "the start", begin)
-        if start is not None and start not in found:
+        if start is not None and start not in vertices:
             raise self.error(begin, f"the start, vertex {start}, is not defined; define it.")
-        index = {number: i for i, number in enumerate(found)}
+        index = {number: i for i, number in enumerate(vertices)}
         target = []
-        for number, vertex in found.items():
+        for number, vertex in vertices.items():
             for other in vertex.successors:
                 if other not in index:
                     raise self.error(
@@ -164,20 +164,23 @@ class _Reader:
                         f"vertex {number} leads to vertex {other}, which is not defined; define it.",
                     )
                 target.append(index[other])
-        numbers = np.array(list(found))
-        valuation = {"vertex": numbers, "priority": np.array([v.priority for v in found.values()])}
-        names = [vertex.name for vertex in found.values()]
+        numbers = np.array(list(vertices))
+        valuation = {
+            "vertex": numbers,
+            "priority": np.array([v.priority for v in vertices.values()]),
+        }
+        names = [vertex.name for vertex in vertices.values()]
         if any(names):
             valuation["name"] = np.array(names, object)
         model = make_sparse(
-            np.cumsum([0, *(len(vertex.successors) for vertex in found.values())]),
+            np.cumsum([0, *(len(vertex.successors) for vertex in vertices.values())]),
             np.arange(len(target) + 1),
             np.array(target),
             np.ones(len(target)),
             initial=None if start is None else (numbers == start).astype(np.float64),
             valuation=valuation,
         )
-        game = make_game(model, np.array([vertex.owner == "0" for vertex in found.values()]))
+        game = make_game(model, np.array([vertex.owner == "0" for vertex in vertices.values()]))
         return ParityGame(game, objective_of(game))
 
 

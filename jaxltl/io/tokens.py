@@ -257,8 +257,8 @@ def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tu
         skipped &= data[np.minimum(start[first] + i, data.size - 1)] == sign
     count = np.diff(first, append=start.size)
     if skipped.any():
-        kept = np.repeat(~skipped, count)
-        start, end, count = start[kept], end[kept], count[~skipped]
+        words = np.repeat(~skipped, count)
+        start, end, count = start[words], end[words], count[~skipped]
     numbers = line + of[first][~skipped].astype(np.int64)
     starts = np.concatenate([[0], count.cumsum()])
     return Block(text, data, start, end, starts, numbers), int(is_end.sum())

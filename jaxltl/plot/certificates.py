@@ -77,7 +77,7 @@ def certificate(
         panel.set(xlabel="coordinate 0", ylabel="satisfaction probability", ylim=(-0.03, 1.03))
         note(figure, [(ACCENT, "lower bound", "s"), (MUTED, "upper bound", "s")])
         return figure
-    across, up = (validation.integer("axes", i, least=0, most=n - 1) for i in axes)
+    across, up = (validation.integer("axes", i, least=0, limit=n - 1) for i in axes)
     if across == up:
         raise ValueError(f"axes={tuple(axes)}: give two distinct coordinates of 0 to {n - 1}.")
     others = tuple(i for i in range(n) if i not in (across, up))

@@ -346,7 +346,7 @@ def assess(
     Raises:
       ValueError: fewer than two evaluations, or arguments of another search.
     """
-    num_evaluations = validation.integer("num_evaluations", num_evaluations, most=2**31 - 1)
+    num_evaluations = validation.integer("num_evaluations", num_evaluations, limit=2**31 - 1)
     if num_evaluations < 2:
         raise ValueError(
             f"num_evaluations={num_evaluations}; a confidence interval needs at least 2."

@@ -43,7 +43,7 @@ def run(
     max_rows: int = 1000,
 ) -> tuple[StateT, MetricsT]:
     """:meth:`~jaxltl.algos.common.learner.Learner.run` of a learner with this `step`."""
-    num_steps = validation.integer("num_steps", num_steps, least=1, most=MAX_STEPS)
+    num_steps = validation.integer("num_steps", num_steps, least=1, limit=MAX_STEPS)
     max_rows = validation.integer("max_rows", max_rows, least=1)
     require_arrays(state=state, problem=problem, hparams=hparams)
     require_hparams(hparams)
@@ -137,7 +137,7 @@ def run_until(
         raise ValueError('idle=True requires check_every=1 and keep="after".')
     for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
         if not isinstance(number, jax.Array):
-            validation.integer(name, number, least=1, most=MAX_STEPS)
+            validation.integer(name, number, least=1, limit=MAX_STEPS)
     until = until if isinstance(until, Partial) else Partial(validation.function("until", until))
     require_arrays(state=state, problem=problem, hparams=hparams, until=until)
     require_hparams(hparams)

@@ -151,7 +151,7 @@ def make_problem(
 def _check(problem: Problem, hparams: Hparams) -> None:
     require_own((problem, Problem), (hparams, Hparams))
     validation.integer(
-        "num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1
+        "num_envs times num_steps", hparams.num_envs * hparams.num_steps, limit=2**31 - 1
     )
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)

@@ -91,7 +91,7 @@ def make_problem(
             "episodes that never end: neither the environment nor horizon says after how many "
             "steps; give horizon, or with_time_limit(environment, num_steps)."
         )
-    horizon = validation.integer("horizon", horizon, least=1, most=2**31 - 1)
+    horizon = validation.integer("horizon", horizon, least=1, limit=2**31 - 1)
     if limit is not None:
         known = isinstance(limit, jax.Array)
         limit = jnp.asarray(
@@ -310,7 +310,7 @@ def rollout(
     both static. Sums over its first axis are those of trajectories.
     """
     require_own((state, State), (problem, Problem), (hparams, Hparams))
-    number = validation.integer("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
+    number = validation.integer("num_trajectories", num_trajectories, least=1, limit=2**31 - 1)
     return _rollout(
         require_key(key), state, problem, hparams, number, validation.boolean("sampled", sampled)
     )

@@ -101,7 +101,7 @@ def reach_avoid_sequences(
       [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
     depth, most = (
-        validation.integer(name, number, least=1, most=2**16)
+        validation.integer(name, number, least=1, limit=2**16)
         for name, number in (("depth", depth), ("most", most))
     )
     validation.instance("automaton", automaton, Automaton, "one of to_automaton")

@@ -102,21 +102,21 @@ def make_box(
     for name, bound in bounds.items():
         if bound.dtype.kind not in "biuf" or np.isnan(bound.astype(float)).any():
             raise ValueError(f"make_box: {name}={bound.tolist()!r}; give numbers.")
-    least, most = bounds.values()
+    least, greatest = bounds.values()
     try:
-        given = np.broadcast_shapes(least.shape, most.shape) if shape is None else shape
-        full = tuple(int(n) for n in given)
-        fits = np.broadcast_shapes(least.shape, most.shape, full) == full
+        whole = np.broadcast_shapes(least.shape, greatest.shape) if shape is None else shape
+        full = tuple(int(n) for n in whole)
+        fits = np.broadcast_shapes(least.shape, greatest.shape, full) == full
     except (TypeError, ValueError):
         fits, full = False, ()
     if not fits:
         raise ValueError(
-            f"make_box: bounds of shapes {list(least.shape)} and {list(most.shape)} do not fit the "
+            f"make_box: bounds of shapes {list(least.shape)} and {list(greatest.shape)} do not fit the "
             f"shape {shape}; give numbers, or arrays of that shape."
         )
-    if (least > most).any():
-        place = np.argwhere(least > most)[0].tolist()
-        where = f" at {place}" if place else f": {least} above {most}"
+    if (least > greatest).any():
+        place = np.argwhere(least > greatest)[0].tolist()
+        where = f" at {place}" if place else f": {least} above {greatest}"
         raise ValueError(f"make_box: low is above high{where}; exchange them.")
     try:
         kind = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
@@ -128,8 +128,8 @@ def make_box(
         raise ValueError(f"make_box: dtype={kind.name}; give a type of numbers.")
     if kind.kind in "biu":  # an infinite bound is that of the type
         ends = (0, 1) if kind.kind == "b" else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
-        least, most = (_clipped(x.astype(float), *ends).astype(kind) for x in (least, most))
-    return Box(least.astype(kind), most.astype(kind), full, kind.name)
+        least, greatest = (_clipped(x.astype(float), *ends).astype(kind) for x in (least, greatest))
+    return Box(least.astype(kind), greatest.astype(kind), full, kind.name)
 
 
 def as_array(values: ArrayLike) -> np.ndarray:
@@ -140,10 +140,12 @@ def as_array(values: ArrayLike) -> np.ndarray:
         return np.asarray(None)
 
 
-def _clipped(x: np.ndarray, least: int, most: int) -> np.ndarray:
+def _clipped(x: np.ndarray, least: int, greatest: int) -> np.ndarray:
     """Clips to integer bounds; 2^63 - 1 has no exact floating-point value."""
-    inside = (x > least) & (x < most)
-    return np.where(inside, np.where(inside, x, 0).astype(int), np.where(x > least, most, least))
+    inside = (x > least) & (x < greatest)
+    return np.where(
+        inside, np.where(inside, x, 0).astype(int), np.where(x > least, greatest, least)
+    )
 
 
 @brief
@@ -304,7 +306,7 @@ def make_environment(
     parts: dict[str, PyTree] = {
         name: None if f is None else as_partial(f, name) for name, f in functions.items()
     }
-    made = Environment(
+    environment = Environment(
         **parts,
         actions=actions,
         observations=observations,
@@ -312,16 +314,16 @@ def make_environment(
         horizon=horizon,
         ending=validation.choice("ending", options.get("ending", "repeat"), ENDINGS),
     )
-    seen = _check_functions(made)
+    seen = _check_functions(environment)
     if observations is None:
 
         def free(x: jax.Array) -> Box:
             return make_box(-np.inf, np.inf, x.shape, x.dtype)
 
-        made = replace(made, observations=jax.tree.map(free, seen))
-    elif not _alike(found := _described(_as_arrays(observations)), _described(seen)):
-        raise ValueError(f"observe returns {_described(seen)}, but observations is of {found}.")
-    return made
+        environment = replace(environment, observations=jax.tree.map(free, seen))
+    elif not _alike(declared := _described(_as_arrays(observations)), _described(seen)):
+        raise ValueError(f"observe returns {_described(seen)}, but observations is of {declared}.")
+    return environment
 
 
 def as_partial(function: Callable[..., PyTree], name: str = "function") -> Partial:
@@ -397,43 +399,43 @@ def allowed_in(environment: Environment, world: PyTree) -> jax.Array | None:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _check_functions(made: Environment) -> PyTree:
+def _check_functions(environment: Environment) -> PyTree:
     """Checks the shapes of all results; returns those of an observation."""
     key = jax.random.key(0)
-    world = traced("reset", made.reset, key)
-    seen = traced("observe", made.observe, world)
+    world = traced("reset", environment.reset, key)
+    seen = traced("observe", environment.observe, world)
     if not jax.tree.leaves(seen):
         raise ValueError("observe returns no array; return what the agent sees.")
-    found = traced("step", made.step, world, some_action(made.actions), key)
-    if not isinstance(found, tuple) or not 3 <= len(found) <= len(Timestep._fields):
+    step = traced("step", environment.step, world, some_action(environment.actions), key)
+    if not isinstance(step, tuple) or not 3 <= len(step) <= len(Timestep._fields):
         raise ValueError(
             f"step must return Timestep({', '.join(Timestep._fields)}), the last three if they are "
-            f"wanted; it returns {_described(found)}."
+            f"wanted; it returns {_described(step)}."
         )
-    found = Timestep(*found)
+    step = Timestep(*step)
     for name in Timestep._fields[1:]:
-        number = getattr(found, name)
+        number = getattr(step, name)
         if np.shape(number) != () or not (np.isscalar(number) or hasattr(number, "dtype")):
             raise ValueError(
                 f"step returns {name} of shape {list(np.shape(number))}; it must be "
                 "a scalar. Functions are of one trajectory: vmap them for more."
             )
     for name in ("terminated", "truncated"):
-        if not _is_bool(getattr(found, name)):
+        if not _is_bool(getattr(step, name)):
             raise ValueError(
-                f"step returns {name} as {getattr(found, name).dtype}; return a Boolean."
+                f"step returns {name} as {getattr(step, name).dtype}; return a Boolean."
             )
-    if not _alike(after := _described(found.world), before := _described(world)):
+    if not _alike(after := _described(step.world), before := _described(world)):
         raise ValueError(
             f"step returns the world {after}, but reset {before}; both must have the "
             "same structure, shapes and dtypes."
         )
-    require_labels(traced("labels", made.labels, world), made.propositions)
-    if made.allowed is not None:
-        if not isinstance(made.actions, Finite):
+    require_labels(traced("labels", environment.labels, world), environment.propositions)
+    if environment.allowed is not None:
+        if not isinstance(environment.actions, Finite):
             raise ValueError("allowed is for finitely many actions; clip those of a box in step.")
-        mask = traced("allowed", made.allowed, world)
-        require_shape("allowed(world)", mask, (made.actions.num,))
+        mask = traced("allowed", environment.allowed, world)
+        require_shape("allowed(world)", mask, (environment.actions.num,))
         if not _is_bool(mask):
             raise ValueError(f"allowed returns {mask.dtype}; return Booleans.")
     return seen
@@ -550,9 +552,9 @@ def reads_key(function: Callable[..., PyTree], *arguments: PyTree) -> bool:
     return any(marked_results(program, [False] * (len(program.invars) - count) + [True] * count))
 
 
-def marked_results(program: Jaxpr, given: list[bool]) -> list[bool]:
+def marked_results(program: Jaxpr, marked: list[bool]) -> list[bool]:
     """The results that may depend on marked arguments."""
-    marks = {id(x) for x, mark in zip(program.invars, given, strict=True) if mark}
+    marks = {id(x) for x, mark in zip(program.invars, marked, strict=True) if mark}
     for line in program.eqns:
         reads = [id(x) in marks for x in line.invars]
         if not any(reads):

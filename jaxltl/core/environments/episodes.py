@@ -153,21 +153,21 @@ def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: 
     >>> run(jax.random.key(0)).reward.tolist()
     [0.0, 1.0, 1.0]
     """
-    num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
+    num_steps = validation.integer("num_steps", num_steps, least=1, limit=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)
     begin, path = begin_episode(require_key(key), environment, agent)
 
     def move(now: Underway, time: jax.Array) -> tuple[Underway, Episode]:
         return continue_episode(now, environment, agent, jax.random.fold_in(path, time))
 
-    end, made = lax.scan(move, begin, jnp.arange(num_steps))
+    end, steps = lax.scan(move, begin, jnp.arange(num_steps))
 
     def append(row: PyTree, end: PyTree) -> PyTree:
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
-    return made._replace(
-        world=append(made.world, end.world),
-        label=append(made.label, environment.labels(end.world)),
+    return steps._replace(
+        world=append(steps.world, end.world),
+        label=append(steps.label, environment.labels(end.world)),
         terminated=end.terminated,
         truncated=end.truncated,
     )
@@ -198,13 +198,13 @@ def continue_episode(
     act_key, step_key = jax.random.split(key)
     observation, allowed = environment.observe(world), allowed_in(environment, world)
     action, memory = agent.act(now.memory, observation, allowed, act_key)
-    found = Timestep(*environment.step(world, action, step_key))
-    reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
-    discount = jnp.where(active, found.discount, 1.0)
-    after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
+    step = Timestep(*environment.step(world, action, step_key))
+    reward, cost = (jnp.where(active, x, 0.0) for x in (step.reward, step.cost))
+    discount = jnp.where(active, step.discount, 1.0)
+    after = jax.tree.map(lambda x, y: jnp.where(active, x, y), step.world, world)
     terminated, truncated = (
         t | (active & jnp.asarray(f, bool))
-        for t, f in ((now.terminated, found.terminated), (now.truncated, found.truncated))
+        for t, f in ((now.terminated, step.terminated), (now.truncated, step.truncated))
     )
     return Underway(after, memory, terminated, truncated), Episode(
         world,
@@ -242,10 +242,10 @@ def auto_reset_step(
     (0, 1)
     """
     step_key, reset_key = jax.random.split(key)
-    found = Timestep(*environment.step(world, action, step_key))
-    ended = jnp.asarray(found.terminated, bool) | jnp.asarray(found.truncated, bool)
+    step = Timestep(*environment.step(world, action, step_key))
+    ended = jnp.asarray(step.terminated, bool) | jnp.asarray(step.truncated, bool)
     fresh = environment.reset(reset_key)
-    return jax.tree.map(lambda x, y: jnp.where(ended, x, y), fresh, found.world), found
+    return jax.tree.map(lambda x, y: jnp.where(ended, x, y), fresh, step.world), step
 
 
 # --- time limits -------------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     >>> with_time_limit(environments.model_environment(gridworld("a b")), 10).horizon
     10
     """
-    num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
+    num_steps = validation.integer("num_steps", num_steps, least=1, limit=2**31 - 1)
     inner, limit = require_environment(environment), np.int32(num_steps)
     parts: dict[str, PyTree] = {n: optional(f, getattr(inner, n)) for n, f in _TIMED.items()}
     return replace(
@@ -304,9 +304,9 @@ def _step_clock(
     return _ticked(limit, Timestep(*step(timed[0], action, key)), timed[1] + 1)
 
 
-def _ticked(limit: jax.Array, found: Timestep, time: jax.Array) -> Timestep:
-    truncated = jnp.asarray(found.truncated, bool) | (time >= limit)
-    return found._replace(world=(found.world, time), truncated=truncated)
+def _ticked(limit: jax.Array, step: Timestep, time: jax.Array) -> Timestep:
+    truncated = jnp.asarray(step.truncated, bool) | (time >= limit)
+    return step._replace(world=(step.world, time), truncated=truncated)
 
 
 def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
@@ -317,9 +317,9 @@ def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
 def _clocked(
     limit: jax.Array, outcomes: Callable[..., PyTree], timed: PyTree, action: PyTree
 ) -> tuple[Timestep, jax.Array]:
-    found, probability = outcomes(timed[0], action)
+    step, probability = outcomes(timed[0], action)
     times = jnp.full(jnp.shape(probability), timed[1] + 1)
-    return _ticked(limit, Timestep(*found), times), probability
+    return _ticked(limit, Timestep(*step), times), probability
 
 
 def _of_first(function: Callable[..., PyTree], timed: PyTree) -> PyTree:

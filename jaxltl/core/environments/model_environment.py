@@ -159,9 +159,9 @@ def _outcomes_of_two(
 ) -> tuple[Timestep, jax.Array]:
     weight = jax.nn.softmax(jnp.asarray(opponent)[state])
     weight = jnp.where(jnp.asarray(system)[state], jnp.arange(len(weight)) == action, weight)
-    found, probability = jax.vmap(lambda a: outcomes(state, a))(jnp.arange(len(weight)))
-    found = Timestep(found.world.ravel(), found.reward.ravel(), terminated=jnp.bool_(False))
-    return found, (weight[:, None] * probability).ravel()
+    outcome, probability = jax.vmap(lambda a: outcomes(state, a))(jnp.arange(len(weight)))
+    outcome = Timestep(outcome.world.ravel(), outcome.reward.ravel(), terminated=jnp.bool_(False))
+    return outcome, (weight[:, None] * probability).ravel()
 
 
 def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:

@@ -149,8 +149,8 @@ def sequence_sampler(
     ((2, 4), False)
     """
     rows = {"length": length, "reach": reach, "avoid": avoid}
-    found = {name: validation.float_array(name, row) for name, row in rows.items()}
-    for name, row in found.items():
+    checked = {name: validation.float_array(name, row) for name, row in rows.items()}
+    for name, row in checked.items():
         if row.ndim != 1 or not (np.isfinite(row) & (row >= 0)).all() or not row.sum() > 0:
             raise ValueError(
                 f"{name}={row.tolist()}; give weights of one axis, none of them "
@@ -165,13 +165,15 @@ def sequence_sampler(
     groups = np.eye(groups.size, dtype=bool)[groups] if groups.ndim == 1 else groups
     for row in first_true(~groups.any(-1)):
         raise ValueError(f"sets: row {row} has no event; leave it out.")
-    most = int(np.flatnonzero(found["reach"])[-1]) + 1 + int(np.flatnonzero(found["avoid"])[-1])
-    if most > len(groups):
+    num_sets = (
+        int(np.flatnonzero(checked["reach"])[-1]) + 1 + int(np.flatnonzero(checked["avoid"])[-1])
+    )
+    if num_sets > len(groups):
         raise ValueError(
-            f"reach and avoid ask for up to {most} sets in a step, but there are "
+            f"reach and avoid ask for up to {num_sets} sets in a step, but there are "
             f"{len(groups)}; give fewer weights."
         )
-    return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
+    return SequenceSampler(checked["length"], checked["reach"], checked["avoid"], groups)
 
 
 def draw_sequence(key: Key, sampler: SequenceSampler) -> Sequence:
@@ -267,8 +269,10 @@ def remaining(sequence: Sequence, index: Numeric) -> Sequence:
     """The sequence after `index` completed steps."""
     depth = sequence.reach.shape[-2]
     row = jnp.arange(depth) + index
-    kept, row = (row < depth)[:, None], jnp.minimum(row, depth - 1)
-    return Sequence(sequence.reach[row] & kept, sequence.avoid[row] & kept, sequence.length - index)
+    within, row = (row < depth)[:, None], jnp.minimum(row, depth - 1)
+    return Sequence(
+        sequence.reach[row] & within, sequence.avoid[row] & within, sequence.length - index
+    )
 
 
 def _read(
@@ -287,12 +291,12 @@ def _reset(
     inner: Environment, events: jax.Array, sampler: SequenceSampler, key: Key
 ) -> SequenceWorld:
     world_key, key = jax.random.split(key)
-    found = _read(inner, events, inner.reset(world_key), draw_sequence(key, sampler), jnp.int32(0))
+    state = _read(inner, events, inner.reset(world_key), draw_sequence(key, sampler), jnp.int32(0))
     # A sequence that the first event decides starts again, since an episode has at least one step.
-    over = found.verdict != Verdict.UNDECIDED
-    return found._replace(
-        stage=jnp.where(over, 0, found.stage),
-        verdict=jnp.where(over, Verdict.UNDECIDED, found.verdict).astype(jnp.int32),
+    over = state.verdict != Verdict.UNDECIDED
+    return state._replace(
+        stage=jnp.where(over, 0, state.stage),
+        verdict=jnp.where(over, Verdict.UNDECIDED, state.verdict).astype(jnp.int32),
     )
 
 
@@ -304,8 +308,8 @@ def _step(
     action: PyTree,
     key: Key,
 ) -> Timestep:
-    found = Timestep(*inner.step(state.world, action, key))
-    after = _read(inner, events, found.world, state.sequence, state.stage)
+    step = Timestep(*inner.step(state.world, action, key))
+    after = _read(inner, events, step.world, state.sequence, state.stage)
     violation, progress = numbers
     reward = (
         (after.verdict == Verdict.SATISFIED)
@@ -315,10 +319,10 @@ def _step(
     return Timestep(
         world=after,
         reward=reward.astype(jnp.result_type(float)),
-        terminated=jnp.asarray(found.terminated, bool) | (after.verdict != Verdict.UNDECIDED),
-        truncated=found.truncated,
-        cost=found.cost,
-        discount=found.discount,
+        terminated=jnp.asarray(step.terminated, bool) | (after.verdict != Verdict.UNDECIDED),
+        truncated=step.truncated,
+        cost=step.cost,
+        discount=step.discount,
     )
 
 

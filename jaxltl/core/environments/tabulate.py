@@ -123,7 +123,7 @@ def tabulate(
     """
     inner, limit = without_time_limit(environment)
     max_states = validation.integer("max_states", max_states, least=1)
-    num_keys = validation.integer("num_keys", num_keys, least=1, most=2**20)
+    num_keys = validation.integer("num_keys", num_keys, least=1, limit=2**20)
     if not isinstance(inner.actions, Finite):
         raise ValueError("tabulate: the actions are a box; only finitely many can be listed.")
     key = jax.random.key(0) if key is None else require_key(key)
@@ -309,22 +309,25 @@ def _left_out_is_idle(kind: _Kind) -> bool:
     environment = kind.environment
 
     def listed(world: PyTree, action: PyTree, key: Key) -> PyTree:
-        found = Timestep(*environment.step(world, action, key))
+        step = Timestep(*environment.step(world, action, key))
         declared = None
         if environment.outcomes is not None:
             each, probability = environment.outcomes(world, action)
             declared = jax.vmap(kind.distinct)(each[0]), tuple(each)[1:5], probability
         mask = allowed_in(environment, world)
-        return kind.distinct(found.world), found[1:5], declared, mask, environment.labels(world)
+        return kind.distinct(step.world), step[1:5], declared, mask, environment.labels(world)
 
-    shown = jax.make_jaxpr(kind.distinct)(kind.like).jaxpr
-    kept = {id(x) for x in shown.outvars}  # as they are; of a part of an array nothing is known
-    left = [id(x) not in kept for x in shown.invars]
-    if not any(left):
+    kept_program = jax.make_jaxpr(kind.distinct)(kind.like).jaxpr
+    # Variables that are returned as they are; nothing is known of parts of an array.
+    unchanged = {id(x) for x in kept_program.outvars}
+    changing = [id(x) not in unchanged for x in kept_program.invars]
+    if not any(changing):
         return True
     action = jax.ShapeDtypeStruct((), jnp.int32)
     program = jax.make_jaxpr(listed)(kind.like, action, kind.keys[0]).jaxpr
-    return not any(marked_results(program, left + [False] * (len(program.invars) - len(left))))
+    return not any(
+        marked_results(program, changing + [False] * (len(program.invars) - len(changing)))
+    )
 
 
 # --- the search -----------------------------------------------------------------------------------
@@ -355,27 +358,27 @@ class _Listed(NamedTuple):
     evidence: str
 
 
-def _ended(found: Timestep) -> jax.Array:
-    cut = jnp.where(jnp.asarray(found.truncated, bool), _TRUNCATED, _LIVE)
-    return jnp.where(jnp.asarray(found.terminated, bool), _TERMINATED, cut).astype(jnp.uint8)
+def _ended(step: Timestep) -> jax.Array:
+    cut = jnp.where(jnp.asarray(step.truncated, bool), _TRUNCATED, _LIVE)
+    return jnp.where(jnp.asarray(step.terminated, bool), _TERMINATED, cut).astype(jnp.uint8)
 
 
 def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
     """The successors of one state, by action."""
     environment = kind.environment
 
-    def seen(found: Timestep) -> jax.Array:
-        return jnp.append(_seen(kind, found.world), _ended(found))
+    def seen(step: Timestep) -> jax.Array:
+        return jnp.append(_seen(kind, step.world), _ended(step))
 
     def one(action: PyTree) -> _Followers:
         def draw(key: Key) -> Timestep:
-            found = Timestep(*environment.step(world, action, key))
-            return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
+            step = Timestep(*environment.step(world, action, key))
+            return Timestep(*jax.tree.map(jnp.asarray, tuple(step)))
 
         tries = jax.vmap(draw)(kind.keys[:draws])
         drawn = jax.vmap(seen)(tries)
         if environment.outcomes is None:
-            found, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
+            step, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
             paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
             drawn = jnp.concatenate([drawn, paid], axis=-1)
         else:
@@ -384,14 +387,14 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
             rest = [
                 jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in tuple(declared)[1:]
             ]
-            found = Timestep(declared[0], *rest)
+            step = Timestep(declared[0], *rest)
         return _Followers(
-            _plain(found.world),
-            jax.vmap(environment.labels)(found.world),
-            jax.vmap(seen)(found),
+            _plain(step.world),
+            jax.vmap(environment.labels)(step.world),
+            jax.vmap(seen)(step),
             probability,
-            found.reward,
-            found.cost,
+            step.reward,
+            step.cost,
             jnp.bool_(True),
             drawn,
         )
@@ -433,22 +436,22 @@ def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
     while (count := len(jax.tree.leaves(frontier)[0])) > 0:
         new = []
         for rows, batch in _batches(frontier, count, size):
-            found = jax.tree.map(
+            followers = jax.tree.map(
                 lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch)
             )
-            _check(found, sum(len(x.allowed) for x in parts), evidence == "declared")
-            real = found.allowed[..., None] & (found.probability > 0)
+            _check(followers, sum(len(x.allowed) for x in parts), evidence == "declared")
+            real = followers.allowed[..., None] & (followers.probability > 0)
             before, places = len(ended), np.zeros(real.shape, np.int64)
-            places[real], first = _numbered(_rows(found.seen)[real], number, ended)
+            places[real], first = _numbered(_rows(followers.seen)[real], number, ended)
             if len(ended) > max_states:
                 raise ValueError(
                     f"tabulate: there are more than max_states={max_states} worlds. Allow more, "
                     "take less into a world, or say by distinct= what of it matters."
                 )
             successor.append(places)
-            parts.append(found._replace(world=None, label=None, seen=None, drawn=None))
+            parts.append(followers._replace(world=None, label=None, seen=None, drawn=None))
             listed.append(
-                jax.tree.map(lambda x, r=real, f=first: x[r][f], (found.world, found.label))
+                jax.tree.map(lambda x, r=real, f=first: x[r][f], (followers.world, followers.label))
             )
             going = np.array(ended[before:], int) == _LIVE
             new.append(jax.tree.map(lambda x, g=going: x[g], listed[-1][0]))
@@ -484,40 +487,42 @@ def _numbered(
     place, new = np.empty(len(unique), np.int64), []
     for i in order:
         code = unique[i].tobytes()
-        if (found := number.get(code)) is None:
-            found = number[code] = len(ended)
+        if (index := number.get(code)) is None:
+            index = number[code] = len(ended)
             ended.append(code[-1])
             new.append(first[i])
-        place[i] = found
+        place[i] = index
     return place[inverse.reshape(-1)], np.array(new, np.int64)
 
 
-def _check(found: _Followers, base: int, declared: bool) -> None:
+def _check(followers: _Followers, base: int, declared: bool) -> None:
     """Refuses undeclared randomness, disagreeing distributions and states without actions."""
-    stuck = np.flatnonzero(~found.allowed.any(axis=1))
+    stuck = np.flatnonzero(~followers.allowed.any(axis=1))
     if stuck.size:
         raise ValueError(
             f"tabulate: no action is allowed in world {base + stuck[0]}, counted in "
             "the order of the search; end the episode there."
         )
-    drawn = _rows(found.drawn)  # [B, A, N]
+    drawn = _rows(followers.drawn)  # [B, A, N]
     if declared:
-        sums = found.probability.sum(axis=-1, dtype=np.float64)
-        bad = ((np.abs(sums - 1) > 1e-5) | (found.probability < 0).any(axis=-1)) & found.allowed
+        sums = followers.probability.sum(axis=-1, dtype=np.float64)
+        bad = (
+            (np.abs(sums - 1) > 1e-5) | (followers.probability < 0).any(axis=-1)
+        ) & followers.allowed
         for b, a in first_true(bad):
             raise ValueError(
                 f"outcomes: of action {a} in world {base + b} the probabilities are "
-                f"{found.probability[b, a].tolist()}; they must be a distribution."
+                f"{followers.probability[b, a].tolist()}; they must be a distribution."
             )
-        seen = _rows(found.seen)
-        known = (drawn[..., None] == seen[:, :, None]) & (found.probability > 0)[:, :, None]
-        for b, a in first_true(~known.any(axis=-1).all(axis=-1) & found.allowed):
+        seen = _rows(followers.seen)
+        known = (drawn[..., None] == seen[:, :, None]) & (followers.probability > 0)[:, :, None]
+        for b, a in first_true(~known.any(axis=-1).all(axis=-1) & followers.allowed):
             raise ValueError(
                 f"outcomes: action {a} in world {base + b} leads to a world that they do not tell; "
                 "give every world to which the step may lead, with how the episode ends there."
             )
         return
-    for b, a in first_true((drawn != drawn[..., :1]).any(axis=-1) & found.allowed):
+    for b, a in first_true((drawn != drawn[..., :1]).any(axis=-1) & followers.allowed):
         raise ValueError(
             f"tabulate: step is random: action {a} in world {base + b} leads to "
             f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "

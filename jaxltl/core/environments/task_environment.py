@@ -163,12 +163,12 @@ def make_task_tables(
     pay = make_task_reward(automaton, decisions, **cast(RewardOptions, reward_options))
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
-    shown = None if embedding is None else validation.float_array("embedding", embedding)
-    if shown is not None and (
-        shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"
+    features = None if embedding is None else validation.float_array("embedding", embedding)
+    if features is not None and (
+        features.ndim < 2 or len(features) != len(decisions) or features.dtype.kind not in "biuf"
     ):
         raise ValueError(
-            f"embedding has shape {list(shown.shape)} and type {shown.dtype}; give numbers "
+            f"embedding has shape {list(features.shape)} and type {features.dtype}; give numbers "
             f"[{len(decisions)}, ...], a row for each state of the automaton."
         )
     number = jnp.result_type(float)
@@ -189,7 +189,7 @@ def make_task_tables(
         decided=pay.decided.astype(number),
         potential=pay.potential.astype(number),
         learner_discount=np.asarray(options.get("learner_discount", 1.0), number),
-        embedding=None if shown is None else shown.astype(number),
+        embedding=None if features is None else features.astype(number),
         state_names=automaton.state_names,
     )
 
@@ -253,8 +253,8 @@ def task_environment(
     """
     environment = require_environment(environment)
     names = environment.propositions if propositions is None else propositions
-    kept = ("reset", "step", "observe", "actions", "allowed", "observations", "horizon", "starts")
-    others: dict[str, PyTree] = {name: getattr(environment, name) for name in kept}
+    copied = ("reset", "step", "observe", "actions", "allowed", "observations", "horizon", "starts")
+    others: dict[str, PyTree] = {name: getattr(environment, name) for name in copied}
     inner = make_environment(
         **others,
         outcomes=environment.outcomes,
@@ -283,12 +283,12 @@ def with_task_tables(environment: Environment, tables: TaskTables) -> Environmen
     """The task environment with another task over the same propositions; runs under ``jit`` and ``vmap``."""
     task_tables(environment)
     validation.instance("tables", tables, TaskTables, "those of make_task_tables")
-    made: PyTree = environment
+    tasked: PyTree = environment
     parts: dict[str, PyTree] = {
-        name: None if (part := getattr(made, name)) is None else part.args[-1]
+        name: None if (part := getattr(tasked, name)) is None else part.args[-1]
         for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
     }
-    return _beside(replace(environment, **parts, observations=made.observations.world), tables)
+    return _beside(replace(environment, **parts, observations=tasked.observations.world), tables)
 
 
 def task_tables(environment: Environment) -> TaskTables:
@@ -334,15 +334,15 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
     if not environments:
         raise ValueError("there is no environment; give at least one.")
     padded = _padded([task_tables(e) for e in environments])
-    made = [with_task_tables(e, t) for e, t in zip(environments, padded, strict=True)]
-    shapes = [_structure(e) for e in made]
+    tasked = [with_task_tables(e, t) for e, t in zip(environments, padded, strict=True)]
+    shapes = [_structure(e) for e in tasked]
     for number, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
                 f"environments 0 and {number} are worlds of different structure: their functions, "
                 "spaces, propositions, horizons and shapes of arrays must be the same."
             )
-    return _stacked(made)
+    return _stacked(tasked)
 
 
 def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree) -> str:
@@ -444,29 +444,29 @@ def _outcomes(
     timesteps, probability = outcomes(before.world, action)
     timesteps = Timestep(*timesteps)
     rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in timesteps[1:])
-    return jax.vmap(lambda found: _read_on(tables, labels, before, found))(
+    return jax.vmap(lambda step: _read_on(tables, labels, before, step))(
         Timestep(timesteps.world, *rest)
     ), probability
 
 
 def _read_on(
-    tables: TaskTables, labels: Callable[..., PyTree], before: TaskWorld, found: Timestep
+    tables: TaskTables, labels: Callable[..., PyTree], before: TaskWorld, step: Timestep
 ) -> Timestep:
     """A step of the product, from a step of the environment."""
     tables = jax.tree.map(jnp.asarray, tables)
-    reading = before.memory, _read(tables, labels(found.world))
+    reading = before.memory, _read(tables, labels(step.world))
     memory, accepted = tables.delta[reading], tables.accepting[reading]
-    over, verdict = jnp.asarray(found.terminated, bool), tables.verdict[memory]
+    over, verdict = jnp.asarray(step.terminated, bool), tables.verdict[memory]
     at_end = tables.repeated[memory, reading[1]]
     verdict = jnp.where(over & (verdict == Verdict.UNDECIDED), at_end, verdict)
     decided = verdict != Verdict.UNDECIDED
     terminated = over | decided
-    discount = found.discount * tables.discount[reading]
+    discount = step.discount * tables.discount[reading]
     # Ng, Harada & Russell 1999; the potential after the end is zero.
     after = jnp.where(terminated, 0, tables.learner_discount * discount * tables.potential[memory])
     reward = jnp.where(decided, tables.decided[verdict], tables.reward[reading])
-    world = TaskWorld(found.world, memory, verdict, accepted, before.visits + accepted)
-    return found._replace(
+    world = TaskWorld(step.world, memory, verdict, accepted, before.visits + accepted)
+    return step._replace(
         world=world,
         reward=reward + after - tables.potential[before.memory],
         terminated=terminated,

@@ -197,8 +197,8 @@ def _potential(
             never = np.full(len(delta), np.inf)
             steps = _distance(delta, cost, never, np.where(accepting, cost, np.inf))
         known = np.isfinite(steps)
-        most = max(steps[known].max(initial=0), 1)
-        share: np.ndarray = np.where(known, steps, most) / most
+        longest = max(steps[known].max(initial=0), 1)
+        share: np.ndarray = np.where(known, steps, longest) / longest
         return share if name == "keep" else 1 - share
     table = np.asarray(shaping)
     if (

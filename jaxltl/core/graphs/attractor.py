@@ -180,13 +180,13 @@ def surely(
         return attract(graph, goal, allowed & graph.forall(~outside))
 
     def body(carry: PyTree) -> PyTree:
-        found, _ = carry
-        smaller = inner(found.region)
-        return smaller, graph.xp.any(smaller.region != found.region)
+        attractor, _ = carry
+        smaller = inner(attractor.region)
+        return smaller, graph.xp.any(smaller.region != attractor.region)
 
-    found = attract(graph, goal, allowed) if reaching is None else reaching
+    start = attract(graph, goal, allowed) if reaching is None else reaching
     # A state that cannot reach the goal at all is what removes others.
-    result: Attractor = graph.repeat(body, (found, ~graph.xp.all(found.region)))[0]
+    result: Attractor = graph.repeat(body, (start, ~graph.xp.all(start.region)))[0]
     return result
 
 

@@ -33,18 +33,18 @@ def components_by_sweeps(
         inside = (graph.least(label) == label[..., None]) & (
             -graph.least(-label) == label[..., None]
         )
-        kept = stay & inside
-        return kept, label, jnp.any(kept != stay)
+        moves = stay & inside
+        return moves, label, jnp.any(moves != stay)
 
     start = stay, jnp.zeros(core.shape, jnp.int32), jnp.bool_(True)
     if closed:
-        kept, label, _ = prune(start)
-        left = graph.anywhere(jnp.any(kept != stay, axis=-1), label)
-        kept = stay & ~left[..., None]
+        moves, label, _ = prune(start)
+        removed = graph.anywhere(jnp.any(moves != stay, axis=-1), label)
+        moves = stay & ~removed[..., None]
     else:
-        kept, label, _ = lax.while_loop(lambda carry: carry[2], prune, start)
-    alive = jnp.any(kept, axis=-1)
-    return jnp.where(alive, label, state_numbers(core.shape)), kept
+        moves, label, _ = lax.while_loop(lambda carry: carry[2], prune, start)
+    alive = jnp.any(moves, axis=-1)
+    return jnp.where(alive, label, state_numbers(core.shape)), moves
 
 
 def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax.Array:
@@ -52,36 +52,36 @@ def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax
     number = state_numbers(states.shape)
     none = jnp.int32(number.size)
 
-    def colour(rank: jax.Array, left: jax.Array) -> jax.Array:
-        def spread(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def colour(rank: jax.Array, undecided: jax.Array) -> jax.Array:
+        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             colour, _ = carry
             ahead = jnp.min(jnp.where(moves, graph.least(colour), none), axis=-1)
-            new = jnp.where(left, jnp.minimum(colour, ahead), none)
+            new = jnp.where(undecided, jnp.minimum(colour, ahead), none)
             return new, jnp.any(new != colour)
 
-        start = jnp.where(left, rank, none), jnp.bool_(True)
-        return lax.while_loop(lambda carry: carry[1], spread, start)[0]
+        start = jnp.where(undecided, rank, none), jnp.bool_(True)
+        return lax.while_loop(lambda carry: carry[1], grow, start)[0]
 
-    def reached(colours: jax.Array, root: jax.Array, left: jax.Array) -> jax.Array:
-        def spread(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            found, _ = carry
-            sent = jnp.where(moves & found[..., None], (colours + 1)[..., None], 0)
+    def reached(colours: jax.Array, root: jax.Array, undecided: jax.Array) -> jax.Array:
+        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            region, _ = carry
+            sent = jnp.where(moves & region[..., None], (colours + 1)[..., None], 0)
             # Colours do not decrease along edges, so the greatest one that arrives is the state's
             # own, if that one arrives.
-            new = found | (
-                left & (operators.greatest_predecessor(graph.model, sent) == colours + 1)
+            new = region | (
+                undecided & (operators.greatest_predecessor(graph.model, sent) == colours + 1)
             )
-            return new, jnp.any(new != found)
+            return new, jnp.any(new != region)
 
-        return lax.while_loop(lambda carry: carry[1], spread, (root, jnp.bool_(True)))[0]
+        return lax.while_loop(lambda carry: carry[1], grow, (root, jnp.bool_(True)))[0]
 
     def body(carry: PyTree) -> PyTree:
-        label, left, forward = carry
+        label, undecided, forward = carry
         rank = jnp.where(forward, number, none - 1 - number)
-        colours = colour(rank, left)
-        found = reached(colours, left & (colours == rank), left)
+        colours = colour(rank, undecided)
+        region = reached(colours, undecided & (colours == rank), undecided)
         root = jnp.where(forward, colours, none - 1 - colours)
-        return jnp.where(found, root, label), left & ~found, ~forward
+        return jnp.where(region, root, label), undecided & ~region, ~forward
 
     label, _, _ = lax.while_loop(
         lambda carry: jnp.any(carry[1]), body, (number, states, jnp.bool_(True))

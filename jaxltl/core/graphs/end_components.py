@@ -104,7 +104,7 @@ def accepting_end_components(model: Product) -> Accepting:
     priority = take(graph, model.automaton.priority)
     everywhere = xp.ones(graph.state_shape, bool)
 
-    def body(half: Array, found: Accepting) -> Accepting:
+    def body(half: Array, accepting: Accepting) -> Accepting:
         least = 2 * half
         allowed = available & ~graph.reads(priority < least)
         components = components_within(graph, everywhere, allowed)
@@ -113,12 +113,12 @@ def accepting_end_components(model: Product) -> Accepting:
         wins = graph.anywhere(hit, components.component) & graph.first(components.inside)[0]
         towards = attract(graph, hit, components.inside).action
         action = xp.where(hit, action, towards)
-        new = wins & ~found.region
+        new = wins & ~accepting.region
         return Accepting(
-            found.region | new,
-            xp.where(new, action, found.action),
-            found.inside | (components.inside & new[..., None]),
-            xp.where(new, least, found.least).astype(np.int32),
+            accepting.region | new,
+            xp.where(new, action, accepting.action),
+            accepting.inside | (components.inside & new[..., None]),
+            xp.where(new, least, accepting.least).astype(np.int32),
         )
 
     nothing = xp.zeros(graph.state_shape, np.int32)

@@ -64,8 +64,8 @@ class TracedGraph:
 
     def least(self, value: jax.Array) -> jax.Array:
         """The smallest value among the successors: ``[S, A]``; the dtype's largest without any."""
-        found = operators.least_successor(self.model, value)
-        return jnp.where(self.available, found, kernels.dtype_max(value.dtype))
+        least = operators.least_successor(self.model, value)
+        return jnp.where(self.available, least, kernels.dtype_max(value.dtype))
 
     def reads(self, marked: jax.Array) -> jax.Array:
         """Mask of actions that may read a marked transition of the automaton: ``bool[S, Q, A]``."""

@@ -298,14 +298,14 @@ def interval_rows(
             f"{upper.shape}; all must be [transitions]."
         )
     starts, entry_start = checked_rows(row_start, entry_start, successor.size)
-    given = _ball(center, radius, successor.shape, entry_start.size - 1)
+    ball_rows = _ball(center, radius, successor.shape, entry_start.size - 1)
     check_entries(starts, entry_start, successor, np.ones(successor.size))
     if rewards is not None and not isinstance(rewards, Mapping):
         raise ValueError(
             f"rewards is {validation.shorten(rewards)}; give a dict of Rewards by name."
         )
     rows, rewards = _merged(
-        _Rows(starts, entry_start, successor, lower, upper, *given), dict(rewards or {})
+        _Rows(starts, entry_start, successor, lower, upper, *ball_rows), dict(rewards or {})
     )
     rows = _pointed(_around(_scaled(rows)))
     ball = None if rows.center is None else Ball(rows.center, rows.radius / 2)
@@ -362,8 +362,8 @@ def _ball(
     if center is None and radius is None:
         return None, None
     if center is None or radius is None:
-        given = "radius" if center is None else "center"
-        raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
+        missing = "radius" if center is None else "center"
+        raise ValueError(f"{missing} is given alone; a ball has a center and a radius.")
     center = validation.float_array("center", center)
     radius = validation.float_array("radius", radius)
     if center.shape != entries or radius.shape != (num_rows,):
@@ -471,12 +471,12 @@ def _around(rows: _Rows) -> _Rows:
         np.minimum(radius, 2),
     )
     half = (radius / 2)[row]
-    least, most = (_outwards(center, side * half, side) for side in (-1, 1))
+    least, greatest = (_outwards(center, side * half, side) for side in (-1, 1))
     least = np.where((half > 0) & (least <= 4 * rows.rounding[row]), 0, least)
     return replace(
         rows,
         lower=np.maximum(lower, least),
-        upper=np.minimum(upper, most),
+        upper=np.minimum(upper, greatest),
         center=center,
         radius=radius,
     )

@@ -251,12 +251,12 @@ def letters_by_state(world: LabelledModel, letter: np.ndarray) -> jax.Array:
 
 
 def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
-    shown = {p for p, holds in zip(automaton.propositions, row, strict=True) if holds}
+    propositions = {p for p, holds in zip(automaton.propositions, row, strict=True) if holds}
     try:
-        return letter_index(automaton, shown)
+        return letter_index(automaton, propositions)
     except ValueError as error:
         raise ValueError(
-            f"world state {state} shows the letter {{{', '.join(sorted(shown))}}}, which the "
+            f"world state {state} shows the letter {{{', '.join(sorted(propositions))}}}, which the "
             "automaton was not built for; translate with letters=occurring_letters(world)."
         ) from error
 
@@ -272,8 +272,8 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    found = operators.combined(model.mdp, here, kernels.positive_hits, jnp.logical_or)
-    return found & model.available
+    hit = operators.combined(model.mdp, here, kernels.positive_hits, jnp.logical_or)
+    return hit & model.available
 
 
 def read_probability(model: Product, marked: jax.Array) -> jax.Array:
@@ -281,8 +281,8 @@ def read_probability(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T.astype(model.dtype)
     if model.label_on == "exit":
         return here[:, :, None] * model.available
-    found = operators.combined(model.mdp, here, jnp.multiply, jnp.add)
-    return found * model.available
+    probability = operators.combined(model.mdp, here, jnp.multiply, jnp.add)
+    return probability * model.available
 
 
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
@@ -341,8 +341,8 @@ def _(model: Product) -> tuple[jax.Array, jax.Array]:
 
 @operators.unpadded_states.register
 def _(model: Product) -> Array:
-    found: Array = operators.unpadded_states(model.mdp)
-    return found if found is True else found[:, None]
+    states: Array = operators.unpadded_states(model.mdp)
+    return states if states is True else states[:, None]
 
 
 @operators.greatest_predecessor.register

@@ -490,17 +490,17 @@ def _checked_rewards(
         raise ValueError(f"reward {name!r} is {validation.shorten(reward)}; give Rewards.")
     parts: dict[str, Array] = {}
     for part, size, first in zip(("state", "choice", "transition"), sizes, begins, strict=True):
-        given = getattr(reward, part)
-        if given is None:
+        array = getattr(reward, part)
+        if array is None:
             continue
-        given = validation.float_array(f"reward {name!r}", given)
-        if given.shape != (size,):
+        array = validation.float_array(f"reward {name!r}", array)
+        if array.shape != (size,):
             raise ValueError(
-                f"reward {name!r} has shape {given.shape} on its {part} part; expected ({size},)."
+                f"reward {name!r} has shape {array.shape} on its {part} part; expected ({size},)."
             )
-        for place in first_true(np.isnan(given)):
+        for place in first_true(np.isnan(array)):
             raise ValueError(f"reward {name!r} is NaN at {part} {first + place}; give a number.")
-        parts[part] = given
+        parts[part] = array
     return Rewards(**parts)
 
 
@@ -542,7 +542,7 @@ def _canonical(
     new[1:] = (row[1:] != row[:-1]) | (target[1:] != target[:-1])
     start = np.flatnonzero(new)
     merged = np.add.reduceat(weight, start) if start.size else weight
-    found = {}
+    arrays = {}
     for name, reward in rewards.items():
         if reward.transition is not None:
             earned = np.add.reduceat(weight * reward.transition[order], start) / merged
@@ -551,13 +551,13 @@ def _canonical(
             reward = replace(
                 reward, transition=np.where(alone, reward.transition[order][start], earned)
             )
-        found[name] = reward
+        arrays[name] = reward
     count = np.bincount(row[start], minlength=entry_start.size - 1)
     for empty in first_true(count == 0):
         place = placed(row_start, empty, state)
         raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
     starts = offsets_from_counts(count).astype(index)
-    return starts, target[start].astype(np.int32), merged, found
+    return starts, target[start].astype(np.int32), merged, arrays
 
 
 def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> np.ndarray:

@@ -112,48 +112,48 @@ def make_trajectories(
                     f"available are {np.flatnonzero(available[s]).tolist()}."
                 )
             state[n, t], action[n, t] = s, a
-    given = (state, action, np.asarray(length, np.int32))
-    _check_steps(model, *given)
-    state, action, length = to_jax(given)
+    steps = (state, action, np.asarray(length, np.int32))
+    _check_steps(model, *steps)
+    state, action, length = to_jax(steps)
     return Trajectories(state, action, length, state_shape=model.state_shape)
 
 
-def _pairs(given: Sequence[tuple[int, int]], number: int) -> np.ndarray:
+def _pairs(trajectory: Sequence[tuple[int, int]], number: int) -> np.ndarray:
     """One trajectory as ``int[T, 2]``."""
-    if not len(given):
+    if not len(trajectory):
         raise ValueError(f"trajectory {number} is empty; give at least one (state, action) pair.")
     with contextlib.suppress(ValueError):  # ragged
-        pairs = np.asarray(given)
-        if pairs.shape == (len(given), 2) and pairs.dtype.kind in "iu":
+        pairs = np.asarray(trajectory)
+        if pairs.shape == (len(trajectory), 2) and pairs.dtype.kind in "iu":
             return pairs
-    for t, pair in enumerate(given):
-        found = f"trajectory {number}, step {t} is {validation.shorten(pair)}"
+    for t, pair in enumerate(trajectory):
+        place = f"trajectory {number}, step {t} is {validation.shorten(pair)}"
         if np.shape(pair) == (3,):
             raise ValueError(
-                f"{found}; give (state, action) alone: the next pair has the successor's state."
+                f"{place}; give (state, action) alone: the next pair has the successor's state."
             )
         if np.shape(pair) == (2,) and np.asarray(pair).dtype.kind == "f":
-            raise ValueError(f"{found}; give integers: [(int(s), int(a)) for s, a in pairs].")
+            raise ValueError(f"{place}; give integers: [(int(s), int(a)) for s, a in pairs].")
         if np.shape(pair) != (2,) or np.asarray(pair).dtype.kind not in "iu":
-            raise ValueError(f"{found}; give a pair of integers, (state, action).")
+            raise ValueError(f"{place}; give a pair of integers, (state, action).")
     raise ValueError(
-        f"trajectory {number} is {validation.shorten(given)}; give (state, action) pairs."
+        f"trajectory {number} is {validation.shorten(trajectory)}; give (state, action) pairs."
     )
 
 
 def require_states(trajectories: Trajectories, model: Model) -> None:
     """Raises ValueError for trajectories of a model with other states."""
-    expected, found = model.state_shape, trajectories.state_shape
-    if found is not None and found != expected:
+    expected, actual = model.state_shape, trajectories.state_shape
+    if actual is not None and actual != expected:
         hint = ""
-        if len(found) > len(expected):
+        if len(actual) > len(expected):
             hint = "; project_trajectories(product, trajectories) leaves out the memory"
-        elif len(found) < len(expected):
+        elif len(actual) < len(expected):
             hint = "; lift_trajectories(product, trajectories) adds the memory"
         raise ValueError(
-            f"the trajectories belong to a model of shape {found}; expected {expected}{hint}."
+            f"the trajectories belong to a model of shape {actual}; expected {expected}{hint}."
         )
-    if found is None and not is_traced(trajectories):
+    if actual is None and not is_traced(trajectories):
         state = np.where(trajectories.mask, trajectories.state, 0)
         for n, t in first_true((state < 0) | (state >= model.num_states)):
             raise ValueError(

@@ -127,8 +127,8 @@ def _first_numbers(weight: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def _table(name: str, values: NDArray[np.integer]) -> str:
-    most = int(values.max(initial=0))
-    bits = next(b for b in (8, 16, 32) if most < 2**b)
+    greatest = int(values.max(initial=0))
+    bits = next(b for b in (8, 16, 32) if greatest < 2**b)
     size = "".join(f"[{n}]" for n in values.shape)
     return f"static const uint{bits}_t {name}{size} = {_braces(values.tolist())};"
 

@@ -201,8 +201,8 @@ def evaluation_of(
     early = None
     if discount is not None:
         # All readings accepting, the first label's included.
-        most = (1 - discount ** (num_steps + 1)) / (1 - discount)
-        early = bounded(totals.discounted_visits, 0, most)
+        max_visits = (1 - discount ** (num_steps + 1)) / (1 - discount)
+        early = bounded(totals.discounted_visits, 0, max_visits)
     length = bounded(totals.length, 1, num_steps)
     assert length is not None
     return Evaluation(
@@ -230,8 +230,8 @@ def evaluation_of(
 
 def frequency_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
     """Frequency with its interval: exact for a fixed number of trials, or anytime-valid."""
-    total = validation.integer("total", total, least=1, most=2**53)
-    count = validation.integer("count", count, most=total)
+    total = validation.integer("total", total, least=1, limit=2**53)
+    count = validation.integer("count", count, limit=total)
     failure = validation.fraction("failure", failure, ends=(False, False))
     ends = clopper_pearson if fixed else anytime
     (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)

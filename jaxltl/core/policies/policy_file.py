@@ -50,11 +50,11 @@ def save_policy(
     [[0]]
     """
     parts = {name: getattr(policy, name) for name in _TABLE}
-    kept = {name: x for name, x in parts.items() if x is not None and len(x)}
-    kept["policy"] = policy.action
+    written = {name: x for name, x in parts.items() if x is not None and len(x)}
+    written["policy"] = policy.action
     if policy.automaton is not None:
-        kept["automaton"] = automaton_text(policy.automaton)
-    write_policy_file(path, "table", kept, more)
+        written["automaton"] = automaton_text(policy.automaton)
+    write_policy_file(path, "table", written, more)
 
 
 def write_policy_file(
@@ -67,8 +67,8 @@ def write_policy_file(
     head = {"format": FORMAT, "version": VERSION, "kind": kind}
     if taken := sorted({*head, *arrays} & {*(more or {})}):
         raise ValueError(f"more has {taken[0]!r}, an array of the policy; choose another name.")
-    given = isinstance(path, str | os.PathLike)
-    with atomic_write(Path(str(path))) if given else contextlib.nullcontext(path) as file:
+    is_path = isinstance(path, str | os.PathLike)
+    with atomic_write(Path(str(path))) if is_path else contextlib.nullcontext(path) as file:
         named = {**head, **arrays, **(more or {})}
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in named.items()})
 
@@ -80,11 +80,11 @@ def read_policy_file(path: str | os.PathLike[str]) -> Arrays:
             arrays: Arrays = read_arrays(file)
     except OSError as error:
         raise ValueError(f"the policy cannot be read: {str(path)!r}: {error.strerror}.") from None
-    found = str(arrays.get("format", "no format"))
+    format_name = str(arrays.get("format", "no format"))
     version = arrays.get("version", np.zeros(()))
-    if found != FORMAT or version.shape or version != VERSION:
+    if format_name != FORMAT or version.shape or version != VERSION:
         raise ValueError(
-            f"{path}: {found}, version {version}, is not a policy that this version of jaxltl "
+            f"{path}: {format_name}, version {version}, is not a policy that this version of jaxltl "
             f"reads; expected {FORMAT}, version {VERSION}. Write it again, or update jaxltl."
         )
     return arrays
@@ -160,16 +160,16 @@ def _check(policy: FiniteMemoryPolicy) -> None:
         indices.append(("letter", policy.letter, automaton.delta.shape[1]))
     if not policy.is_random:
         indices.append(("policy", action, policy.num_actions))
-    for name, table, most in indices:
+    for name, table, size in indices:
         if table.dtype.kind not in "iu" or (
             name in ("initial_memory", "letter") and table.shape != (count,)
         ):
             raise ValueError(
                 f"{name} is {table.dtype}{list(table.shape)}; expected int32[{count}]."
             )
-        if ((table < 0) | (table >= most)).any():
+        if ((table < 0) | (table >= size)).any():
             raise ValueError(
-                f"{name} has {table[(table < 0) | (table >= most)][0]}; expected 0 to {most - 1}."
+                f"{name} has {table[(table < 0) | (table >= size)][0]}; expected 0 to {size - 1}."
             )
     for name in ("actions", "states"):
         width = policy.num_actions if name == "actions" else count

@@ -110,7 +110,7 @@ def build_rows(
     program: Program, *, max_states: int = MAX_STATES, progress: Progress | None = None
 ) -> Rows:
     """Rows of the model of a program, also of one with parameters; see :func:`build_model`."""
-    max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
+    max_states = validation.integer("max_states", max_states, least=1, limit=2**31 - 2)
     layout = make_layout(program.variables)
     weights: Numbers = (
         Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()

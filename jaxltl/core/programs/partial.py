@@ -105,7 +105,7 @@ def solve_program(
         return cast(Answer, solve_property(model, prop, tolerance=tolerance))
     validation.choice("method", method, ("build", "partial"))
     tolerance = requested_width(tolerance)
-    max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
+    max_states = validation.integer("max_states", max_states, least=1, limit=2**31 - 2)
     if program.kind == "smg" or program.has_intervals or program.parameters:
         raise ValueError(
             f"{program.source.name!r}: games and programs with intervals or parameters are not "

@@ -128,12 +128,12 @@ def _climbed(
     share, half = k / n, deviance / n
     x = share * share / (share + half + np.sqrt(half * (half + 2 * share * (1 - share))))
     x = np.minimum(x, 1 - _EPS)
-    found, active = np.zeros(k.size), np.arange(k.size)
+    bound, active = np.zeros(k.size), np.arange(k.size)
     for _ in range(_STEPS):
         at = x[active]
         above, slope = gap(at, active)
         below = above <= -_MARGIN
-        found[active[below]] = np.maximum(found[active], at)[below]
+        bound[active[below]] = np.maximum(bound[active], at)[below]
         with np.errstate(invalid="ignore"):
             step = (-5 * _MARGIN - above) / slope
         lost = ~np.isfinite(step)  # so far left that it rounds to zero
@@ -145,7 +145,7 @@ def _climbed(
         active = active[~done]
         if not active.size:
             break
-    return found
+    return bound
 
 
 # --- means of bounded numbers ------------------------------------------------------------------
@@ -174,12 +174,12 @@ def bounded_mean(
     guess, old = np.append(0.5, mean)[:-1], np.append(0.25, variance)[:-1]
     many = count * np.log1p(count) if planned is None else planned
     weight = np.minimum(np.sqrt(2 * np.log(2 / failure) / (many * old)), _MOST)
-    spread = (x - guess) ** 2 @ (-np.log1p(-weight) - weight)
+    sum_of_squares = (x - guess) ** 2 @ (-np.log1p(-weight) - weight)
     total = weight.sum()
     if not total:
         return 0.0, 1.0
     # Sums of n numbers are off by less than n roundings each.
     rounding = 8 * float(np.finfo(np.float64).eps) * (x.size + 8)
-    deviation = (np.log(2 / failure) + spread) / total * (1 + rounding) + rounding
+    deviation = (np.log(2 / failure) + sum_of_squares) / total * (1 + rounding) + rounding
     lower, upper = around(np.array(weight @ x / total), np.array(deviation))
     return float(lower), float(upper)

@@ -158,8 +158,8 @@ def intervals_from_counts(
     unknown = (~claimed & (outcomes > 1))[row]
     lower = np.where(known, 1.0, np.where(unknown, 0.0, lower))
     upper = np.where(known | unknown, 1.0, upper)
-    left = 1 - np.bincount(row, lower, listed.size) + (listed + 2) * _EPS
-    rest = np.minimum(np.where(claimed, rest * (1 + 4 * _EPS), 1), np.clip(left, 0, 1))
+    remaining = 1 - np.bincount(row, lower, listed.size) + (listed + 2) * _EPS
+    rest = np.minimum(np.where(claimed, rest * (1 + 4 * _EPS), 1), np.clip(remaining, 0, 1))
     return ConfidenceSets(
         lower=_as_given(lower, is_entry),
         upper=_as_given(upper, is_entry),
@@ -225,8 +225,8 @@ def samples_needed(
 
 def check_confidence(confidence: float) -> None:
     """Raises a ValueError unless a confidence is a number strictly between 0 and 1."""
-    given = np.asarray(confidence)
-    if given.ndim or given.dtype.kind not in "fiu" or not 0 < given < 1:  # NaN is not
+    array = np.asarray(confidence)
+    if array.ndim or array.dtype.kind not in "fiu" or not 0 < array < 1:  # NaN is not
         raise ValueError(
             f"confidence={confidence!r}; it must lie strictly between 0 and 1, such as 0.95."
         )
@@ -288,13 +288,13 @@ def _entries(
 def _outcomes(num_outcomes: ArrayLike | None, listed: Integers, shape: tuple[int, ...]) -> Integers:
     if num_outcomes is None:
         return listed
-    given = np.asarray(num_outcomes)
-    if given.shape not in ((), shape) or not np.issubdtype(given.dtype, np.integer):
+    counts = np.asarray(num_outcomes)
+    if counts.shape not in ((), shape) or not np.issubdtype(counts.dtype, np.integer):
         raise ValueError(
-            f"num_outcomes is {given.dtype}{list(given.shape)}; expected an integer, "
+            f"num_outcomes is {counts.dtype}{list(counts.shape)}; expected an integer, "
             f"or integers {list(shape)}."
         )
-    outcomes = np.broadcast_to(given, shape).reshape(-1).astype(np.int64)
+    outcomes = np.broadcast_to(counts, shape).reshape(-1).astype(np.int64)
     if (outcomes < listed).any():
         row = int(np.argmax(outcomes < listed))
         raise ValueError(
@@ -304,13 +304,15 @@ def _outcomes(num_outcomes: ArrayLike | None, listed: Integers, shape: tuple[int
     return outcomes
 
 
-def _claims(given: int | None, made: int) -> int:
-    if given is None:
-        return made
-    found = validation.integer("num_claims", given)
-    if found < made:
-        raise ValueError(f"num_claims={given}; the rows make {made}, and no fewer can be counted.")
-    return found
+def _claims(num_claims: int | None, required: int) -> int:
+    if num_claims is None:
+        return required
+    number = validation.integer("num_claims", num_claims)
+    if number < required:
+        raise ValueError(
+            f"num_claims={num_claims}; the rows make {required}, and no fewer can be counted."
+        )
+    return number
 
 
 def _name(row: int, shape: tuple[int, ...]) -> str:
@@ -332,9 +334,9 @@ def _claimed(rows: ArrayLike | None, shape: tuple[int, ...]) -> Booleans:
 
 
 def _as_given(entries: Floats, is_entry: Booleans) -> Floats:
-    found = np.zeros(is_entry.shape)
-    found[is_entry] = entries
-    return found
+    entries_table = np.zeros(is_entry.shape)
+    entries_table[is_entry] = entries
+    return entries_table
 
 
 # --- assumptions on the graph ------------------------------------------------------------------

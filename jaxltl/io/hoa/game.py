@@ -272,16 +272,16 @@ class _Reader:
         def step(node: _Node) -> list[tuple[_Node, int]]:
             nonlocal size
             q, residuals = node
-            found: list[tuple[_Node, int]]
+            edges: list[tuple[_Node, int]]
             if isinstance(residuals, tuple):
-                found = [(x, g) for x, g in zip(moves[q], residuals, strict=True) if g != FALSE]
+                edges = [(x, g) for x, g in zip(moves[q], residuals, strict=True) if g != FALSE]
             else:
                 classes = split.of(tuple(moves[q].values()))
-                found = [((q, rest), guard) for rest, guard in classes.items()]
-            size += len(found)
+                edges = [((q, rest), guard) for rest, guard in classes.items()]
+            size += len(edges)
             if size > MAX_MOVES:
                 raise _TooMany
-            return found
+            return edges
 
         order, rows, guards = explore(begin, step)
         state = np.array([q for q, _ in order])

@@ -23,21 +23,23 @@ MAX_BYTES = 2**24  # of a program
 Constants = Mapping[str, object] | str | None
 
 
-def constants_of(given: Constants) -> dict[str, object]:
+def constants_of(constants: Constants) -> dict[str, object]:
     """Values of constants from a mapping, or from a text such as ``"N=64,MAX=4"``.
 
     >>> constants_of("N=64, p = min(1, 2)")
     {'N': '64', 'p': 'min(1, 2)'}
     """
-    if given is None:
+    if constants is None:
         return {}
-    if isinstance(given, Mapping):
-        return dict(given)
-    if not isinstance(given, str):
-        raise ValueError(f"constants is {given!r}; give a dict, or a text such as 'N=64,MAX=4'.")
-    found: dict[str, object] = {}
+    if isinstance(constants, Mapping):
+        return dict(constants)
+    if not isinstance(constants, str):
+        raise ValueError(
+            f"constants is {constants!r}; give a dict, or a text such as 'N=64,MAX=4'."
+        )
+    values: dict[str, object] = {}
     parts = [""]
-    for character in given:
+    for character in constants:
         if character == "," and parts[-1].count("(") == parts[-1].count(")"):
             parts.append("")
         else:
@@ -48,12 +50,12 @@ def constants_of(given: Constants) -> dict[str, object]:
             continue
         if not (name.isidentifier() and equals and value):
             raise ValueError(f"constants: {part.strip()!r}; write NAME=VALUE, as in N=64,MAX=4.")
-        if name in found:
+        if name in values:
             raise ValueError(f"constants: {name} is given twice.")
         if ":" in value and "?" not in value:
             raise ValueError(f"constants: {name}={value} is a range; give one value.")
-        found[name] = value
-    return found
+        values[name] = value
+    return values
 
 
 def read_program(path: str | os.PathLike[str], constants: Constants = None) -> Program:

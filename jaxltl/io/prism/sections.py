@@ -77,9 +77,9 @@ def _prism_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
 
 def _without(tokens: Integers, size: int) -> Integers:
     """Indices of all other tokens."""
-    kept = np.ones(size, bool)
-    kept[tokens] = False
-    return np.flatnonzero(kept)
+    mask = np.ones(size, bool)
+    mask[tokens] = False
+    return np.flatnonzero(mask)
 
 
 def _storm_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
@@ -189,12 +189,12 @@ _TO_BLANKS = bytes.maketrans(b":(),", b"    ")
 
 def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> dict[str, Rewards]:
     """Reward structures of a model by name, from its ``srew`` and ``trew`` sections."""
-    found: dict[str, dict[str, tuple[Text, Rewards]]] = {}
+    sections_by_name: dict[str, dict[str, tuple[Text, Rewards]]] = {}
     reward_sections = [s for s in sections if s[0] in ("srew", "trew")]
     unnamed = len({number for _, number, text in reward_sections if not _reward_name(text)})
     for kind, number, text in reward_sections:
         name = _reward_name(text)
-        parts = found.setdefault(name or (number if unnamed > 1 else ""), {})
+        parts = sections_by_name.setdefault(name or (number if unnamed > 1 else ""), {})
         if kind in parts:
             raise text.error(
                 text.line,
@@ -209,7 +209,7 @@ def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> d
             parts["trew"][1] if "trew" in parts else Rewards(),
             state=parts["srew"][1].state if "srew" in parts else None,
         )
-        for key, parts in found.items()
+        for key, parts in sections_by_name.items()
     }
 
 
@@ -224,16 +224,16 @@ def _reward_lines(text: Text, num_states: int, form: str) -> tuple[int | None, T
     sizes = first.split()
     if not first:
         return 0, rest
-    shown = repr(first[:60].decode(errors="replace"))
+    quoted = repr(first[:60].decode(errors="replace"))
     if not sizes[0].isdigit() or len(sizes[0]) > 18 or int(sizes[0]) > num_states:
         raise text.error(
             line,
-            f"{shown}; expected a number of states, here {num_states}, and of rewards, or {form}.",
+            f"{quoted}; expected a number of states, here {num_states}, and of rewards, or {form}.",
         )
     if int(sizes[0]) < num_states:
         return None, text
     if not sizes[-1].isdigit() or len(sizes[-1]) > 18 or len(sizes) not in (2, 3):
-        raise text.error(line, f"{shown}; expected a number of states and of rewards.")
+        raise text.error(line, f"{quoted}; expected a number of states and of rewards.")
     return int(sizes[-1]), rest
 
 

@@ -53,10 +53,10 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         known = set(formula.propositions)
-        shown = {
+        letters = {
             x for world in worlds for x in occurring_letters(world, known & set(world.propositions))
         }
-        task = to_automaton(formula, letters=sorted(shown, key=sorted))
+        task = to_automaton(formula, letters=sorted(letters, key=sorted))
     num_states = max(world.num_states for world in worlds)
     width = max(world.num_successors for world in worlds)
     products = []
@@ -92,9 +92,9 @@ def _like_first(world: Model, number: int, first: MDP) -> MDP:
     if set(world.propositions) != set(first.propositions):
         missing = sorted(set(first.propositions) - set(world.propositions))
         added = sorted(set(world.propositions) - set(first.propositions))
-        what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(added)} besides"
+        difference = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(added)} besides"
         raise ValueError(
-            f"world {number} does not have the propositions of world 0: it {what}. Give "
+            f"world {number} does not have the propositions of world 0: it {difference}. Give "
             "every world the same ones, with labels that are false where nothing shows them."
         )
     column = [world.propositions.index(p) for p in first.propositions]
@@ -234,11 +234,11 @@ def _of_each_world(trajectories: Demonstrations) -> list[Trajectories]:
         lanes = range(len(trajectories.length)) if stacked else ()
         split = [jax.tree.map(lambda x, w=w: x[w], trajectories) for w in lanes]
         trajectories = split if stacked else [trajectories]
-    found = []
+    parts = []
     for one in trajectories:
         rows = np.flatnonzero(np.asarray(one.length))
-        found.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], one))
-    return found
+        parts.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], one))
+    return parts
 
 
 def split_trajectories(
@@ -249,9 +249,9 @@ def split_trajectories(
         raise ValueError(f"held_out={share}; it must be a share in [0, 1).")
     first, second = [], []
     for one in _of_each_world(trajectories):
-        kept = len(one.length) - round(share * len(one.length))
-        first.append(jax.tree.map(lambda x, n=kept: x[:n], one))
-        second.append(jax.tree.map(lambda x, n=kept: x[n:], one))
+        num_first = len(one.length) - round(share * len(one.length))
+        first.append(jax.tree.map(lambda x, n=num_first: x[:n], one))
+        second.append(jax.tree.map(lambda x, n=num_first: x[n:], one))
     return first, second
 
 
@@ -259,11 +259,11 @@ def demonstration_counts(
     models: Product, trajectories: Demonstrations, *, horizon: int | None = None
 ) -> jax.Array:
     """State-action counts ``float[W, S, Q, A]`` in each product; ``[W, T, S, Q, A]`` with a horizon T."""
-    given, count = _of_each_world(trajectories), num_worlds(models)
-    if len(given) != count:
-        raise ValueError(f"there are demonstrations in {len(given)} worlds; expected {count}.")
-    found = []
-    for w, one in enumerate(given):
+    split, count = _of_each_world(trajectories), num_worlds(models)
+    if len(split) != count:
+        raise ValueError(f"there are demonstrations in {len(split)} worlds; expected {count}.")
+    tensors = []
+    for w, one in enumerate(split):
         model = unstack_product(models, w)
         shape: tuple[int, ...] = (*model.state_shape, model.num_actions)
         state, action, length = (np.asarray(x) for x in (one.state, one.action, one.length))
@@ -294,8 +294,8 @@ def demonstration_counts(
             if horizon is not None:
                 pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
             counts = np.bincount(pair[inside], minlength=size)
-        found.append(counts.reshape(shape))
-    return jax_array(np.stack(found).astype(models.dtype))
+        tensors.append(counts.reshape(shape))
+    return jax_array(np.stack(tensors).astype(models.dtype))
 
 
 def stack_observations(models: Product, observation: PyTree) -> jax.Array:

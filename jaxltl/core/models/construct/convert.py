@@ -74,11 +74,11 @@ def _distribution(initial: ArrayLike) -> np.ndarray:
 
 def _product(model: Product) -> SparseMDP:
     world = to_sparse(model.mdp)
-    kept = None
+    allowed_rows = None
     if model.allowed is not None:
         action = world.rank if world.action is None else world.action
-        kept = np.asarray(model.allowed)[world.host.state, :, action]
-    written = product_rows(world, model, kept)
+        allowed_rows = np.asarray(model.allowed)[world.host.state, :, action]
+    written = product_rows(world, model, allowed_rows)
     return make_sparse(
         written.row_start,
         written.entry_start,
@@ -93,17 +93,19 @@ def _product(model: Product) -> SparseMDP:
     )
 
 
-def product_rows(world: SparseMDP, model: Product, kept: np.ndarray | None = None) -> SparseMDP:
+def product_rows(
+    world: SparseMDP, model: Product, allowed_rows: np.ndarray | None = None
+) -> SparseMDP:
     """A product written out, inside ``jit`` too; only rows ``kept[r, q]`` of a sparse world."""
     # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
     number = np.arange(model.num_states, dtype=np.int32)
     state, memory = np.divmod(number, model.num_memory)
     row_start, owner, row = _members(world.row_start, state, world.num_rows * model.num_memory)
-    if kept is not None:
-        chosen = kept[row, memory[owner]]
+    if allowed_rows is not None:
+        chosen = allowed_rows[row, memory[owner]]
         owner, row = owner[chosen], row[chosen]
         row_start = offsets_from_counts(np.bincount(owner, minlength=state.size))
-    total = world.num_transitions * model.num_memory if kept is None else None
+    total = world.num_transitions * model.num_memory if allowed_rows is None else None
     entry_start, of, entry = _members(world.entry_start, row, total)
     arrays = world.successor, world.probability, world.label, world.action
     xp, (successor, probability, label, action), owner, step, initial = namespace(
@@ -144,10 +146,10 @@ def keep_with_model(convert: Callable[[M], R]) -> Callable[[M], R]:
     def wrapper(model: M) -> R:
         if name in vars(model):
             return vars(model)[name]  # type: ignore[no-any-return]
-        found = convert(model)
+        converted = convert(model)
         fixed = all(isinstance(x, jax.Array) for x in jax.tree.leaves(model))
-        if fixed and found is not model:
-            vars(model)[name] = found
-        return found
+        if fixed and converted is not model:
+            vars(model)[name] = converted
+        return converted
 
     return wrapper

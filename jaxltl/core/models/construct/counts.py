@@ -112,10 +112,10 @@ def make_counts(
             f"count adds up to {sum(arrays['count'].tolist())}; at most 2^53 "
             "transitions are counted."
         )
-    most = {"state": max(arrays["state"].max(), arrays["successor"].max()) + 1}
-    most |= {"action": arrays["action"].max() + 1}
-    state_names = _checked_names("states", states, int(most["state"]))
-    action_names = _checked_names("actions", actions, int(most["action"]))
+    num_names = {"state": max(arrays["state"].max(), arrays["successor"].max()) + 1}
+    num_names |= {"action": arrays["action"].max() + 1}
+    state_names = _checked_names("states", states, int(num_names["state"]))
+    action_names = _checked_names("actions", actions, int(num_names["action"]))
     count = arrays.get("count", np.ones(size, np.int64))
     rows = [arrays[name] for name in ("state", "action", "successor")]
     s, a, t, number = merged(np.stack([x.astype(np.int64) for x in (*rows, count)]))
@@ -140,17 +140,17 @@ def _totals(place: Integers, count: Integers) -> NDArray[np.int64]:
     return np.bincount(place.ravel(), count).astype(np.int64)
 
 
-def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:
+def _checked_names(noun: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:
     if names is None:
         if least > _MOST_ENTRIES:
-            raise ValueError(f"{what} go up to {least - 1}; number them from 0, without gaps.")
+            raise ValueError(f"{noun} go up to {least - 1}; number them from 0, without gaps.")
         return tuple(map(str, range(least)))
-    names = tuple(map(str, validation.sequence(what, names)))
+    names = tuple(map(str, validation.sequence(noun, names)))
     if len(names) < least:
-        raise ValueError(f"there are {len(names)} names of {what}; number {least - 1} has none.")
+        raise ValueError(f"there are {len(names)} names of {noun}; number {least - 1} has none.")
     if len(set(names)) < len(names):
         twice = next(x for i, x in enumerate(names) if x in names[:i])
-        raise ValueError(f"{what}: the name {twice!r} stands twice.")
+        raise ValueError(f"{noun}: the name {twice!r} stands twice.")
     return names
 
 
@@ -213,10 +213,10 @@ class Places:
 
     def ambiguous(self) -> str | None:
         """A description of two choices or successors with the same names, or None."""
-        for (key, order), what in ((self._rows, "choice"), (self._entries, "successor")):
+        for (key, order), noun in ((self._rows, "choice"), (self._entries, "successor")):
             same = np.flatnonzero(key[1:] == key[:-1])
             if same.size:
-                return f"{what}s {order[same[0]]} and {order[same[0] + 1]}"
+                return f"{noun}s {order[same[0]]} and {order[same[0] + 1]}"
         return None
 
     def rows(self, state: Integers, action: Integers) -> Integers:
@@ -249,14 +249,14 @@ def places(model: MDP | DenseMDP | SparseMDP) -> Places:
             f"{type(model).__name__} has no transitions to count; give an MDP, a DenseMDP or a "
             "SparseMDP (of a game, its mdp; of an interval model, its nominal one)."
         )
-    found = Places(state_names(model), action_names(model), *parts, shape)
-    if twice := found.ambiguous():
+    result = Places(state_names(model), action_names(model), *parts, shape)
+    if twice := result.ambiguous():
         raise ValueError(
             f"{twice} of the model have the same names, so that no count says which it is of; give "
             "each choice of a state an action of its own, and convert a model whose rows repeat a "
             "successor by to_sparse."
         )
-    return found
+    return result
 
 
 def _sorted_keys(first: Integers, second: Integers, size: int) -> tuple[Integers, Integers]:
@@ -297,29 +297,29 @@ def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) ->
     place, wrong = place_of(known, state, action, successor)
     if wrong:
         raise ValueError(f"the counts do not fit the model: {wrong[1]}.")
-    found = np.zeros(known.shape, np.int64)
-    found.reshape(-1)[place] = counts.count
-    return found
+    aligned = np.zeros(known.shape, np.int64)
+    aligned.reshape(-1)[place] = counts.count
+    return aligned
 
 
 def _renumbered(
-    what: str, names: tuple[str, ...], number: Integers, to: tuple[str, ...]
+    noun: str, names: tuple[str, ...], number: Integers, to: tuple[str, ...]
 ) -> Integers:
     """Indices of names as indices of the same names in another list."""
     if names == to:
         return number
     of = {name: i for i, name in enumerate(to)}
-    found = np.array([of.get(name, -1) for name in names], np.int64)[number]
-    if (found < 0).any():
-        name = names[number[int(np.argmin(found >= 0))]]
-        raise ValueError(f"the model has no {what} {name!r}; it has {listed(to)}.")
-    return found
+    renumbered = np.array([of.get(name, -1) for name in names], np.int64)[number]
+    if (renumbered < 0).any():
+        name = names[number[int(np.argmin(renumbered >= 0))]]
+        raise ValueError(f"the model has no {noun} {name!r}; it has {listed(to)}.")
+    return renumbered
 
 
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The number of names and the first `most`, for messages."""
-    shown = ", ".join(map(repr, names[:most]))
-    return f"{len(names)}: {shown}{', ...' if len(names) > most else ''}"
+def listed(names: Sequence[str], limit: int = 8) -> str:
+    """The number of names and the first `limit`, for messages."""
+    names_text = ", ".join(map(repr, names[:limit]))
+    return f"{len(names)}: {names_text}{', ...' if len(names) > limit else ''}"
 
 
 def place_of(
@@ -387,9 +387,9 @@ def model_from_counts(
     number = {name: i for i, name in enumerate(counts.states)}
     stays = np.zeros(len(number), bool)
     stays[_numbers(terminal, number, "terminal")] = True
-    left = np.flatnonzero(stays[counts.state] & (counts.state != counts.successor))
-    if left.size:
-        name, to = (counts.states[x[left[0]]] for x in (counts.state, counts.successor))
+    departures = np.flatnonzero(stays[counts.state] & (counts.state != counts.successor))
+    if departures.size:
+        name, to = (counts.states[x[departures[0]]] for x in (counts.state, counts.successor))
         raise ValueError(f"the terminal state {name!r} was left to {to!r}; it is not terminal.")
     untried = np.setdiff1d(np.arange(len(number)), counts.state)
     names = counts.actions
@@ -470,21 +470,21 @@ def _variable(names: tuple[str, ...]) -> np.ndarray:
     return np.array(names, object)
 
 
-def _numbers(names: object, number: Mapping[str, int], what: str) -> list[int]:
-    found = []
-    for name in [names] if isinstance(names, str | int) else validation.sequence(what, names):
+def _numbers(names: object, number: Mapping[str, int], place: str) -> list[int]:
+    numbers = []
+    for name in [names] if isinstance(names, str | int) else validation.sequence(place, names):
         if str(name) not in number:
             raise ValueError(
-                f"{what}: there is no state {str(name)!r}; there are {listed(tuple(number))}."
+                f"{place}: there is no state {str(name)!r}; there are {listed(tuple(number))}."
             )
-        found.append(number[str(name)])
-    return found
+        numbers.append(number[str(name)])
+    return numbers
 
 
 def _initial(initial: Initial, number: Mapping[str, int]) -> NDArray[np.float64]:
-    found = np.zeros(len(number))
+    weights = np.zeros(len(number))
     weight: ArrayLike = 1.0
     if isinstance(initial, Mapping):
         weight = validation.float_array("initial", list(initial.values()))
-    found[_numbers(initial, number, "initial")] = weight
-    return found if isinstance(initial, Mapping) else found / max(found.sum(), 1)
+    weights[_numbers(initial, number, "initial")] = weight
+    return weights if isinstance(initial, Mapping) else weights / max(weights.sum(), 1)

@@ -122,13 +122,13 @@ def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
         np.asarray(x) for x in (trajectories.state, trajectories.action, trajectories.mask)
     )
     place = (state, memory_along(model, state)) if isinstance(model, Product) else (state,)
-    kept: np.ndarray = inside & np.asarray(model.available)[(*place, action)]
-    for n in first_true(inside.any(1) & ~kept.any(1)):
+    valid: np.ndarray = inside & np.asarray(model.available)[(*place, action)]
+    for n in first_true(inside.any(1) & ~valid.any(1)):
         raise ValueError(
             f"trajectory {n}: none of its {inside[n].sum()} steps takes an allowed action, so "
             "nothing can be learned from it; leave it out, or allow more."
         )
-    return kept
+    return valid
 
 
 def lift_policy(model: Product, policy: jax.Array) -> jax.Array:

@@ -72,6 +72,6 @@ def to_padded(model: SparseMDP) -> MDP:
 def pad_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
     """A quantity ``[R]`` on rows as one of the padded model, ``[S, A]``; zero where unavailable."""
     action = row_actions(model)
-    found = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
-    found[model.host.state, action] = quantity
-    return found
+    padded = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
+    padded[model.host.state, action] = quantity
+    return padded

@@ -133,9 +133,9 @@ def restrict(
       [1]
     """
     if isinstance(model, IntervalMDP):
-        found = restrict(model.nominal, initial, allowed=allowed)
+        restriction = restrict(model.nominal, initial, allowed=allowed)
         part = model.changed(lambda x: restrict(x, initial, allowed=allowed).model)
-        return found._replace(model=part)
+        return restriction._replace(model=part)
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     if isinstance(world, SparseMDP):
@@ -226,9 +226,9 @@ def _restrict_sparse(
             )
     host, used = sparse.host, rows[sparse.host.row]
     states = forward_reachable(host.state[host.row[used]], host.successor[used], start > 0)
-    found = submodel(replace(sparse, initial=start / start.sum()), states, rows)
+    restriction = submodel(replace(sparse, initial=start / start.sum()), states, rows)
     num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
-    return _restriction(model, found, np.flatnonzero(states), num_memory)
+    return _restriction(model, restriction, np.flatnonzero(states), num_memory)
 
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,14 +240,14 @@ def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP:
     """The sparse model of some states ``bool[S]`` and rows ``bool[R]``; ValueError for a state without rows."""
-    host, kept = model.host, np.flatnonzero(states)
+    host, kept_states = model.host, np.flatnonzero(states)
     row = np.flatnonzero(rows & states[host.state])
     number = np.cumsum(states, dtype=np.int32) - 1
-    choices = np.bincount(number[host.state[row]], minlength=kept.size)
+    choices = np.bincount(number[host.state[row]], minlength=kept_states.size)
     for i in first_true(choices == 0):
-        raise ValueError(f"no choice is left in state {kept[i]}; allow one.")
+        raise ValueError(f"no choice is left in state {kept_states[i]}; allow one.")
     entry, width = row_entries(host.entry_start, row)
-    initial = np.asarray(model.initial)[kept]
+    initial = np.asarray(model.initial)[kept_states]
     return replace(
         model,
         row_start=offsets_from_counts(choices),
@@ -255,8 +255,8 @@ def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMD
         successor=number[host.successor[entry]],
         probability=host.probability[entry],
         initial=initial / initial.sum() if initial.sum() else initial,
-        label=np.asarray(model.label)[kept],
-        rewards={name: x.gathered(kept, row, entry) for name, x in model.rewards.items()},
+        label=np.asarray(model.label)[kept_states],
+        rewards={name: x.gathered(kept_states, row, entry) for name, x in model.rewards.items()},
         action=None if model.action is None else np.asarray(model.action)[row],
-        valuation={name: np.asarray(x)[kept] for name, x in model.valuation.items()},
+        valuation={name: np.asarray(x)[kept_states] for name, x in model.valuation.items()},
     )

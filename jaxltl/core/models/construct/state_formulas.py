@@ -19,15 +19,15 @@ def label_columns(model: SparseMDP, names: Collection[str], place: str) -> np.nd
     """Masks ``bool[S, n]`` of n labels, with the built-in ``init`` and ``deadlock`` (certain self-loops)."""
     known = (*model.propositions, *(x for x in BUILT_IN if x not in model.propositions))
     require_known(names, known, place)
-    found = np.zeros((model.num_states, len(names)), bool)
+    columns = np.zeros((model.num_states, len(names)), bool)
     for i, name in enumerate(names):
         if name in model.propositions:
-            found[:, i] = np.asarray(model.label)[:, model.propositions.index(name)]
+            columns[:, i] = np.asarray(model.label)[:, model.propositions.index(name)]
         elif name == "init":
-            found[:, i] = np.asarray(model.initial) > 0
+            columns[:, i] = np.asarray(model.initial) > 0
         else:
-            found[:, i] = _deadlocks(model)
-    return found
+            columns[:, i] = _deadlocks(model)
+    return columns
 
 
 def _deadlocks(model: SparseMDP) -> np.ndarray:

@@ -60,10 +60,10 @@ def _call(function: Callable[..., PyTree], lanes: PyTree, arguments: PyTree) -> 
         several = function if lanes is None else _vmap(function, lanes)
         has_lanes = any(jax.tree.leaves(batched))  # else only tangents have
         if size > 1 and has_lanes and _is_available():
-            found = _call(several, batched[0], arguments)
+            results = _call(several, batched[0], arguments)
         else:
-            found = (_vmap(several, batched[0]) if has_lanes else several)(*arguments)
-        return found, jax.tree.map(lambda _: has_lanes, found)
+            results = (_vmap(several, batched[0]) if has_lanes else several)(*arguments)
+        return results, jax.tree.map(lambda _: has_lanes, results)
 
     return call(arguments)
 
@@ -118,9 +118,9 @@ class _Parts:
         keys = [_implementation(x) for x in leaves]
 
         def program(several: bool, data: tuple[jax.Array, ...]) -> list[jax.Array]:
-            given = jax.tree.unflatten(tree, map(_undata, data, keys))
-            found = (_vmap(function, lanes) if several else function)(*given)
-            leaves, self.tree = jax.tree.flatten(found)
+            inputs = jax.tree.unflatten(tree, map(_undata, data, keys))
+            results = (_vmap(function, lanes) if several else function)(*inputs)
+            leaves, self.tree = jax.tree.flatten(results)
             self.keys = [_implementation(x) for x in leaves]
             return [_data(x) for x in leaves]
 
@@ -151,11 +151,11 @@ class _Parts:
             for x, pair in zip(self.results, pairs, strict=True)
         ]
 
-    def decode(self, found: list[jax.Array]) -> PyTree:
+    def decode(self, results: list[jax.Array]) -> PyTree:
         """The tree of results."""
         leaves = [
             x if x.dtype == shape.dtype else lax.bitcast_convert_type(x, shape.dtype)
-            for x, shape in zip(found, self.results, strict=True)
+            for x, shape in zip(results, self.results, strict=True)
         ]
         return jax.tree.unflatten(self.tree, map(_undata, leaves, self.keys))
 
@@ -170,16 +170,16 @@ class _Parts:
     def __call__(self, *data: np.ndarray) -> list[np.ndarray]:
         """Results of all lanes, from views of the arguments."""
         skip = self.width > 1
-        found = [np.empty((self.size, *x.shape[skip:]), x.dtype) for x in self.results]
+        results = [np.empty((self.size, *x.shape[skip:]), x.dtype) for x in self.results]
 
         def part(start: int) -> None:
             stop = min(start + self.width, self.size)
             rows: PyTree = start
             if skip:  # the last part repeats its last lane
                 rows = np.minimum(np.arange(start, start + self.width), self.size - 1)
-            given = [x[rows] if has else x for x, has in zip(shared, self.lanes, strict=True)]
+            inputs = [x[rows] if has else x for x, has in zip(shared, self.lanes, strict=True)]
             with jax.enable_x64(self.x64):  # local to a thread
-                for x, y in zip(found, self.compiled[start // self.width](*given), strict=True):
+                for x, y in zip(results, self.compiled[start // self.width](*inputs), strict=True):
                     x[start:stop] = np.asarray(y)[: stop - start] if skip else np.asarray(y)
 
         with jax.enable_x64(self.x64):  # one copy of large arrays for all parts
@@ -191,7 +191,7 @@ class _Parts:
         with ThreadPoolExecutor(min(num_cores(), len(starts))) as pool:
             list(pool.map(part, starts))
         # The caller's thread may be set to numbers of 32 bits.
-        return [_bits(x) for x in found]
+        return [_bits(x) for x in results]
 
 
 def _implementation(x: jax.Array) -> PyTree:

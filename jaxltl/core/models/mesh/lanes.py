@@ -82,8 +82,8 @@ def on_host(tree: PyTree) -> PyTree:
         if not isinstance(x, jax.Array):
             return np.asarray(x)
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-            found = one(jax.random.key_data(x))
-            return jax.random.wrap_key_data(found, impl=jax.random.key_impl(x))
+            words = one(jax.random.key_data(x))
+            return jax.random.wrap_key_data(words, impl=jax.random.key_impl(x))
         sharding: Any = x.sharding
         if not x.is_fully_addressable and not x.is_fully_replicated:
             x = _copied(x, sharding.mesh)
@@ -139,10 +139,10 @@ def require_split(name: str, sharding: NamedSharding | None, **sizes: int) -> No
             f"PartitionSpec({sharding.mesh.axis_names[0]!r})."
         )
     devices = _count(sharding.mesh, axes)
-    for what, size in sizes.items():
+    for subject, size in sizes.items():
         if size % devices:
             raise ValueError(
-                f"{name} splits over {devices} devices, but {what} is {size}; choose a multiple, "
+                f"{name} splits over {devices} devices, but {subject} is {size}; choose a multiple, "
                 f"such as {size - size % devices + devices}."
             )
 
@@ -339,7 +339,7 @@ def _mapped(
         jax.tree.unflatten(tree, [0 if has else None for has in lanes]),
     )
     # Loops begin with constants, which are not marked as different on each device: no check.
-    found = jax.shard_map(
+    results = jax.shard_map(
         side_by_side,
         mesh=here,
         in_specs=jax.tree.unflatten(tree, specs),
@@ -348,5 +348,5 @@ def _mapped(
         check_vma=False,
     )(*jax.tree.unflatten(tree, leaves))
     if uneven:
-        found = jax.tree.map(lambda x: _constrained(x, here, PartitionSpec())[:number], found)
-    return found
+        results = jax.tree.map(lambda x: _constrained(x, here, PartitionSpec())[:number], results)
+    return results

@@ -62,7 +62,7 @@ class StateLayout(NamedTuple):
         return int(self.starts[d]), int(self.starts[d + 1])
 
     def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
-        found = [
+        arrays = [
             jax.device_put(piece, device)
             for d, piece in pieces.items()
             for device in self.devices(d)
@@ -70,7 +70,7 @@ class StateLayout(NamedTuple):
         ]
         some = next(iter(pieces.values()))
         shape = (some.shape[0] * self.parts, *some.shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, self.sharding, found)
+        return jax.make_array_from_single_device_arrays(shape, self.sharding, arrays)
 
     def replicated(self, x: np.ndarray) -> jax.Array:
         return jax.make_array_from_callback(

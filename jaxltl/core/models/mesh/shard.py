@@ -200,15 +200,15 @@ def to_mesh(model: ShardedMDP, quantity: Array, fill: Array = 0) -> jax.Array:
         if index is model.row or quantity.ndim > 1:
             _refuse_underflow(quantity, model.dtype)
         quantity = quantity.astype(model.dtype)
-    sharding, found = model.sharding, {}
+    sharding, pieces = model.sharding, {}
     for piece in index.addressable_shards:
         number = np.asarray(piece.data)
         taken = quantity[np.maximum(number, 0)]
         missing = (number < 0).reshape(*number.shape, *(1,) * (taken.ndim - number.ndim))
-        found[piece.device] = np.where(missing, quantity.dtype.type(fill), taken)
+        pieces[piece.device] = np.where(missing, quantity.dtype.type(fill), taken)
     shape = (*index.shape, *quantity.shape[1:])
     return jax.make_array_from_single_device_arrays(
-        shape, sharding, [jax.device_put(x, device) for device, x in found.items()]
+        shape, sharding, [jax.device_put(x, device) for device, x in pieces.items()]
     )
 
 
@@ -244,9 +244,9 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     >>> from_mesh(model, to_mesh(model, np.array([1.0, 2.0]))).tolist()
     [1.0, 2.0]
     """
-    number, found = on_host((model.number, quantity))
-    result = np.zeros((model.num_given, *found.shape[1:]), found.dtype)
-    result[number[number >= 0]] = found[number >= 0]
+    number, laid = on_host((model.number, quantity))
+    result = np.zeros((model.num_given, *laid.shape[1:]), laid.dtype)
+    result[number[number >= 0]] = laid[number >= 0]
     return result
 
 
@@ -309,7 +309,7 @@ def _assembled(
     return ShardedMDP(
         **whole,
         sent=tuple(layout.array(x) for x in halo.sent),
-        shown=layout.replicated(labels),
+        label_rows=layout.replicated(labels),
         propositions=propositions,
         num_given=num_states,
         mesh=layout.mesh,
@@ -323,18 +323,18 @@ def _checked(
 ) -> tuple[SparseMDP, np.ndarray | None]:
     """The validated range of a device as a sparse model, and the numbers of its rows."""
     start, stop = layout.span(d)
-    place, count, found = f"part({start}, {stop})", stop - start, part(start, stop)
-    if not isinstance(found, ModelPart):
-        raise ValueError(f"{place} is {validation.shorten(found)}; it must return a ModelPart.")
-    starts = found.entry_start if found.row_start is None else found.row_start
+    place, count, piece = f"part({start}, {stop})", stop - start, part(start, stop)
+    if not isinstance(piece, ModelPart):
+        raise ValueError(f"{place} is {validation.shorten(piece)}; it must return a ModelPart.")
+    starts = piece.entry_start if piece.row_start is None else piece.row_start
     if np.size(starts) != count + 1:
         raise ValueError(f"{place} has {np.size(starts) - 1} states; it must have {count}.")
     initial = np.full(count, 1 / layout.num_given)
-    if found.initial is not None:
-        initial = validation.float_array("initial", found.initial)
-    label = np.zeros((count, len(names)), bool) if found.label is None else found.label
-    num_rows = np.size(found.entry_start) - 1
-    row = np.empty(num_rows) if found.row is None else found.row
+    if piece.initial is not None:
+        initial = validation.float_array("initial", piece.initial)
+    label = np.zeros((count, len(names)), bool) if piece.label is None else piece.label
+    num_rows = np.size(piece.entry_start) - 1
+    row = np.empty(num_rows) if piece.row is None else piece.row
     shapes = {
         "initial": (initial, (count,)),
         "label": (label, (count, len(names))),
@@ -344,16 +344,16 @@ def _checked(
         if np.shape(x) != shape:
             raise ValueError(f"{place}: {name} has shape {np.shape(x)}; expected {shape}.")
     model = sparse_part(
-        found.row_start,
-        found.entry_start,
-        found.successor,
-        found.probability,
+        piece.row_start,
+        piece.entry_start,
+        piece.successor,
+        piece.probability,
         (start, 0, 0),
         layout.num_given,
         label=label,
         propositions=names,
-        action=found.action,
-        rewards={name: Rewards(choice=x) for name, x in found.rewards.items()},
+        action=piece.action,
+        rewards={name: Rewards(choice=x) for name, x in piece.rewards.items()},
     )
     dtype, host = target_dtype(np.float64), model.host
     refuse_underflow(host.row_start, host.entry_start, host.probability, dtype, first=start)
@@ -362,7 +362,7 @@ def _checked(
         raise ValueError(
             f"initial probability of state {start + s} {underflow_text(initial[s], dtype)}."
         )
-    return replace(model, initial=initial), found.row
+    return replace(model, initial=initial), piece.row
 
 
 _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
@@ -371,9 +371,9 @@ _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
 def _facts(part: SparseMDP) -> np.ndarray:
     """Actions, widest row, transitions, initial mass, and the number of rows of each width."""
     width = np.diff(part.host.entry_start)
-    most = row_actions(part).max(initial=0) + 1.0, width.max(initial=1)
+    limits = row_actions(part).max(initial=0) + 1.0, width.max(initial=1)
     counts = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
-    return np.array([[*most, part.num_transitions, part.initial.sum(), *counts]])
+    return np.array([[*limits, part.num_transitions, part.initial.sum(), *counts]])
 
 
 class _Halo(NamedTuple):
@@ -390,14 +390,14 @@ class _Halo(NamedTuple):
         return d * self.layout.size if self.requested is None else 0
 
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
-        owner, found = self.layout.place(successor)
+        owner, position = self.layout.place(successor)
         if self.requested is None:
-            return cast(np.ndarray, (owner * self.layout.size + found).astype(np.int32))
+            return cast(np.ndarray, (owner * self.layout.size + position).astype(np.int32))
         for e in np.unique(owner[owner != d]):
             here = owner == e
             of_e = _within(self.requested[d], *self.layout.span(int(e)))
-            found[here] = self.first[d, int(e)] + np.searchsorted(of_e, successor[here])
-        return found.astype(np.int32)
+            position[here] = self.first[d, int(e)] + np.searchsorted(of_e, successor[here])
+        return position.astype(np.int32)
 
 
 def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
@@ -443,28 +443,28 @@ def _tables(
     num_actions, widest = (int(x) for x in facts[:, [_ACTIONS, _WIDEST]].max(0))
     host, action = part.host, row_actions(part)
     here, size, own, row = host.num_states, layout.size, halo.own(d), host.row
-    successor, kept = halo.places(d, host.successor), target_dtype(np.float64)
+    successor, dtype = halo.places(d, host.successor), target_dtype(np.float64)
     width, rank = np.diff(host.entry_start), np.arange(row.size) - host.entry_start[row]
     if layout.parts * size * num_actions * widest <= _PADDED * facts[:, _TRANSITIONS].sum():
-        table = _empty_table(size * num_actions, widest, kept)
+        table = _empty_table(size * num_actions, widest, dtype)
         table.fill(((host.state * num_actions + action)[row], rank), successor, host.probability)
         filled = np.arange(here, size)
         table.fill((filled * num_actions, 0), own + filled, 1)
         return (table,), None
-    most, kind = facts[:, _COUNTS:].max(0).astype(np.int64), np.searchsorted(_WIDTHS, width)
+    counts, kind = facts[:, _COUNTS:].max(0).astype(np.int64), np.searchsorted(_WIDTHS, width)
     # The first two rows are those of padded states and of missing choices.
-    tables = [_empty_table(2, 1, kept)]
+    tables = [_empty_table(2, 1, dtype)]
     tables[0].fill((0, 0), own + min(here, size - 1), 1)
     place, begins = np.ones((size, num_actions), np.int32), 2
     place[here:, 0] = 0
-    for c in np.flatnonzero(most):
+    for c in np.flatnonzero(counts):
         rows, entry = np.flatnonzero(kind == c), kind[row] == c
         number = np.cumsum(kind == c) - 1
-        table = _empty_table(int(most[c]), int(_WIDTHS[c]), kept)
+        table = _empty_table(int(counts[c]), int(_WIDTHS[c]), dtype)
         table.fill((number[row[entry]], rank[entry]), successor[entry], host.probability[entry])
         place[host.state[rows], action[rows]] = begins + np.arange(rows.size)
         tables.append(table)
-        begins += int(most[c])
+        begins += int(counts[c])
     return tuple(tables), place
 
 
@@ -481,18 +481,18 @@ def _of_states(
     labels: np.ndarray,
 ) -> dict[str, PyTree]:
     """Quantities on a device's states and choices, by field of :class:`ShardedMDP`."""
-    here, own, kept = part.num_states, slice(*layout.span(d)), target_dtype(np.float64)
+    here, own, float_dtype = part.num_states, slice(*layout.span(d)), target_dtype(np.float64)
     num_actions, choice = int(facts[:, _ACTIONS].max()), (part.host.state, row_actions(part))
 
     def on_choices(x: Array, fill: float, dtype: DTypeLike) -> np.ndarray:
-        found = np.full((layout.size, num_actions), fill, dtype)
-        found[choice] = x
-        return found
+        array = np.full((layout.size, num_actions), fill, dtype)
+        array[choice] = x
+        return array
 
     def on_states(x: Array, fill: float, dtype: DTypeLike) -> np.ndarray:
-        found = np.full(layout.size, fill, dtype)
-        found[:here] = x
-        return found
+        array = np.full(layout.size, fill, dtype)
+        array[:here] = x
+        return array
 
     available = on_choices(True, False, bool)
     if available.sum() != part.num_rows:
@@ -502,14 +502,14 @@ def _of_states(
         )
     available[here:, 0] = True
     different, of = np.unique(part.label, axis=0, return_inverse=True)
-    place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
+    place_of = {labels_of_kind.tobytes(): i for i, labels_of_kind in enumerate(labels)}
     kind = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
     number = np.arange(own.start, own.stop) if layout.order is None else layout.order[own]
     return {
         "available": available,
-        "initial": on_states(part.initial, 0, kept),
+        "initial": on_states(part.initial, 0, float_dtype),
         "kind": on_states(kind, 0, np.int32),  # padded states have some label that occurs
-        "rewards": {name: on_choices(x.choice, 0, kept) for name, x in part.rewards.items()},
+        "rewards": {name: on_choices(x.choice, 0, float_dtype) for name, x in part.rewards.items()},
         "number": on_states(number, -1, np.int32),
         "row": None if row is None else on_choices(row, -1, np.int32),
     }

@@ -63,7 +63,7 @@ class ShardedMDP:
       available: ``bool[N, A]``.
       sent: for each round of an exchange ``int32[D * H]``, the local states that a device sends.
       initial: ``float[N]``, the initial distribution.
-      kind, shown: ``int32[N]`` and ``bool[U, P]``; ``shown[kind]`` are the labels of the states.
+      kind, label_rows: ``int32[N]`` and ``bool[U, P]``; ``label_rows[kind]`` are the labels of the states.
       rewards: expected rewards of choices by name, ``float[N, A]``.
       number, row: ``int32[N]`` and ``int32[N, A]``, the state and the row of the original model, or -1;
         `row` only for a sparse original model, else None.
@@ -85,7 +85,7 @@ class ShardedMDP:
     sent: tuple[jax.Array, ...]
     initial: jax.Array
     kind: jax.Array
-    shown: jax.Array
+    label_rows: jax.Array
     rewards: dict[str, jax.Array]
     number: jax.Array
     row: jax.Array | None
@@ -123,7 +123,7 @@ class ShardedMDP:
     @property
     def label(self) -> jax.Array:
         """``bool[N, P]``, the propositions that hold in each state."""
-        return kernels.gather(self.shown, self.kind)
+        return kernels.gather(self.label_rows, self.kind)
 
     @property
     def num_devices(self) -> int:
@@ -187,8 +187,8 @@ def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.
             return kernels.by_action(
                 successor.reshape(shape), weight.reshape(shape), seen, term, combine
             )
-        found = jnp.concatenate([_rows(table, seen, term, combine) for table in tables])
-        return jnp.moveaxis(kernels.gather(found, place), 1, -1)
+        rows = jnp.concatenate([_rows(table, seen, term, combine) for table in tables])
+        return jnp.moveaxis(kernels.gather(rows, place), 1, -1)
 
     return cast(
         jax.Array,
@@ -233,13 +233,13 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
                 seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False
             )
             return cast(jax.Array, every.max(axis=0))
-        found, first = seen[:size], size
+        rows, first = seen[:size], size
         for index, pairs in zip(sent, model.rounds, strict=True):
             back = [(target, source) for source, target in pairs]
             part = lax.ppermute(seen[first : first + index.size], model.axis, back)
-            found = found.at[index].max(part)
+            rows = rows.at[index].max(part)
             first += index.size
-        return found
+        return rows
 
     available, missing = model.available, quantity.ndim - model.available.ndim
     available = available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
@@ -251,7 +251,7 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
 
 @distinct_labels.register
 def _(world: ShardedMDP) -> np.ndarray:
-    return np.asarray(world.shown)
+    return np.asarray(world.label_rows)
 
 
 @letters_by_state.register
@@ -278,9 +278,9 @@ def _(model: ShardedMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
             pick = policy[:, None, None]
             chosen = (jnp.take_along_axis(x.reshape(shape), pick, 1)[:, 0] for x in tables[0])
             return _rows(RowTable(*chosen), seen, jnp.multiply, jnp.add)
-        found = [_rows(table, seen, jnp.multiply, jnp.add) for table in tables]
+        rows = [_rows(table, seen, jnp.multiply, jnp.add) for table in tables]
         row = jnp.take_along_axis(place, policy[:, None], 1)[:, 0]
-        return kernels.gather(jnp.concatenate(found), row)
+        return kernels.gather(jnp.concatenate(rows), row)
 
     return lambda value: over_devices(
         model, one, model.tables, model.place, model.sent, model.available, policy, value

@@ -60,12 +60,12 @@ def host_callback(function: Callable[..., PyTree], result: PyTree, *arguments: P
     # JAX rounds the arrays of a callback to single precision if double precision is enabled for the
     # calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
     arguments = jax.tree.map(jnp.asarray, arguments)
-    given = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)
+    dtypes = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)
     kinds = jax.tree.map(lambda x: np.dtype(jax.dtypes.canonicalize_dtype(x.dtype)), result)
 
     def on_host(*words: PyTree) -> PyTree:
-        found = function(*jax.tree.map(_from_words, words, given))
-        return jax.tree.map(lambda kind, x: _to_words(np.asarray(x, kind)), kinds, found)
+        results = function(*jax.tree.map(_from_words, words, dtypes))
+        return jax.tree.map(lambda kind, x: _to_words(np.asarray(x, kind)), kinds, results)
 
     def words_of(x: jax.Array, kind: np.dtype) -> jax.ShapeDtypeStruct:
         wide = kind.itemsize == 8

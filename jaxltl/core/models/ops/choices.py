@@ -51,8 +51,8 @@ def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array,
 
 def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
     """True where a condition ``bool[S, A]`` holds for some action, and the first such action or 0."""
-    most, action = action_argmax(condition.astype(jnp.float32), jnp.ones_like(condition))
-    return most > 0, action
+    highest, action = action_argmax(condition.astype(jnp.float32), jnp.ones_like(condition))
+    return highest > 0, action
 
 
 def is_deterministic(policy: chex.Array) -> bool:
@@ -224,11 +224,11 @@ class Rows:
     def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
         last = self.shape[0]
         number = jnp.arange(last, dtype=jnp.int32)
-        found = kernels.segment_reduce(
+        row = kernels.segment_reduce(
             jnp.minimum, jnp.where(condition, number, last), self.state, self.num_states
         )
-        some = found < last
-        return some, jnp.where(some, found, self.start[:-1]).astype(jnp.int32)
+        some = row < last
+        return some, jnp.where(some, row, self.start[:-1]).astype(jnp.int32)
 
     def all(self, condition: jax.Array) -> jax.Array:
         return ~self.first(~condition)[0]

@@ -96,9 +96,9 @@ def reciprocal(x: jax.Array) -> jax.Array:
     # One step of Newton's method squares the relative error u of the first guess.
     high = lax.real(x)
     guess = jnp.where(high == 0, 0, 1 / jnp.where(high == 0, 1, high))
-    near, rest = words(times(guess, x))
-    left = (1 - near) - rest  # the first difference is exact (Sterbenz 1974)
-    return double_word(guess, jnp.where(high == 0, 0, guess * left))
+    product, rest = words(times(guess, x))
+    remainder = (1 - product) - rest  # the first difference is exact (Sterbenz 1974)
+    return double_word(guess, jnp.where(high == 0, 0, guess * remainder))
 
 
 def _halves(x: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -70,10 +70,10 @@ def by_action(
         ]
         return jnp.stack(each, axis=-1)
     if large and width <= UNROLL:
-        found = fold(columns(successor), columns(weight), value, term, combine)
+        values = fold(columns(successor), columns(weight), value, term, combine)
     else:
-        found = folded(successor, weight, value, term, combine, axis=2)
-    return jnp.moveaxis(found, 1, -1)
+        values = folded(successor, weight, value, term, combine, axis=2)
+    return jnp.moveaxis(values, 1, -1)
 
 
 def folded(
@@ -151,7 +151,7 @@ _SEGMENTS: dict[Term, Callable[..., jax.Array]] = {
 def segment_reduce(combine: Term, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
     """Reduction of ``[T, ...]`` over nonempty segments with ascending ids `owner`: ``[count, ...]``."""
     numbers = quantity.astype(jnp.int32) if quantity.dtype == bool else quantity
-    found = _SEGMENTS[combine](
+    reduced = _SEGMENTS[combine](
         numbers, owner, count, indices_are_sorted=True, mode="promise_in_bounds"
     )
-    return found.astype(bool) if combine is jnp.logical_or else found
+    return reduced.astype(bool) if combine is jnp.logical_or else reduced

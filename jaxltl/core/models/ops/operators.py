@@ -388,7 +388,7 @@ class Policy(NamedTuple):
     """A validated policy."""
 
     distribution: jax.Array  # float[S, A], uniform in invalid rows
-    given: jax.Array  # as given, NaN where an unavailable action has weight
+    masked: jax.Array  # the given weights, NaN where an unavailable action has weight
     valid: jax.Array  # bool[]: all rows are distributions, without subnormal weights
     representable: jax.Array  # bool[], of the model, see is_representable
 
@@ -397,16 +397,16 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     """A policy with its validity in the states `where`; differentiable in a stochastic policy."""
     policy, over = policy_distribution(model, policy), choices(model)
     available = over.available
-    given = jnp.where(available | (policy == 0), policy, jnp.nan)
-    total = over.sum(given)
-    row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(given >= 0)
+    masked = jnp.where(available | (policy == 0), policy, jnp.nan)
+    total = over.sum(masked)
+    row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(masked >= 0)
     row |= ~jnp.asarray(where & unpadded_states(model))
     uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
     used = jnp.where(
         over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
     )
     valid = jnp.all(row) & ~jnp.any(is_subnormal(policy))
-    return Policy(used, lax.stop_gradient(given), valid, is_representable(model))
+    return Policy(used, lax.stop_gradient(masked), valid, is_representable(model))
 
 
 def require_policy(model: Model, policy: Array, where: Array = True) -> None:
@@ -434,10 +434,10 @@ def require_policy(model: Model, policy: Array, where: Array = True) -> None:
         return
     if table.shape != shape:
         policy_distribution(model, table)
-    given = np.where(available | (table == 0), table, np.nan)
-    good = (np.abs(given.sum(-1) - 1) <= row_tolerance(table.dtype)) & (given >= 0).all(-1)
+    masked = np.where(available | (table == 0), table, np.nan)
+    good = (np.abs(masked.sum(-1) - 1) <= row_tolerance(table.dtype)) & (masked >= 0).all(-1)
     for state in map(tuple, np.argwhere(~good & where)[:1].tolist()):
-        raise ValueError(f"{describe_row(given[state], state)}.")
+        raise ValueError(f"{describe_row(masked[state], state)}.")
     if (small := underflows(table, model.dtype)) is not None:
         *state, action = np.argwhere(small)[0].tolist()
         raise ValueError(

@@ -71,8 +71,8 @@ class ModelOperator:
         shape = self.model.state_shape
 
         def one(value: jax.Array) -> list[jax.Array]:
-            found = operators.expectation(self.model, value.reshape(shape))
-            return [x.ravel() for x in jnp.moveaxis(found, -1, 0)]
+            values = operators.expectation(self.model, value.reshape(shape))
+            return [x.ravel() for x in jnp.moveaxis(values, -1, 0)]
 
         if value.ndim == 1:
             return one(value)
@@ -126,8 +126,8 @@ def sweep_operator(
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
         return row_entries(world)
-    if isinstance(world, ShardedMDP) and (spread := _spread_out(world)):
-        return spread
+    if isinstance(world, ShardedMDP) and (ranges := _spread_out(world)):
+        return ranges
     return successor_table(model) or ModelOperator(model)
 
 

@@ -22,8 +22,8 @@ def underflows(probability: np.ndarray, dtype: np.typing.DTypeLike) -> np.ndarra
     tiny = jnp.finfo(dtype).tiny
     if probability.dtype == np.float64 and probability.size and probability.min() >= tiny:
         return None
-    found = (probability > 0) & (probability < tiny)
-    return found if found.any() else None
+    mask = (probability > 0) & (probability < tiny)
+    return mask if mask.any() else None
 
 
 def underflow_text(value: float, dtype: np.typing.DTypeLike) -> str:

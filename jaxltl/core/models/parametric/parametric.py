@@ -76,19 +76,19 @@ class ParametricMDP:
 
     def valid_points(self, name: str, points: ArrayLike) -> np.ndarray:
         """Validated points of the box, ``float64[N, D]``."""
-        found, names = validation.float_array(f"{name}s", points), self.parameters
-        if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
+        array, names = validation.float_array(f"{name}s", points), self.parameters
+        if array.ndim != 2 or array.shape[1] != len(names) or not len(array):
             raise ValueError(
-                f"{name}s has shape {found.shape}; expected (N, {len(names)}), a number "
+                f"{name}s has shape {array.shape}; expected (N, {len(names)}), a number "
                 f"for each of {', '.join(names)}."
             )
-        out = ~((found >= self.low) & (found <= self.high))
+        out = ~((array >= self.low) & (array <= self.high))
         for n, d in first_true(out):
             raise ValueError(
-                f"{name} {n} has {names[d]} = {found[n, d]:.9g}; its interval is "
+                f"{name} {n} has {names[d]} = {array[n, d]:.9g}; its interval is "
                 f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
             )
-        return found
+        return array
 
     def _at(self, point: np.ndarray) -> SparseMDP:
         if self.exact is None:
@@ -163,16 +163,16 @@ def make_parametric(
     numbers = Partial(_paired, numbers, model.host.state)
     model = replace(model, valuation={})
     _check_shapes(numbers, model, len(names))
-    inside, found = point_inside(low, high, lambda x: _evaluated(model, numbers, x))
-    return ParametricMDP(found, numbers, low, high, inside, names)
+    inside, nominal = point_inside(low, high, lambda x: _evaluated(model, numbers, x))
+    return ParametricMDP(nominal, numbers, low, high, inside, names)
 
 
 def _paired(
     numbers: Callable[[jax.Array], PyTree], state: Array, x: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Probabilities and rewards of choices."""
-    found = numbers(x)
-    probability, rewards = found if isinstance(found, tuple) else (found, {})
+    result = numbers(x)
+    probability, rewards = result if isinstance(result, tuple) else (result, {})
     size = state.shape[0]
     return jnp.asarray(probability), {
         name: jnp.asarray(r) if jnp.shape(r) == (size,) else jnp.asarray(r)[state]
@@ -203,8 +203,8 @@ def _evaluated(
     model: SparseMDP, numbers: Callable[[jax.Array], PyTree], point: np.ndarray
 ) -> SparseMDP:
     """The validated model at a point."""
-    found = _evaluate(numbers, np.asarray(point, jnp.zeros(()).dtype))
-    probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), found)
+    values = _evaluate(numbers, np.asarray(point, jnp.zeros(()).dtype))
+    probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), values)
     host = model.host
     wrong = ~(probability > 0)  # NaN too
     for e in first_true(wrong):
@@ -267,15 +267,15 @@ def _point(of: str, values: PyTree, names: Sequence[str]) -> np.ndarray:
                 f"{word}; the parameters are {', '.join(names)}."
             )
         values = [values[name] for name in names]
-    found = validation.float_array(of, values)
-    if found.ndim == 0 and of != "values":
-        found = np.full(len(names), found)
-    if found.shape != (len(names),):
+    point = validation.float_array(of, values)
+    if point.ndim == 0 and of != "values":
+        point = np.full(len(names), point)
+    if point.shape != (len(names),):
         raise ValueError(
-            f"{of} has shape {found.shape}; expected ({len(names)},), a number for "
+            f"{of} has shape {point.shape}; expected ({len(names)},), a number for "
             f"each of {', '.join(names)}."
         )
-    if not np.isfinite(found).all():
-        d = int(np.flatnonzero(~np.isfinite(found))[0])
-        raise ValueError(f"{of} of {names[d]} is {found[d]}; give a finite number.")
-    return found
+    if not np.isfinite(point).all():
+        d = int(np.flatnonzero(~np.isfinite(point))[0])
+        raise ValueError(f"{of} of {names[d]} is {point[d]}; give a finite number.")
+    return point

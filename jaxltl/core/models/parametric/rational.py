@@ -74,14 +74,14 @@ def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polyn
     table = np.zeros((len(factors), width), np.int32)
     for row, places in zip(table, factors, strict=True):
         row[: len(places)] = places
-    most = max((power for powers in number for power in powers), default=1)
+    degree = max((power for powers in number for power in powers), default=1)
     return Polynomials(
         table,
         np.asarray(owner, np.int32),
         np.asarray(monomial, np.int32),
         np.asarray(coefficient, np.float64),
         len(polynomials),
-        max(most.bit_length() - 1, 0),
+        max(degree.bit_length() - 1, 0),
     )
 
 
@@ -154,11 +154,11 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     coefficient = np.asarray(of.coefficient, np.float64)
     ends = np.stack([low, high])
     # Term by term: monomials of nonnegative parameters are monotone.
-    least, most = (np.prod(x**powers, axis=1)[monomial] for x in ends)
-    small = np.where(coefficient > 0, coefficient * least, coefficient * most)
-    large = np.where(coefficient > 0, coefficient * most, coefficient * least)
+    least, greatest = (np.prod(x**powers, axis=1)[monomial] for x in ends)
+    small = np.where(coefficient > 0, coefficient * least, coefficient * greatest)
+    large = np.where(coefficient > 0, coefficient * greatest, coefficient * least)
     lower, upper = (np.bincount(owner, x, of.count) for x in (small, large))
-    size = np.bincount(owner, np.abs(coefficient) * most, of.count)
+    size = np.bincount(owner, np.abs(coefficient) * greatest, of.count)
     terms = np.bincount(owner, minlength=of.count)
     used = np.zeros((of.count, low.size), bool)
     np.logical_or.at(used, owner, powers[monomial] > 0)
@@ -167,10 +167,10 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     number = used.sum(1)
     for n in np.unique(number[linear & (terms > 1) & (number <= _MOST)]):
         some = np.flatnonzero(linear & (terms > 1) & (number == n))
-        found = _corners(some, n, used, _Terms(owner, powers[monomial], coefficient), ends)
+        extremes = _corners(some, n, used, _Terms(owner, powers[monomial], coefficient), ends)
         lower[some], upper[some] = (
-            np.maximum(lower[some], found[0]),
-            np.minimum(upper[some], found[1]),
+            np.maximum(lower[some], extremes[0]),
+            np.minimum(upper[some], extremes[1]),
         )
     # Powers, products, the sum and the coefficient are rounded.
     slack = (2 * powers.max(initial=0) + 2 * low.size + terms + 4) * _EPS * size
@@ -180,11 +180,11 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
 def _powers(of: Polynomials, num_parameters: int) -> np.ndarray:
     """The power of each parameter in each monomial, ``int[M, D]``."""
     factor = np.asarray(of.factor)
-    found = np.zeros((factor.shape[0], num_parameters), np.int64)
+    power_table = np.zeros((factor.shape[0], num_parameters), np.int64)
     m, w = np.nonzero(factor)
     square, d = np.divmod(factor[m, w] - 1, num_parameters)
-    np.add.at(found, (m, d), 1 << square)
-    return found
+    np.add.at(power_table, (m, d), 1 << square)
+    return power_table
 
 
 class _Terms(NamedTuple):

@@ -239,7 +239,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
         read = _read(game, ~game.system)
         other = valid_policy(game, jnp.asarray(environment), read)
         weight = jnp.where(over.spread(read), other.distribution, weight)
-        given = jnp.where(over.spread(read), other.given, given)
+        given = jnp.where(over.spread(read), other.masked, given)
         valid &= other.valid
     return _Drawn(Policy(weight, given, valid, representable), lax.stop_gradient(weight) > 0)
 

@@ -192,7 +192,7 @@ def refuse(solution: Solution, checked: Policy | None) -> Solution:
     code = jnp.where(checked.representable, Status.INVALID_POLICY, Status.INVALID)
     valid = checked.valid & checked.representable
 
-    policy = jnp.where(valid, solution.policy, checked.given)
+    policy = jnp.where(valid, solution.policy, checked.masked)
     reason = jnp.where(valid, Status.CONVERGED, code)
     result: Solution = invalidated(replace(solution, policy=policy), reason)
     return result

@@ -85,7 +85,7 @@ def episode_evaluator(
       >>> [float(x) for x in evaluate(jnp.array([0.5]), jax.random.key(0))]
       [-1.3125, 0.328125]
     """
-    num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=2**31 - 1)
+    num_episodes = validation.integer("num_episodes", num_episodes, least=1, limit=2**31 - 1)
     several = (
         (costs,)
         if isinstance(costs, str) or callable(costs)

@@ -186,9 +186,9 @@ def evaluate(
     environment = require_environment(environment)
     num_steps = checked_steps(environment, num_steps)
     most = 2**31 - 1
-    num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=most)
+    num_episodes = validation.integer("num_episodes", num_episodes, least=1, limit=most)
     batch = batch if isinstance(batch, Batch) else Batch(batch)
-    size = validation.integer("batch", batch.size, least=1, most=most)
+    size = validation.integer("batch", batch.size, least=1, limit=most)
     confidence = validation.fraction("confidence", confidence, ends=(False, False))
     if threshold is not None:
         threshold = validation.fraction("threshold", threshold, ends=(False, False))
@@ -264,7 +264,7 @@ def checked_steps(environment: Environment, num_steps: int | None) -> int:
             "episodes that never end: neither the environment nor num_steps says after how many "
             "steps; give num_steps, or with_time_limit(environment, num_steps)."
         )
-    return validation.integer("num_steps", steps, least=1, most=2**31 - 1)
+    return validation.integer("num_steps", steps, least=1, limit=2**31 - 1)
 
 
 def _checked_agent(agent: object, environment: Environment) -> tuple[Agent, PyTree]:

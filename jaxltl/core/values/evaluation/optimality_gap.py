@@ -125,7 +125,7 @@ def tabulate_policy(
     """
     inner, _ = without_time_limit(environment)
     validation.instance("table", table, Table, "one of tabulate")
-    num_memory = validation.integer("num_memory", num_memory, least=1, most=2**24)
+    num_memory = validation.integer("num_memory", num_memory, least=1, limit=2**24)
     count = table.model.num_states
     size = max(1, min(count, _BATCH // num_memory))
     policy = as_partial(policy, "policy")

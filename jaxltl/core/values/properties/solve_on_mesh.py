@@ -85,7 +85,9 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     index: tuple[jax.Array, ...] = (starts,)
     advance: Callable[[Bounds, float, int], Solution]
     if path.operator == "F" and is_boolean(path.operands[0]):
-        holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
+        holds = satisfying(
+            np.asarray(model.label_rows), model.propositions, path.operands[0], prop.text
+        )
         target = jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
         reward = None if prop.operator == "P" else _reward(model, prop)
 
