@@ -37,25 +37,25 @@ class Choices(NamedTuple):
         """The optimum over the choices of each state, by ``np.maximum`` or ``np.minimum``."""
         if self.is_chain:
             return quantity
-        found = quantity[: self.starts[1]].copy()
+        optimum = quantity[: self.starts[1]].copy()
         for a, b in pairwise(self.starts[1:]):
-            operation(found[: b - a], quantity[a:b], out=found[: b - a])
+            operation(optimum[: b - a], quantity[a:b], out=optimum[: b - a])
         if self.further.size:
-            left = operation.reduceat(quantity[self.starts[-1] :], self.further)
-            operation(found[: left.size], left, out=found[: left.size])
-        return found
+            rest = operation.reduceat(quantity[self.starts[-1] :], self.further)
+            operation(optimum[: rest.size], rest, out=optimum[: rest.size])
+        return optimum
 
     def first(self, quantity: Floats, best: Floats) -> Integers:
         """The first choice that attains the optimum of each state: ``int[N]``."""
-        found = np.arange(self.states.size)
+        choice = np.arange(self.states.size)
         if self.further.size:
             end = self.starts[-1]
             hit = end + np.flatnonzero(quantity[end:] == best[self.owner[end:]])
-            found[self.owner[hit[::-1]]] = hit[::-1]  # the first one is written last
+            choice[self.owner[hit[::-1]]] = hit[::-1]  # the first one is written last
         for a, b in reversed(list(pairwise(self.starts))):
             hit = quantity[a:b] == best[: b - a]
-            found[: b - a] = np.where(hit, np.arange(a, b), found[: b - a])
-        return found
+            choice[: b - a] = np.where(hit, np.arange(a, b), choice[: b - a])
+        return choice
 
 
 def choices_of(count: Integers) -> Choices:
@@ -63,17 +63,17 @@ def choices_of(count: Integers) -> Choices:
     states = np.argsort(-count, kind="stable")
     base, sizes = (count.cumsum() - count)[states], count[states]
     # How many states have a choice of each rank, and up to which rank slices are faster.
-    most = int(count.max(initial=1))
-    having = count.size - np.bincount(count, minlength=most)[:most].cumsum()
+    largest = int(count.max(initial=1))
+    having = count.size - np.bincount(count, minlength=largest)[:largest].cumsum()
     ranks = _ranks(having)
     owner = concatenated_ranges(np.zeros(ranks, np.int64), having[:ranks])
     rank = np.repeat(np.arange(ranks), having[:ranks])
     starts = [0, *having[:ranks].cumsum().tolist()]
     wide = int(having[ranks]) if ranks < having.size else 0
-    left = sizes[:wide] - ranks
-    owner = np.concatenate([owner, np.repeat(np.arange(wide), left)])
-    rank = np.concatenate([rank, ranks + concatenated_ranges(np.zeros(wide, np.int64), left)])
-    return Choices(states, base[owner] + rank, owner, starts, left.cumsum() - left)
+    remaining = sizes[:wide] - ranks
+    owner = np.concatenate([owner, np.repeat(np.arange(wide), remaining)])
+    rank = np.concatenate([rank, ranks + concatenated_ranges(np.zeros(wide, np.int64), remaining)])
+    return Choices(states, base[owner] + rank, owner, starts, remaining.cumsum() - remaining)
 
 
 def _ranks(having: Integers) -> int:

@@ -26,9 +26,9 @@ class Contraction:
 
     def region(self, states: Booleans) -> Booleans:
         """The nodes of some states, ``bool[N]``."""
-        found = np.zeros(self.mdp.num_states, bool)
-        found[self.node[states]] = True
-        return found
+        nodes = np.zeros(self.mdp.num_states, bool)
+        nodes[self.node[states]] = True
+        return nodes
 
 
 def identity(mdp: HostMDP, cost: Floats | None = None) -> Contraction:

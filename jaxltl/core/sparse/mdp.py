@@ -61,13 +61,13 @@ class HostGraph:
     def is_self_loop(self) -> NDArray[np.bool_]:
         """Rows with their own state as the only successor, ``bool[R]``."""
         count = np.diff(self.entry_start)
-        found: NDArray[np.bool_] = count > 0
-        found[found] = self.successor[self.entry_start[:-1][found]] == self.state[found]
-        several = np.flatnonzero(found & (count > 1))
+        loops: NDArray[np.bool_] = count > 0
+        loops[loops] = self.successor[self.entry_start[:-1][loops]] == self.state[loops]
+        several = np.flatnonzero(loops & (count > 1))
         entry = concatenated_ranges(self.entry_start[several], count[several])
         of = several.repeat(count[several])
-        found[of[self.successor[entry] != self.state[of]]] = False
-        return found
+        loops[of[self.successor[entry] != self.state[of]]] = False
+        return loops
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:

@@ -140,14 +140,14 @@ def _searched(world: _World, start: Integers) -> Booleans:
 
     host, (num_states, num_memory) = world.host, (world.host.num_states, world.num_memory)
     first_entry = host.entry_start[host.row_start].astype(np.int64)
-    left = host.state[host.row] if not world.on_entry else host.successor
+    read = host.state[host.row] if not world.on_entry else host.successor
     # Pairs are numbered by memory first here, so that each memory's edges are together.
     target, count = [], []
     for q in range(num_memory):
         moves = not world.still[q]
         count.append(np.diff(first_entry) * moves)
         if moves:
-            target.append(world.step[world.letter[left], q] * num_states + host.successor)
+            target.append(world.step[world.letter[read], q] * num_states + host.successor)
     first = np.unique(start % num_memory * num_states + start // num_memory)
     target.append(first)  # of an additional node
     size = num_states * num_memory + 1

@@ -62,11 +62,11 @@ class Rows:
 
     def reduce(self, operation: np.ufunc, entries: np.ndarray, default: float) -> np.ndarray:
         """A reduction over the entries of each row, ``[R]``; the default for empty rows."""
-        found = np.full(self.num_rows, default, entries.dtype)
+        reduced = np.full(self.num_rows, default, entries.dtype)
         full = self.count > 0
         if full.any():
-            found[full] = operation.reduceat(entries, self.entry_start[:-1][full])
-        return found
+            reduced[full] = operation.reduceat(entries, self.entry_start[:-1][full])
+        return reduced
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:
@@ -84,9 +84,9 @@ class Rows:
 def concatenated_ranges(start: Integers, count: Integers) -> Integers:
     """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all ranges, concatenated."""
     end = count.cumsum()
-    found: Integers = (start - end + count).repeat(count)
-    found += np.arange(found.size)
-    return found
+    numbers: Integers = (start - end + count).repeat(count)
+    numbers += np.arange(numbers.size)
+    return numbers
 
 
 def row_entries(start: Integers, row: Integers) -> tuple[Integers, Integers]:
@@ -101,9 +101,9 @@ def offsets_from_counts(count: Integers) -> Integers:
     >>> offsets_from_counts(np.array([2, 0, 1])).tolist()
     [0, 2, 2, 3]
     """
-    found: Integers = np.zeros(count.size + 1, np.int64)
-    np.cumsum(count, out=found[1:])
-    return found.astype(np.int32) if found[-1] < 2**31 else found
+    offsets: Integers = np.zeros(count.size + 1, np.int64)
+    np.cumsum(count, out=offsets[1:])
+    return offsets.astype(np.int32) if offsets[-1] < 2**31 else offsets
 
 
 def sorted_unique(number: Integers, size: int) -> Integers:
@@ -126,9 +126,9 @@ def group_starts(number: Integers) -> Booleans:
     >>> group_starts(np.array([1, 1, 3])).tolist()
     [True, False, True]
     """
-    found = np.ones(number.size, bool)
-    np.not_equal(number[1:], number[:-1], out=found[1:])
-    return found
+    starts = np.ones(number.size, bool)
+    np.not_equal(number[1:], number[:-1], out=starts[1:])
+    return starts
 
 
 def first_hits(hit: Booleans, owner: Integers, otherwise: Integers) -> Integers:
@@ -137,9 +137,9 @@ def first_hits(hit: Booleans, owner: Integers, otherwise: Integers) -> Integers:
     >>> first_hits(np.array([False, True, True]), np.array([0, 1, 1]), np.array([7, 7])).tolist()
     [7, 1]
     """
-    place, found = np.flatnonzero(hit)[::-1], otherwise.copy()
-    found[owner[place]] = place  # the first one is written last
-    return found
+    place, first = np.flatnonzero(hit)[::-1], otherwise.copy()
+    first[owner[place]] = place  # the first one is written last
+    return first
 
 
 def decrement(counter: Integers, number: Integers) -> None:

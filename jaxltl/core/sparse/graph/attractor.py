@@ -33,7 +33,7 @@ def attracted(
 ) -> Attraction:
     """States that a goal attracts by some row (`exists`) or by all of `rows`, the rows that count."""
     waiting = np.ones(graph.num_rows, bool) if rows is None else rows.copy()
-    left = (
+    remaining = (
         np.diff(graph.row_start)
         if rows is None
         else np.bincount(graph.state[rows], minlength=graph.num_states)
@@ -46,7 +46,7 @@ def attracted(
         graph,
         waiting,
         lacking,
-        left,
+        remaining,
         open_,
         rule,
         goal.copy(),
@@ -56,7 +56,7 @@ def attracted(
         not rule.all(),
     )
     # In the first round also states without a row join that need all, and empty rows lead anywhere.
-    alone: Integers = np.flatnonzero(~rule & (left == 0) & open_)
+    alone: Integers = np.flatnonzero(~rule & (remaining == 0) & open_)
     empty = np.flatnonzero(waiting & (lacking == 0)) if lacking is not None else None
     frontier, count = search.many(np.flatnonzero(goal), 1, empty), 1
     if alone.size:
@@ -79,8 +79,8 @@ class _Search(NamedTuple):
     graph: HostGraph
     waiting: Booleans  # bool[R], rows that count and do not lead to the region yet
     lacking: Integers | None  # int32[R], entries outside if all must be inside, else None
-    left: Integers  # int32[S], waiting rows of a state
-    open: Booleans  # bool[S], states that may still join
+    remaining: Integers  # int32[S], waiting rows of a state
+    joinable: Booleans  # bool[S], states that may still join
     rule: Booleans  # bool[S], True where one row suffices
     region: Booleans
     row: Integers
@@ -104,18 +104,18 @@ class _Search(NamedTuple):
             mark[row] = True
             row = np.flatnonzero(mark & self.waiting)
         self.waiting[row] = False
-        row = row[self.open[self.graph.state[row]]]
+        row = row[self.joinable[self.graph.state[row]]]
         state: Integers = self.graph.state[row]
         if self.needs_all:
             every = state[~self.rule[state]] if self.needs_one else state
-            decrement(self.left, every)
-            joins = self.left[state] == 0
+            decrement(self.remaining, every)
+            joins = self.remaining[state] == 0
             if self.needs_one:
                 joins |= self.rule[state]
             state, row = state[joins], row[joins]
         first = group_starts(state)  # rows are in order, so those of one state are contiguous
         state = state[first]
-        self.open[state], self.region[state], self.rank[state] = False, True, rank
+        self.joinable[state], self.region[state], self.rank[state] = False, True, rank
         if self.needs_one:
             one = self.rule[state]
             self.row[state[one]] = row[first][one]
@@ -125,7 +125,7 @@ class _Search(NamedTuple):
         """Rounds by plain loops while few states join, as along a chain; the next frontier."""
         arrays: tuple[Any, ...] = (*self.graph.predecessors, self.graph.state, *self[1:9])
         views: list[Any] = [None if x is None else memoryview(x) for x in arrays]
-        start, pred, owner, waiting, lacking, left, open_, rule, region, first, joined = views
+        start, pred, owner, waiting, lacking, remaining, open_, rule, region, first, joined = views
         todo = frontier.tolist()
         while todo and len(todo) <= FEW:
             rows: list[int] = []
@@ -143,8 +143,8 @@ class _Search(NamedTuple):
                 if waiting[row]:
                     waiting[row] = False
                     state = owner[row]
-                    left[state] -= 1
-                    if (rule[state] or not left[state]) and open_[state]:
+                    remaining[state] -= 1
+                    if (rule[state] or not remaining[state]) and open_[state]:
                         open_[state], region[state], joined[state] = False, True, rank
                         if rule[state]:
                             first[state] = row

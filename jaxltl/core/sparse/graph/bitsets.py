@@ -40,24 +40,24 @@ class BitGraph:
     def read(self, words: Words, part: Part) -> Words:
         """The memory states in which entering a state of a block leads to a pair of a set."""
         letter = self.letter[part]
-        found: Words = self.after[0][letter + (words & 255).astype(np.int64)]
+        memory: Words = self.after[0][letter + (words & 255).astype(np.int64)]
         for i, table in enumerate(self.after[1:], 1):
-            found |= table[letter + (words >> (8 * i) & 255).astype(np.int64)]
-        return found
+            memory |= table[letter + (words >> (8 * i) & 255).astype(np.int64)]
+        return memory
 
     def seen(self, words: Words) -> Words:
         """The same for all states, and the empty word for padding."""
-        found = np.zeros(self.num_states + 1, words.dtype)
-        found[:-1] = self.read(words, slice(None))
-        return found
+        memory = np.zeros(self.num_states + 1, words.dtype)
+        memory[:-1] = self.read(words, slice(None))
+        return memory
 
     def hits(self, action: int, seen: Words, part: Part) -> Words:
         """The memory states in which an action may lead to a set, for some states."""
         first, *others = self.columns[action]
-        found = seen[first[part]]
+        memory = seen[first[part]]
         for column in others:
-            found |= seen[column[part]]
-        return found
+            memory |= seen[column[part]]
+        return memory
 
     def grow(
         self,
@@ -100,17 +100,17 @@ class BitGraph:
         kept: list[Words],
         action: Integers | None,
     ) -> Words:
-        found = open_.copy() if forced else np.zeros_like(open_)
+        joining = open_.copy() if forced else np.zeros_like(open_)
         for a in range(len(self.columns)):
             hit = self.hits(a, seen, part)
             if forced:
-                found &= hit | ~kept[a][part]
+                joining &= hit | ~kept[a][part]
                 continue
             hit &= kept[a][part] & open_
             if action is not None:
-                _note(action, part, hit & ~found, a)
-            found |= hit
-        return found
+                _note(action, part, hit & ~joining, a)
+            joining |= hit
+        return joining
 
     def only(self, words: Words) -> list[Words]:
         """For each action the pairs in which it is permitted and all successors are in a set."""
@@ -130,10 +130,10 @@ def _note(action: Integers, part: Part, words: Words, number: int) -> None:
 
 def _first(action: Integers, words: Words, kept: list[Words]) -> None:
     """Writes the first action that counts, into an array of zeros."""
-    left = words & ~kept[0]
+    remaining = words & ~kept[0]
     for a in range(1, len(kept)):
-        _note(action, slice(None), left & kept[a], a)
-        left &= ~kept[a]
+        _note(action, slice(None), remaining & kept[a], a)
+        remaining &= ~kept[a]
 
 
 def pack(mask: Booleans) -> Words:
@@ -201,12 +201,12 @@ def decided(graph: BitGraph, target: Words, num_memory: int, *, maximize: bool) 
     action = np.zeros((graph.num_states, num_memory), np.int32)
     before = everything & ~target
     _first(action, everything, graph.permitted)
-    found = (_largest if maximize else _smallest)(graph, target, before, action)
-    if found is None:
+    sets = (_largest if maximize else _smallest)(graph, target, before, action)
+    if sets is None:
         return None
-    one, zero = found
-    left = everything & ~(one | zero)
-    out = graph.grow(everything & ~left, left, forced=True) if maximize else everything
+    one, zero = sets
+    undecided = everything & ~(one | zero)
+    out = graph.grow(everything & ~undecided, undecided, forced=True) if maximize else everything
     return None if out is None else BitSets(one, zero, everything & ~out, action)
 
 
@@ -225,15 +225,15 @@ def _largest(
             return None
         kept = graph.only(everything & ~grown)
         among = before & ~grown
-        found = graph.grow(target, among, forced=False, kept=kept) if among.any() else target
-        if found is None:
+        reached = graph.grow(target, among, forced=False, kept=kept) if among.any() else target
+        if reached is None:
             return None
-        if (found == everything & ~grown).all():
+        if (reached == everything & ~grown).all():
             break
-        outside = everything & ~found
+        outside = everything & ~reached
     if among.any():
         graph.grow(target, among, forced=False, kept=kept, action=action)
-    return found, everything & ~some
+    return reached, everything & ~some
 
 
 def _smallest(

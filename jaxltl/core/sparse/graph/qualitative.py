@@ -43,10 +43,10 @@ def almost_sure_reachability(
         outside = ~inside
         leaving = mdp.support.some_successor_in(outside)
         kept &= ~leaving & inside[mdp.state]
-        found = backward_reachable(mdp, goal & inside, kept)
-        if (found == inside).all():
+        reached = backward_reachable(mdp, goal & inside, kept)
+        if (reached == inside).all():
             return inside, kept
-        inside = found
+        inside = reached
 
 
 def shortest_path_rows(mdp: HostGraph, goal: Booleans, rows: Booleans) -> Integers:
@@ -62,9 +62,9 @@ class EndComponents(NamedTuple):
 
     def region(self, mdp: HostGraph) -> Booleans:
         """The states of end components, ``bool[S]``."""
-        found = np.zeros(mdp.num_states, bool)
-        found[mdp.state[self.inside]] = True
-        return found
+        states = np.zeros(mdp.num_states, bool)
+        states[mdp.state[self.inside]] = True
+        return states
 
 
 def end_components(
@@ -79,8 +79,8 @@ def end_components(
     if states is not None:
         kept &= states[mdp.state]
     still = kept & mdp.is_self_loop
-    found = _moving_components(mdp, kept & ~still)
-    return found._replace(inside=found.inside | still)
+    components = _moving_components(mdp, kept & ~still)
+    return components._replace(inside=components.inside | still)
 
 
 def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
@@ -115,9 +115,9 @@ def _labels(
     number = np.full(candidates.size, -1)
     number[node] = np.arange(node.size)
     stays = ~leaves[of]
-    found = strong_components(number[state[of[stays]]], number[target[stays]], node.size)
+    leader = strong_components(number[state[of[stays]]], number[target[stays]], node.size)
     label: Integers = np.full(candidates.size, -1)
-    label[node] = node[found]
+    label[node] = node[leader]
     return label
 
 

@@ -42,8 +42,8 @@ class RowGraph:
 
     def exists(self, region: Booleans) -> Booleans:
         """Tests if some successor lies in a region; False where unavailable."""
-        found = self.host.support.some_successor_in(region.reshape(-1))
-        return found.reshape(self.available.shape)
+        rows = self.host.support.some_successor_in(region.reshape(-1))
+        return rows.reshape(self.available.shape)
 
     def forall(self, region: Booleans) -> Booleans:
         """Tests if all successors lie in a region; True where unavailable."""
@@ -51,8 +51,8 @@ class RowGraph:
 
     def least(self, value: Integers) -> Integers:
         """The smallest value among the successors; the dtype's largest without any."""
-        found = self.host.support.least(value.reshape(-1), np.iinfo(value.dtype).max)
-        return found.reshape(self.available.shape)
+        smallest = self.host.support.least(value.reshape(-1), np.iinfo(value.dtype).max)
+        return smallest.reshape(self.available.shape)
 
     def reads(self, marked: Booleans) -> Booleans:
         """Tests if an action can read a marked transition ``bool[Q, L]``: ``bool[S, Q, A]``."""
@@ -63,8 +63,8 @@ class RowGraph:
         support, num_memory = self.host.support, self.state_shape[1]
         row = np.arange(support.num_rows) // self.available.shape[-1] % num_memory
         entry = self.host.successor // num_memory * num_memory + np.repeat(row, support.count)
-        found = support.reduce(np.logical_or, here.reshape(-1)[entry], False)
-        return found.reshape(self.available.shape)
+        rows = support.reduce(np.logical_or, here.reshape(-1)[entry], False)
+        return rows.reshape(self.available.shape)
 
     def first(self, mask: Booleans) -> tuple[Booleans, Integers]:
         """Tests if a mask holds for some choice of a state; and the first one (or first of all)."""
@@ -75,7 +75,7 @@ class RowGraph:
     ) -> tuple[Booleans, Integers, Integers]:
         """Region, choice and rank of an attractor."""
         allowed, shape = allowed & self.available, self.state_shape
-        found = attracted(
+        attraction = attracted(
             self.host,
             goal.reshape(-1),
             allowed.reshape(-1),
@@ -83,8 +83,8 @@ class RowGraph:
             chance=chance,
             among=among.reshape(-1),
         )
-        region, rank = found.region.reshape(shape), found.rank.reshape(shape)
-        row = found.row - self.host.row_start[:-1] if self.is_padded else found.row
+        region, rank = attraction.region.reshape(shape), attraction.rank.reshape(shape)
+        row = attraction.row - self.host.row_start[:-1] if self.is_padded else attraction.row
         joined = region & ~goal
         # Where every choice leads nearer none is better than the first.
         action = np.where(rule, row.reshape(shape), self.first(allowed)[1])
@@ -104,9 +104,9 @@ class RowGraph:
             source, target = host.state[host.row[used]], host.successor[used]
             label = strong_components(source, target, host.num_states)
             crossing = label[source] != label[target]
-            left = np.zeros(host.num_states, bool)
-            left[label[source[crossing]]] = True
-            inside = rows & ~left[label][host.state]
+            exited = np.zeros(host.num_states, bool)
+            exited[label[source[crossing]]] = True
+            inside = rows & ~exited[label][host.state]
             alive = host.first_choice(inside)[0]
             component = np.where(alive, label, np.arange(host.num_states))
         return (
@@ -116,9 +116,9 @@ class RowGraph:
 
     def anywhere(self, mark: Booleans, component: Integers) -> Booleans:
         """Tests if a state of the same component is marked: ``bool[S]``."""
-        found = np.zeros(component.size, bool)
-        found[component[mark]] = True
-        return found[component]
+        marked = np.zeros(component.size, bool)
+        marked[component[mark]] = True
+        return marked[component]
 
     # --- loops --------------------------------------------------------------------------------
 

@@ -44,8 +44,8 @@ class DiscountedModel:
         matrix = mdp.matrix.copy()
         matrix.data = matrix.data * self.discount[row][mdp.row]
         system = factorize(matrix, label, np.arange(mdp.num_states))
-        found = None if system is None else system.solve(earned)
-        return found if found is not None and np.isfinite(found).all() else None
+        value = None if system is None else system.solve(earned)
+        return value if value is not None and np.isfinite(value).all() else None
 
 
 def discounted_value(problem: DiscountedModel, query: Query) -> RobustValues:
@@ -72,18 +72,18 @@ def discounted_value(problem: DiscountedModel, query: Query) -> RobustValues:
         # Nature answers first; only then does the policy improve.
         taken = np.isin(np.arange(mdp.num_rows), row)
         answers = ((image - now) * nature > noise) & taken
-        found = mdp.over_choices(best, image)
-        residual = float(np.abs(found - value).max())
+        optimum = mdp.over_choices(best, image)
+        residual = float(np.abs(optimum - value).max())
         error = (residual + float(noise.max())) * steps
         if error < (high - low).max() / 2:
             low, high = value - error, value + error
         if 2 * error <= query.tolerance:
             break
-        better = sign * (found - image[row]) > noise[row]
+        better = sign * (optimum - image[row]) > noise[row]
         if not answers.any() and not better.any():
             break
         p = np.where((answers | ~taken)[mdp.row], q, p)
         if not answers.any():
-            row = np.where(better, mdp.first_choice(image == found[mdp.state])[1], row)
+            row = np.where(better, mdp.first_choice(image == optimum[mdp.state])[1], row)
     values = enclosed_values(value, (low, high), row, p, rounds=rounds, residual=residual)
     return replace(values, method="policy iteration with nature")

@@ -31,18 +31,18 @@ class EncodedChoices:
     def policy(self, row: Integers, probability: Floats) -> Integers:
         """Original rows of a policy; nature's most likely one where it chooses."""
         size = int(self.source.size - np.count_nonzero(np.arange(self.source.size) != self.source))
-        found = self.row[row[:size]].copy()
+        policy = self.row[row[:size]].copy()
         mdp = self.model.mdp
-        for s in np.flatnonzero(found < 0):
+        for s in np.flatnonzero(policy < 0):
             first, last = mdp.entry_start[row[s]], mdp.entry_start[row[s] + 1]
-            found[s] = self.chosen[first + int(probability[first:last].argmax())]
-        return found
+            policy[s] = self.chosen[first + int(probability[first:last].argmax())]
+        return policy
 
     def nature(self, probability: Floats, otherwise: Floats) -> Floats:
         """Nature's distributions in the original entries, `otherwise` elsewhere."""
-        found, original = otherwise.copy(), self.entry >= 0
-        found[self.entry[original]] = probability[original]
-        return found
+        nature, original = otherwise.copy(), self.entry >= 0
+        nature[self.entry[original]] = probability[original]
+        return nature
 
 
 def choices_as_nature(

@@ -46,19 +46,19 @@ def narrow_intervals(
     rise, fall = upper - center, center - lower
     if used is not None:
         rise, fall = np.where(used, rise, 0), np.where(used, fall, 0)
-    left = limits.gain - _sums_before(rise)
-    added = np.clip(np.where(left > limits.rounding, left, 0), 0, rise)
+    remaining = limits.gain - _sums_before(rise)
+    added = np.clip(np.where(remaining > limits.rounding, remaining, 0), 0, rise)
     high = np.where(added == rise, upper, center + added)
-    left = limits.gain - limits.deficit - _sums_before(fall[:, ::-1])[:, ::-1]
-    removed = np.clip(np.where(left > limits.rounding, left, 0), 0, fall)
-    low = np.where(fall <= left + limits.rounding, lower, center - removed)
+    remaining = limits.gain - limits.deficit - _sums_before(fall[:, ::-1])[:, ::-1]
+    removed = np.clip(np.where(remaining > limits.rounding, remaining, 0), 0, fall)
+    low = np.where(fall <= remaining + limits.rounding, lower, center - removed)
     return low, high
 
 
 def _sums_before(x: Floats) -> Floats:
-    found = np.zeros_like(x)
-    np.cumsum(x[:, :-1], axis=1, out=found[:, 1:])
-    return found
+    sums = np.zeros_like(x)
+    np.cumsum(x[:, :-1], axis=1, out=sums[:, 1:])
+    return sums
 
 
 def share_of(part: Floats, whole: Floats) -> Floats:

@@ -53,9 +53,9 @@ def parity_against_nature(
             row = np.where(better, mdp.first_choice(gain == best[mdp.state])[1], row)
         else:
             game = _class_game(model, value, gain)
-            found = almost_sure_parity(game, priority, leader="policy")
-            better = found.region & (value < 1 - _CLASS)
-            row = np.where(better, found.row, row)
+            winning = almost_sure_parity(game, priority, leader="policy")
+            better = winning.region & (value < 1 - _CLASS)
+            row = np.where(better, winning.row, row)
         if not better.any() or rounds == _ROUNDS:
             break
     nature = almost_sure_parity(_class_game(model, value, gain), priority + 1, leader="nature")
@@ -76,10 +76,10 @@ def _value_under_nature(
     mdp = model.resolve(p)
     region = accepting_region(mdp, priority[mdp.state[mdp.row]]).region
     depth = distribution_depth(mdp)
-    found = mdp_reachability.reachability(
+    enclosure = mdp_reachability.reachability(
         mdp, region, maximize=True, tolerance=tolerance / 2, depth=depth
     )
-    return p, found.upper if able else np.ones(mdp.num_states)
+    return p, enclosure.upper if able else np.ones(mdp.num_states)
 
 
 def _losing_probability(
@@ -141,8 +141,8 @@ def optimal_face(model: UncertainMDP, rank: Integers) -> UncertainMDP:
     gains, loses = (binds & (rank == x[row]) for x in (gainer, loser))
     lower = np.where(gains, center, np.where(loses, model.lower, np.where(binds, p, lower)))
     upper = np.where(gains, model.upper, np.where(loses, center, np.where(binds, p, upper)))
-    left = model.sum_rows(np.where(loses, p - lower, 0))
-    upper = np.where(loses & (left <= model.rounding)[row], lower, upper)
+    movable = model.sum_rows(np.where(loses, p - lower, 0))
+    upper = np.where(loses & (movable <= model.rounding)[row], lower, upper)
     inner = np.where(binds, lower, np.where(free, center, p))
     limit = np.where(np.logical_or.reduceat(binds, start), 1, spare)
     return SplitMDP(
@@ -168,24 +168,24 @@ class SplitMDP(UncertainMDP):
         return (self.gains, self.mass), (~self.gains, 1 - self.mass)
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
-        found = UncertainMDP.can_stay_on(self, entries)
+        stays = UncertainMDP.can_stay_on(self, entries)
         for part, mass in self._parts:
             room = self.sum_rows(np.where(entries & part, self.upper, 0))
-            found &= room >= mass - self.rounding
-        return found
+            stays &= room >= mass - self.rounding
+        return stays
 
     def interior_distributions(self, entries: Booleans) -> Floats:
         row = self.mdp.row
         entries = entries | ~self.can_stay_on(entries)[row]
-        found = UncertainMDP.interior_distributions(self, entries)
+        distribution = UncertainMDP.interior_distributions(self, entries)
         split = np.logical_or.reduceat(self.gains, self.mdp.entry_start[:-1])[row]
         for part, mass in self._parts:
             free = np.where(entries & part, self.upper - self.lower, 0)
             rest = mass - self.sum_rows(np.where(part, self.lower, 0))
             share = share_of(rest, self.sum_rows(free))[row]
             inner = np.where(entries, self.lower + free * share, 0)
-            found = np.where(part & split, inner, found)
-        return found
+            distribution = np.where(part & split, inner, distribution)
+        return distribution
 
 
 def almost_sure_parity(game: ClassGame, priority: Integers, *, leader: str) -> RobustRegion:
@@ -264,34 +264,36 @@ class _Fixpoint:
         below = (self.priority >= 2 * level + 1).any()
         y = ys[-1] if ys else np.ones(self.priority.size, bool)
         while True:
-            found = self.solve([*ys, y], [*xs, np.zeros_like(y)])
+            winning = self.solve([*ys, y], [*xs, np.zeros_like(y)])
             while below:
-                new = self.solve([*ys, y], [*xs, found.region])
-                fresh = new.region & ~found.region
+                new = self.solve([*ys, y], [*xs, winning.region])
+                fresh = new.region & ~winning.region
                 if not fresh.any():
                     break
-                found = self.join(found, new, fresh)
-            if (found.region == y).all():
-                return found
-            y = found.region
+                winning = self.join(winning, new, fresh)
+            if (winning.region == y).all():
+                return winning
+            y = winning.region
 
-    def join(self, found: RobustRegion, new: RobustRegion, fresh: Booleans) -> RobustRegion:
+    def join(self, winning: RobustRegion, new: RobustRegion, fresh: Booleans) -> RobustRegion:
         """The region with new states."""
         mdp = self.game.model.mdp
         source = fresh[mdp.state[mdp.row]]
         return RobustRegion(
-            found.region | fresh,
-            np.where(fresh, new.row, found.row),
-            np.where(source, new.probability, found.probability),
+            winning.region | fresh,
+            np.where(fresh, new.row, winning.row),
+            np.where(source, new.probability, winning.probability),
         )
 
     def body(self, ys: list[Booleans], xs: list[Booleans]) -> RobustRegion:
         """One step from each state, by its priority."""
         mdp = self.game.model.mdp
         region = np.zeros(mdp.num_states, bool)
-        found = RobustRegion(region, mdp.row_start[:-1].astype(np.int64), mdp.probability)
+        winning = RobustRegion(region, mdp.row_start[:-1].astype(np.int64), mdp.probability)
         for p in np.unique(self.priority):
             up = p // 2 + 1
             some, row, chance = self.step(self, p % 2 == 1, ys[:up], xs[:up])
-            found = self.join(found, RobustRegion(some, row, chance), some & (self.priority == p))
-        return found
+            winning = self.join(
+                winning, RobustRegion(some, row, chance), some & (self.priority == p)
+            )
+        return winning

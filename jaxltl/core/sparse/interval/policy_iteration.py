@@ -59,7 +59,7 @@ class PathProblem:
     """Sums until a set of states is left, by every pair of policy and nature that counts."""
 
     model: UncertainMDP
-    open: Booleans  # bool[S], the states to solve for
+    interior: Booleans  # bool[S], the states to solve for
     known: Floats  # float64[S], finite and at least 0, the values of the others
     cost: Floats  # float64[R], at least 0; NaN in rows that must not be taken
     component: Integers  # int[S], number of the end component that is one node
@@ -73,11 +73,11 @@ class PathProblem:
     def operator(self) -> RowOperator:
         """The optimality operator on the open components."""
         mdp, sign = self.model.mdp, 1 if self.maximize else -1
-        states = np.flatnonzero(self.open)
+        states = np.flatnonzero(self.interior)
         heads, number = np.unique(self.component[states], return_inverse=True)
         node = np.full(mdp.num_states, -1)
         node[states] = number
-        row = np.flatnonzero(self.open[mdp.state] & ~np.isnan(self.cost))
+        row = np.flatnonzero(self.interior[mdp.state] & ~np.isnan(self.cost))
         row = row[np.argsort(node[mdp.state[row]], kind="stable")]
         count = np.bincount(node[mdp.state[row]], minlength=heads.size)
         part, entry = self.model.select_rows(offsets_from_counts(count), row)
@@ -139,12 +139,12 @@ def _path_bounds(
     problem: PathProblem, search: _Search, beyond: PolicyPair | None, attained: PolicyPair | None
 ) -> PathBounds:
     operator = search.operator
-    states = np.flatnonzero(problem.open)
+    states = np.flatnonzero(problem.interior)
 
     def of_states(x: Floats) -> Floats:
-        found = problem.known.copy()
-        found[states] = np.maximum(operator.sign * x, 0)[operator.node[states]]
-        return found
+        values = problem.known.copy()
+        values[states] = np.maximum(operator.sign * x, 0)[operator.node[states]]
+        return values
 
     row = problem.model.mdp.row_start[:-1].astype(np.int64)
     probability = problem.model.mdp.probability.copy()
@@ -194,9 +194,9 @@ class _Search:
     def step_extra(self, pair: PolicyPair) -> float:
         """Extra of a step: small compared with the tolerance, and more than rounding."""
         operator = self.operator
-        most = np.abs(pair.steps).max(initial=1)
+        longest = np.abs(pair.steps).max(initial=1)
         size = max(np.abs(pair.value).max(initial=0), np.abs(operator.known).max(initial=0))
-        aim = _AIM * self.accuracy.tolerance * self.scale(pair.value) / most
+        aim = _AIM * self.accuracy.tolerance * self.scale(pair.value) / longest
         return float(max(aim, self.rounding * size, _LEAST))
 
     def is_narrow(self, beyond: PolicyPair | None, attained: PolicyPair | None) -> bool:
@@ -259,11 +259,11 @@ class _Search:
             return pair
         pair = self._value_iteration(pair)
         for _ in range(_ROUNDS):
-            found = self.evaluate(pair, residual)
-            if found is None:
+            evaluated = self.evaluate(pair, residual)
+            if evaluated is None:
                 return None
-            pair, change = self.operator.improve(found, found.value, 0.0, _DOUBT * residual)
-            if change <= _NEARLY * self.accuracy.tolerance * self.scale(found.value):
+            pair, change = self.operator.improve(evaluated, evaluated.value, 0.0, _DOUBT * residual)
+            if change <= _NEARLY * self.accuracy.tolerance * self.scale(evaluated.value):
                 break
             residual = _ROUGH * change
         return pair
@@ -300,10 +300,10 @@ class _Search:
         if not self.accuracy.relative:
             full = pair.value >= operator.ceiling - self.accuracy.tolerance / 4
         for rounds in range(1, _ROUNDS):
-            found = self.evaluate_with_steps(pair, self.extra, full)
-            if found is None:
+            evaluated = self.evaluate_with_steps(pair, self.extra, full)
+            if evaluated is None:
                 return None
-            pair, self.extra = found
+            pair, self.extra = evaluated
             factor *= 8 if rounds % _PATIENCE == 0 else 1
             z = np.minimum(pair.value + factor * self.extra * pair.steps, operator.ceiling)
             z[full] = operator.ceiling
@@ -327,10 +327,10 @@ class _Search:
                 return bounded
             if operator.adversarial:
                 pair = operator.improve(pair, z, -self.extra)[0]
-            found = self.evaluate_with_steps(pair, self.extra)
-            if found is None:
+            evaluated = self.evaluate_with_steps(pair, self.extra)
+            if evaluated is None:
                 return None
-            pair, self.extra = found
+            pair, self.extra = evaluated
         return None
 
     def proportional_bound(self, pair: PolicyPair) -> PolicyPair | None:

@@ -50,9 +50,9 @@ def _attractor(
     """The attractor, and rows by which states entered it."""
     mdp = model.mdp
     region = goal.copy()
-    found: Integers = mdp.row_start[:-1].astype(np.int64)
+    entering: Integers = mdp.row_start[:-1].astype(np.int64)
     waiting = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
-    left = np.bincount(mdp.state[waiting], minlength=mdp.num_states)
+    remaining = np.bincount(mdp.state[waiting], minlength=mdp.num_states)
     start, before = mdp.predecessors
     frontier: Integers = np.flatnonzero(region)
     while frontier.size:
@@ -62,14 +62,14 @@ def _attractor(
         waiting[row] = False
         state = mdp.state[row]
         if all_rows:
-            decrement(left, state)
-            state = state[left[state] == 0]
+            decrement(remaining, state)
+            state = state[remaining[state] == 0]
         else:
             new = ~region[state]
-            found[state[new]] = row[new]
+            entering[state[new]] = row[new]
         frontier = sorted_unique(state[~region[state]], mdp.num_states)
         region[frontier] = True
-    return region, found
+    return region, entering
 
 
 class ZeroOneStates(NamedTuple):
@@ -123,7 +123,7 @@ def almost_sure_states(
         kept = model.can_stay_in(inside) if helps else ~mdp.support.some_successor_in(~inside)
         if query.maximize:
             kept &= inside[mdp.state]
-            found = (
+            reached = (
                 backward_reachable(mdp, goal & inside, kept)
                 if helps
                 else attractor_against_nature(model, goal & inside, all_rows=False, rows=kept)
@@ -131,10 +131,10 @@ def almost_sure_states(
         else:
             bad = np.zeros(mdp.num_states, bool)
             bad[mdp.state[~kept]] = True
-            found = positive_under_all_policies(mdp, goal & inside, among=inside & ~bad)
-        if (found == inside).all():
+            reached = positive_under_all_policies(mdp, goal & inside, among=inside & ~bad)
+        if (reached == inside).all():
             return inside, kept & inside[mdp.state]
-        inside = found
+        inside = reached
 
 
 def joint_end_components(
@@ -179,11 +179,11 @@ def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustReg
     row = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     for p in np.unique(priority[priority % 2 == 0]):
-        found, used = joint_end_components(model, ~region, priority >= p)
+        components, used = joint_end_components(model, ~region, priority >= p)
         hit = used & (priority == p)
         accepting = np.zeros(mdp.num_states, bool)
-        accepting[found.component[mdp.state[mdp.row[hit]]]] = True
-        new = accepting[found.component] & found.region(mdp)
+        accepting[components.component[mdp.state[mdp.row[hit]]]] = True
+        new = accepting[components.component] & components.region(mdp)
         if not new.any():
             continue
         region |= new
@@ -191,7 +191,7 @@ def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustReg
         takes[mdp.row[hit]] = True
         some, first = mdp.first_choice(takes)
         keep = used & new[mdp.state[mdp.row]]
-        inside = found.inside & new[mdp.state]
+        inside = components.inside & new[mdp.state]
         way = model.resolve(np.where(keep | ~inside[mdp.row], chance, 0))
         row = np.where(new, np.where(some, first, shortest_path_rows(way, some, inside)), row)
         chance = np.where(inside[mdp.row], model.interior_distributions(keep), chance)

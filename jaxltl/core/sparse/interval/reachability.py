@@ -67,10 +67,10 @@ def hull_of_readings(
     decided: Callable[[UncertainMDP], tuple[Booleans, ...]],
 ) -> RobustValues:
     """Bounds for both readings of sums of ends, if these decide states differently."""
-    found, wide = solve(model), model.enlarged
+    values, wide = solve(model), model.enlarged
     if wide is None or all(map(np.array_equal, decided(model), decided(wide))):
-        return found
-    return found.hull(solve(wide))
+        return values
+    return values.hull(solve(wide))
 
 
 def _reachability(
@@ -91,17 +91,17 @@ def _reachability(
     cost, accuracy = np.zeros(absorbing.mdp.num_rows), Accuracy(query.tolerance)
     solve = Subproblems(fixed_nature, joint, cost, accuracy)
     if query.cooperative:
-        found = joint(absorbing, cost, query.maximize)
+        values = joint(absorbing, cost, query.maximize)
     elif (both := _opposed(absorbing, target, query)) is not None:
-        found = both
+        values = both
     else:
         start, p = _first_choices(absorbing, target, maximize=query.maximize)
-        found = (
+        values = (
             improve_policy(absorbing, start, solve, maximize=True)
             if query.maximize
             else improve_nature(absorbing, p, solve, nature_maximizes=True)
         )
-    return without_absorbing(model, absorbing, row, stop, found)
+    return without_absorbing(model, absorbing, row, stop, values)
 
 
 def _joint(
@@ -122,7 +122,7 @@ def _joint(
     components = joint_end_components(model, open_) if up else None
     problem = PathProblem(
         model=model,
-        open=open_,
+        interior=open_,
         known=one.astype(np.float64),
         cost=np.zeros(mdp.num_rows),
         component=np.arange(mdp.num_states) if components is None else components[0].component,
@@ -144,12 +144,14 @@ def joint_optimum(
     model, up, (row, chance) = problem.model, problem.maximize, pair
     bound, rounds, highest = problem.known, 0, np.inf if accuracy.relative else 1.0
     best: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
-    if problem.open.any():
-        found = enclose_paths(problem, accuracy)
-        bound, rounds = np.clip(found.beyond, 0, highest), found.rounds
-        best = found.enclosed(problem, accuracy)
-        row = np.where(problem.open, found.row, row)
-        chance = np.where(problem.open[model.mdp.state][model.mdp.row], found.probability, chance)
+    if problem.interior.any():
+        bounds = enclose_paths(problem, accuracy)
+        bound, rounds = np.clip(bounds.beyond, 0, highest), bounds.rounds
+        best = bounds.enclosed(problem, accuracy)
+        row = np.where(problem.interior, bounds.row, row)
+        chance = np.where(
+            problem.interior[model.mdp.state][model.mdp.row], bounds.probability, chance
+        )
         if components is not None and components[0].inside.any():
             inside, used = components[0].inside, components[1]
             row, chance = move_to_exits(model, (row, chance), problem.component, inside, used)
@@ -176,7 +178,7 @@ def _opposed(model: UncertainMDP, target: Booleans, query: Query) -> RobustValue
     if open_.any():
         problem = PathProblem(
             model=model,
-            open=open_,
+            interior=open_,
             known=value,
             cost=np.zeros(mdp.num_rows),
             component=np.arange(mdp.num_states),
@@ -185,14 +187,14 @@ def _opposed(model: UncertainMDP, target: Booleans, query: Query) -> RobustValue
             first=attracting_rows(model, known.one) if up else row,
             depth=query.depth,
         )
-        found = enclose_paths(problem, Accuracy(query.tolerance))
-        if found.attained is None:
+        bounds = enclose_paths(problem, Accuracy(query.tolerance))
+        if bounds.attained is None:
             return None
-        low, high = (found.attained, found.beyond) if up else (found.beyond, found.attained)
+        low, high = (bounds.attained, bounds.beyond) if up else (bounds.beyond, bounds.attained)
         low, high = np.clip(low, 0, 1), np.clip(high, 0, 1)
-        value, rounds = found.value, found.rounds
-        row = np.where(open_, found.row, row)
-        chance = np.where(open_[mdp.state][mdp.row], found.probability, chance)
+        value, rounds = bounds.value, bounds.rounds
+        row = np.where(open_, bounds.row, row)
+        chance = np.where(open_[mdp.state][mdp.row], bounds.probability, chance)
         if (high - low).max() > query.tolerance:
             return None
     width = float((high - low).max())
@@ -256,12 +258,12 @@ def without_absorbing(
     absorbing: UncertainMDP,
     row: Integers,
     states: Booleans,
-    found: RobustValues,
+    values: RobustValues,
 ) -> RobustValues:
     """Values of the model with some absorbing states, in the rows and entries of the model."""
     if absorbing is model:
-        return found
+        return values
     chance = model.mdp.probability.copy()
     moves, moved = (~states[x.state[x.row]] for x in (model.mdp, absorbing.mdp))
-    chance[moves] = found.probability[moved]
-    return replace(found, row=row[found.row], probability=chance)
+    chance[moves] = values.probability[moved]
+    return replace(values, row=row[values.row], probability=chance)

@@ -57,10 +57,10 @@ class Refinement:
             share, step, cost = extra
             high, lost = two_sum(value.high, side * cost)
             z = TwoFloats(*two_sum(high, lost + value.low))
-            found = self._proven(operator, pair, z, side)
-            if found is not None:
+            proven = self._proven(operator, pair, z, side)
+            if proven is not None:
                 narrow = cost.max(initial=0) <= _NARROW * self.tolerance
-                return replace(found, value=value.high) if narrow else None
+                return replace(proven, value=value.high) if narrow else None
             better, _ = operator.improve(pair, z, side * step)
             same = (better.chosen == pair.chosen).all() and all(
                 np.array_equal(p, q) for p, q in zip(better.p, pair.p, strict=True)
@@ -77,16 +77,16 @@ class Refinement:
         high = self.solve(system.matrix, system.earned)
         if high is None:
             return None
-        found, last = TwoFloats(high, np.zeros_like(high)), float(np.abs(high).max(initial=0))
+        value, last = TwoFloats(high, np.zeros_like(high)), float(np.abs(high).max(initial=0))
         with np.errstate(all="ignore"):
             for _ in range(_STEPS):
-                more = self.solve(system.matrix, operator.residual(pair, found))
+                more = self.solve(system.matrix, operator.residual(pair, value))
                 step = np.inf if more is None else float(np.abs(more).max(initial=0))
                 if more is None or not step < last / 2:  # also if NaN
                     break
-                high, lost = two_sum(found.high, more)
-                found, last = TwoFloats(*two_sum(high, found.low + lost)), step
-        return found if np.isfinite(found.high).all() else None
+                high, lost = two_sum(value.high, more)
+                value, last = TwoFloats(*two_sum(high, value.low + lost)), step
+        return value if np.isfinite(value.high).all() else None
 
     def _extra(
         self,

@@ -79,21 +79,21 @@ class Block:
         """``x_t - x_s`` of each entry, plus a reward for leaving the node, ``float64[W, N]``."""
         high, low, target, owner = values.high, values.low, self.target, self.owner
         if low is None:
-            found = high[target]
-            found -= high[owner]
+            ahead = high[target]
+            ahead -= high[owner]
         else:
-            found = two_float_difference(high[target], low[target], high[owner], low[owner])
+            ahead = two_float_difference(high[target], low[target], high[owner], low[owner])
         if isinstance(step_reward, np.ndarray):
             step_reward = step_reward[self.owner]
         elif not step_reward:
-            return found
-        found += step_reward if self.leaves is None else step_reward * self.leaves
-        return found
+            return ahead
+        ahead += step_reward if self.leaves is None else step_reward * self.leaves
+        return ahead
 
     def leaving(self, p: Floats) -> Floats:
         """Mass that leaves the node of each row, ``float64[N]``."""
-        found: Floats = (p if self.leaves is None else p * self.leaves).sum(0)
-        return found
+        mass: Floats = (p if self.leaves is None else p * self.leaves).sum(0)
+        return mass
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class RowOperator:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        mdp, found = self.part.mdp, []
+        mdp, blocks = self.part.mdp, []
         target = self.node[mdp.successor]
         index = np.where(target < 0, self.size + mdp.successor, target).astype(np.int32)
         for table in self.part.tables:
@@ -134,8 +134,8 @@ class RowOperator:
             if table.used is not None:
                 to = np.where(table.used, to, owner)
             leaves = to != owner
-            found.append(Block(table, to, owner, None if leaves.all() else leaves))
-        return found
+            blocks.append(Block(table, to, owner, None if leaves.all() else leaves))
+        return blocks
 
     @cached_property
     def label(self) -> Integers:
@@ -185,19 +185,19 @@ class RowOperator:
 
     def by_entry(self, p: Distributions) -> Floats:
         """Distributions of all rows, ``float64[T']``."""
-        found = np.empty(self.part.mdp.num_transitions)
+        probability = np.empty(self.part.mdp.num_transitions)
         for block, mass in zip(self.blocks, p, strict=True):
-            scatter(block.table, mass, found)
-        return found
+            scatter(block.table, mass, probability)
+        return probability
 
     def rows_of_nodes(self, row: Integers) -> Integers:
         """The rows of states, ``int[S]``, as rows of nodes."""
         number = np.full(int(max(self.row.max(), row.max())) + 1, -1)
         number[self.row] = np.arange(self.row.size)
-        found = np.zeros(self.size, np.int64)
+        rows = np.zeros(self.size, np.int64)
         states = np.flatnonzero(self.node >= 0)
-        found[self.node[states]] = number[row[states]]
-        return found
+        rows[self.node[states]] = number[row[states]]
+        return rows
 
     def exit_rows(self, *, positive: bool) -> Integers:
         """Rows on shortest paths out of the nodes; if `positive`, to known values above 0."""
@@ -309,8 +309,8 @@ class RowOperator:
         for block in self.blocks:
             gain = block.differences(values)
             mass = self.answer(block, gain)
-            most = self.gain_bound(block, gain, mass, 1, over_all=not self.adversarial)
-            holds = (most < 0) if self.adversarial else (most <= 0)
+            upper = self.gain_bound(block, gain, mass, 1, over_all=not self.adversarial)
+            holds = (upper < 0) if self.adversarial else (upper <= 0)
             if not (holds | (values.high[block.owner] >= self.ceiling)).all():
                 return None
             p.append(mass)
@@ -341,5 +341,5 @@ class RowOperator:
         slack = terms * _EPS * (np.einsum("wn,wn->n", p, size) + np.abs(cost))
         slack += terms * _TINY * (slack > 0)
         slack += table.mean_error(p, side * gain, over_all=over_all)
-        found: Floats = np.einsum("wn,wn->n", p, gain) + cost + side * slack
-        return found
+        bound: Floats = np.einsum("wn,wn->n", p, gain) + cost + side * slack
+        return bound

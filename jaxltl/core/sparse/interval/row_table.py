@@ -78,13 +78,13 @@ class RowTable:
 
     def _by_pairs(self, key: Floats) -> Floats:
         free = self.upper - self.lower
-        left = np.repeat(self.free_mass[None], key.shape[0], 0)
+        remaining = np.repeat(self.free_mass[None], key.shape[0], 0)
         for j in range(1, key.shape[0]):
             for i in range(j):
                 first = key[i] <= key[j]
-                left[j] -= first * free[i]
-                left[i] -= ~first * free[j]
-        mass = _greedy(left, self.lower, self.upper, self.rounding)
+                remaining[j] -= first * free[i]
+                remaining[i] -= ~first * free[j]
+        mass = _greedy(remaining, self.lower, self.upper, self.rounding)
         if self.fine.size:
             order = np.argsort(key[:, self.fine].T, axis=1, kind="stable")
             ends = (
@@ -124,7 +124,7 @@ class RowTable:
             return self._dual_bound(p, gain) if over_all else self._nearest_bound(p, gain)
         room = np.minimum(p - self.lower, self.upper - p)
         partial = room > 0
-        found: Floats = np.einsum("wn,wn->n", partial, np.abs(gain)) * self.rounding
+        error: Floats = np.einsum("wn,wn->n", partial, np.abs(gain)) * self.rounding
         # With one entry strictly between its ends, by more than rounding, only that one may err.
         certain = (partial.sum(0) == 1) & (room.max(0) > self.rounding)
         certain[self.fine] = False
@@ -132,21 +132,21 @@ class RowTable:
             rows = np.flatnonzero(~certain)
             part, p, gain = self.select(rows), p[:, rows], gain[:, rows]
             bound = part._dual_bound if over_all else part._nearest_bound
-            found[rows] = bound(p, gain)
-        return found
+            error[rows] = bound(p, gain)
+        return error
 
     def missing(self, p: Floats, share: float = SUM_ERROR) -> Floats:
         """One minus the sum of each distribution; 0 in rows with a single distribution."""
-        found = exact_sum(np.concatenate([np.ones((1, p.shape[1])), -p]), share)
-        return np.where((self.lower == self.upper).all(0), 0, found)
+        mass = exact_sum(np.concatenate([np.ones((1, p.shape[1])), -p]), share)
+        return np.where((self.lower == self.upper).all(0), 0, mass)
 
     def _unused_gain(self, p: Floats) -> Floats:
         """Mass that p may still gain over the center of the ball."""
         assert self.center is not None and self.gain is not None
         over = p > self.center
         gained = np.where(over, p, 0), np.where(over, self.center, 0)
-        found = exact_sum(np.concatenate([self.gain[None], -gained[0], gained[1]]))
-        return np.where((self.lower == self.upper).all(0), 0, found)
+        unused = exact_sum(np.concatenate([self.gain[None], -gained[0], gained[1]]))
+        return np.where((self.lower == self.upper).all(0), 0, unused)
 
     def _dual_bound(self, p: Floats, gain: Floats) -> Floats:
         """Bound of ``max_q sum (q - p) gain`` by linear programming duality.
@@ -157,14 +157,14 @@ class RowTable:
         """
         missing = self.missing(p)
         price = _marginal_gain(p < self.upper, p > self.lower, gain, missing)
-        found = self._dual_value(p, gain, missing, price, np.zeros_like(price))
+        bound = self._dual_value(p, gain, missing, price, np.zeros_like(price))
         if self.center is None:
-            return found
+            return bound
         falls = (p > self.lower) & (p <= self.center)
         low = _marginal_gain(p < self.center, falls, gain, missing)
         rise = np.where((p < self.upper) & (p >= self.center), gain, -np.inf).max(0)
         rise = np.where(np.isfinite(rise), np.maximum(rise - low, 0), 0)
-        return np.minimum(found, self._dual_value(p, gain, missing, low, rise))
+        return np.minimum(bound, self._dual_value(p, gain, missing, low, rise))
 
     def _dual_value(
         self, p: Floats, gain: Floats, missing: Floats, price: Floats, rise: Floats
@@ -220,11 +220,11 @@ class RowTable:
         return p, fits
 
 
-def _greedy(left: Floats, lower: Floats, upper: Floats, rounding: Floats) -> Floats:
+def _greedy(remaining: Floats, lower: Floats, upper: Floats, rounding: Floats) -> Floats:
     """Mass of entries from what better ones leave; a full entry gets its upper end exactly."""
     room = upper - lower
-    added = np.minimum(left, room)
-    added *= left > rounding
+    added = np.minimum(remaining, room)
+    added *= remaining > rounding
     mass = lower + added
     np.copyto(mass, upper, where=added == room)
     return mass
@@ -234,9 +234,9 @@ def _marginal_gain(more: Booleans, less: Booleans, gain: Floats, missing: Floats
     """Gain of the next unit of mass, or of the last one where mass is in excess."""
     high = np.where(more, gain, -np.inf).max(0)
     low = np.where(less, gain, np.inf).min(0)
-    found: Floats = np.where(missing < 0, low, high)
-    np.copyto(found, gain.min(0), where=~np.isfinite(found))
-    return found
+    marginal: Floats = np.where(missing < 0, low, high)
+    np.copyto(marginal, gain.min(0), where=~np.isfinite(marginal))
+    return marginal
 
 
 def _upward(x: Floats) -> Floats:
@@ -277,28 +277,28 @@ def exact_sum(terms: Floats, share: float = SUM_ERROR) -> Floats:
         high, lost = two_sum(high, x)
         low += lost
         size += np.abs(lost)
-    found: Floats = high + low
-    unsure = np.flatnonzero(share * np.abs(found) < len(terms) * _EPS * size)
+    total: Floats = high + low
+    unsure = np.flatnonzero(share * np.abs(total) < len(terms) * _EPS * size)
     if unsure.size:
-        found[unsure] = [math.fsum(x) for x in terms[:, unsure].T.tolist()]
-    return found
+        total[unsure] = [math.fsum(x) for x in terms[:, unsure].T.tolist()]
+    return total
 
 
 def row_sums(quantity: Floats, start: Integers, *more: Floats) -> Floats:
     """Sums of ``float64[T]`` over each row, plus ``float64[R]`` terms, with the right sign."""
-    found = np.add.reduceat(quantity, start[:-1])
+    sums = np.add.reduceat(quantity, start[:-1])
     for x in more:
-        found = found + x
-    near = np.flatnonzero(np.abs(found) <= _RESUM)
-    near = near[np.diff(start)[near] + len(more) > 2]  # a single addition has the right sign
-    if near.size:
-        entry, width = row_entries(start, near)
+        sums = sums + x
+    small = np.flatnonzero(np.abs(sums) <= _RESUM)
+    small = small[np.diff(start)[small] + len(more) > 2]  # a single addition has the right sign
+    if small.size:
+        entry, width = row_entries(start, small)
         for part in row_parts(offsets_from_counts(width)):
             terms = quantity[entry[part.entry]]
             terms = terms if part.used is None else np.where(part.used, terms, 0)
-            rows = near[part.row]
-            found[rows] = exact_sum(np.concatenate([[x[rows] for x in more], terms]))
-    return found
+            rows = small[part.row]
+            sums[rows] = exact_sum(np.concatenate([[x[rows] for x in more], terms]))
+    return sums
 
 
 class RowPart(NamedTuple):

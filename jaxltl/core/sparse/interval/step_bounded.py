@@ -61,8 +61,8 @@ def until(
     chance, limit = mdp.probability, _Limit(model, target, open_, num_steps, query)
     while done < min(num_steps, _most_backups(model)) and not is_fixed:
         done += 1
-        found, row, chance = _backup(model, value[mdp.successor], query)
-        new = np.where(open_, np.clip(found, 0, 1), target)
+        best, row, chance = _backup(model, value[mdp.successor], query)
+        new = np.where(open_, np.clip(best, 0, 1), target)
         is_fixed, value = np.array_equal(new, value), new
         if done == check and not is_fixed:
             check *= 2
@@ -103,25 +103,25 @@ class _Limit:
 
     model: UncertainMDP
     target: Booleans
-    open: Booleans
+    undecided: Booleans
     num_steps: int
     query: Query
 
     @cached_property
-    def found(self) -> RobustValues:
+    def unbounded(self) -> RobustValues:
         """The unbounded probability."""
         query = replace(self.query, tolerance=_CLOSE / 4)
-        return reachability(self.model, self.target, query, stay=self.open | self.target)
+        return reachability(self.model, self.target, query, stay=self.undecided | self.target)
 
     @property
     def upper(self) -> Floats:
-        return self.found.upper
+        return self.unbounded.upper
 
     @cached_property
     def lower(self) -> Floats:
-        part, chance = self.model, self.found.probability
+        part, chance = self.model, self.unbounded.probability
         if self.query.maximize:
-            part, entry = part.under_policy(self.found.row)
+            part, entry = part.under_policy(self.unbounded.row)
             chance = chance[entry]
         depth = self.query.depth + distribution_depth(part.mdp)
         if self.query.nature_maximizes:
@@ -130,12 +130,12 @@ class _Limit:
                 return np.zeros(self.target.size)
             fixed = part.resolve(chance)
             return UnboundedLimit(
-                fixed, self.target, self.open, self.num_steps, maximize=False, depth=depth
+                fixed, self.target, self.undecided, self.num_steps, maximize=False, depth=depth
             ).lower
         least = Query(False, False, tolerance=_CLOSE / 4, depth=self.query.depth)
-        value = reachability(part, self.target, least, stay=self.open | self.target).lower
-        absorbing = part.with_absorbing(~self.open)[0]
-        ended = ~self.open | zero_one_states(absorbing, self.target, least).zero
+        value = reachability(part, self.target, least, stay=self.undecided | self.target).lower
+        absorbing = part.with_absorbing(~self.undecided)[0]
+        ended = ~self.undecided | zero_one_states(absorbing, self.target, least).zero
         longest = Query(True, True, tolerance=0.1, depth=self.query.depth)
         time = total_reward(part, np.ones(part.mdp.num_rows), ended, longest).upper
         return value - unfinished(time, self.num_steps)
@@ -148,8 +148,8 @@ def next_step(model: UncertainMDP, target: Booleans, query: Query) -> StepBounde
     value, error = np.clip(value, 0, 1), np.full(value.size, backup_error(model))
     for surely in (False, True):
         rows = _entering(model, target, surely, query.nature_maximizes)
-        found = model.mdp.over_choices(_any_or_all(query), rows)
-        known = found if surely else ~found
+        states = model.mdp.over_choices(_any_or_all(query), rows)
+        known = states if surely else ~states
         value, error = np.where(known, surely, value), np.where(known, 0, error)
     return StepBoundedValues(value, error, row, chance, 1)
 
@@ -161,30 +161,30 @@ def total(
     mdp, one = model.mdp, backup_error(model)
     value, error, done, check = start, 0.0, 0, _LONG
     row: Integers = mdp.row_start[:-1].astype(np.int64)
-    chance, most = mdp.probability, min(num_steps, _most_backups(model))
+    chance, max_backups = mdp.probability, min(num_steps, _most_backups(model))
     width: Floats = np.zeros(value.size)
-    while done < most:
+    while done < max_backups:
         done += 1
         ahead = earned + value[mdp.successor]
-        found, row, chance = _backup(model, ahead, query)
-        left, size = num_steps - done + 1, float(np.abs(ahead).max(initial=0))
-        if np.array_equal(found, value):
+        best, row, chance = _backup(model, ahead, query)
+        remaining, size = num_steps - done + 1, float(np.abs(ahead).max(initial=0))
+        if np.array_equal(best, value):
             # At a fixed point the error of all further steps follows from e -> (1 + u) e + u size.
-            growth = float(np.expm1(min(left * np.log1p(one), 500)))
+            growth = float(np.expm1(min(remaining * np.log1p(one), 500)))
             error = 1.01 * (error * (1 + growth) + growth * size)
             break
-        if left > 1 and done in (check, most):
+        if remaining > 1 and done in (check, max_backups):
             check *= 2
             # T is monotone and T (v + c) = T v + c: each further step adds at least the least, and
             # at most the largest, of T v - v (Puterman 1994, section 8.5).
-            step, slack = found - value, error + 2 * left * one * size
-            low, high = (value + left * x for x in (step.min(), step.max()))
+            step, slack = best - value, error + 2 * remaining * one * size
+            low, high = (value + remaining * x for x in (step.min(), step.max()))
             if not earned.any():
-                low, high = np.maximum(low, found.min()), np.minimum(high, found.max())
-            if done == most or (high - low <= _CLOSE * np.maximum(np.abs(low), 1)).all():
+                low, high = np.maximum(low, best.min()), np.minimum(high, best.max())
+            if done == max_backups or (high - low <= _CLOSE * np.maximum(np.abs(low), 1)).all():
                 value, width, error = (low + high) / 2, (high - low) / 2, 1.01 * slack
                 break
-        value, error = found, error + one * (size + error)
+        value, error = best, error + one * (size + error)
     some = start != 0
     some[mdp.state[mdp.row[earned != 0]]] = True
     # Without a reward ahead the value is exactly 0, also where the remaining steps are bounded.

@@ -45,10 +45,12 @@ def under_nature(
 ) -> Enclosure:
     """The policy's optimum where nature picks distributions next to p."""
     exact, able = model.nearest_distributions(p)
-    found = solve(model.resolve(exact), cost, maximize)
+    optimum = solve(model.resolve(exact), cost, maximize)
     if able:
-        return found
-    return replace(found, lower=np.zeros_like(found.lower), upper=np.full_like(found.upper, np.inf))
+        return optimum
+    return replace(
+        optimum, lower=np.zeros_like(optimum.lower), upper=np.full_like(optimum.upper, np.inf)
+    )
 
 
 def improve_policy(
@@ -83,22 +85,22 @@ def improve_nature(
     sign = 1 if up else -1
     while True:
         rounds += 1
-        found = under_nature(solve.fixed_nature, model, p, solve.cost, not up)
-        gain, q = row_gains(model, found.value, solve.cost, nature_maximizes=up)
-        now = model.sum_rows(p * differences(model, found.value)) + solve.cost
+        outer = under_nature(solve.fixed_nature, model, p, solve.cost, not up)
+        gain, q = row_gains(model, outer.value, solve.cost, nature_maximizes=up)
+        now = model.sum_rows(p * differences(model, outer.value)) + solve.cost
         more = sign * (gain - now)
-        better = more > gain_noise(found.value)[mdp.state]
+        better = more > gain_noise(outer.value)[mdp.state]
         last = rounds == _ROUNDS or not better.any()
         if last or _tests_bounds(rounds):
             best = mdp.over_choices(np.minimum, sign * gain)
             row = mdp.first_choice(sign * gain == best[mdp.state])[1].astype(np.int64)
             inner = solve.joint(model.under_policy(row)[0], solve.cost[row], up)
-            low, high = (found.lower, inner.upper) if up else (inner.lower, found.upper)
+            low, high = (outer.lower, inner.upper) if up else (inner.lower, outer.upper)
             if last or solve.accuracy.accepts(low, high):
                 break
         p = np.where(better[mdp.row], q, p)
     return enclosed_values(
-        found.value, (low, high), row, p, rounds=rounds + inner.rounds, residual=float(more.max())
+        outer.value, (low, high), row, p, rounds=rounds + inner.rounds, residual=float(more.max())
     )
 
 

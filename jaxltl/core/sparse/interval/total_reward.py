@@ -79,24 +79,24 @@ def _total_reward(
 
     solve = Subproblems(fixed_nature, joint, cost, Accuracy(query.tolerance, relative=True))
     if query.cooperative:
-        found = joint(part, cost, query.maximize)
+        values = joint(part, cost, query.maximize)
     elif query.maximize:
         p = part.interior_distributions(np.ones(part.mdp.num_transitions, bool))
-        found = improve_nature(part, p, solve, nature_maximizes=False)
+        values = improve_nature(part, p, solve, nature_maximizes=False)
     else:
-        found = improve_policy(part, _first_policy(part, ends, solve), solve, maximize=False)
+        values = improve_policy(part, _first_policy(part, ends, solve), solve, maximize=False)
     value, lower, upper = (
-        np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper)
+        np.where(finite, x, np.inf) for x in (values.value, values.lower, values.upper)
     )
     # Nature's distributions are arbitrary at infinite values and in rows that are not taken.
     taken, open_ = np.zeros(absorbing.mdp.num_rows, bool), finite[part.mdp.state]
     taken[origin[open_]] = True
     chance = np.where(taken[absorbing.mdp.row], 0, absorbing.mdp.probability)
-    chance[entry[open_[part.mdp.row]]] = found.probability[open_[part.mdp.row]]
-    found = replace(
-        found, value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance
+    chance[entry[open_[part.mdp.row]]] = values.probability[open_[part.mdp.row]]
+    values = replace(
+        values, value=value, lower=lower, upper=upper, row=origin[values.row], probability=chance
     )
-    return without_absorbing(model, absorbing, row, target, found)
+    return without_absorbing(model, absorbing, row, target, values)
 
 
 def _joint(
@@ -110,7 +110,7 @@ def _joint(
     components = None if up else joint_end_components(model, open_, (cost == 0)[mdp.row])
     problem = PathProblem(
         model=model,
-        open=open_,
+        interior=open_,
         known=np.zeros(mdp.num_states),
         cost=cost,
         component=np.arange(mdp.num_states) if components is None else components[0].component,

@@ -86,7 +86,7 @@ class UncertainMDP:
         if self.ball is not None:
             deficit = 1 - self.sum_rows(self.ball.center)
             deficit = np.where(np.abs(deficit) > self.rounding, deficit, 0)
-        found = []
+        tables = []
         for row, entry, used in row_parts(self.mdp.entry_start):
             lower, upper = (
                 x[entry] if used is None else np.where(used, x[entry], 0)
@@ -97,12 +97,12 @@ class UncertainMDP:
                 center = self.ball.center[entry]
                 center = center if used is None else np.where(used, center, 0)
                 ball = {"center": center, "gain": self.ball.gain[row], "deficit": deficit[row]}
-            found.append(
+            tables.append(
                 RowTable(
                     row, entry, used, lower, upper, self.free_mass[row], self.rounding[row], **ball
                 )
             )
-        return found
+        return tables
 
     def sum_rows(self, quantity: Floats) -> Floats:
         """The sum over each row's entries, ``[R]`` from ``[T]``."""
@@ -112,10 +112,10 @@ class UncertainMDP:
 
     def extreme_distributions(self, quantity: Floats, *, maximize: bool) -> Floats:
         """Distributions that make ``sum_t p_t quantity_t`` extreme in each row, ``float64[T]``."""
-        key, found = -quantity if maximize else quantity, np.empty(quantity.size)
+        key, probability = -quantity if maximize else quantity, np.empty(quantity.size)
         for table in self.tables:
-            scatter(table, table.extreme(key[table.entry]), found)
-        return found
+            scatter(table, table.extreme(key[table.entry]), probability)
+        return probability
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
         """Tests if nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
@@ -158,8 +158,10 @@ class UncertainMDP:
         entries = entries | ~self.can_stay_on(entries)[self.mdp.row]
         free = np.where(entries, self.upper - self.lower, 0)
         share = share_of(self.free_mass, self.sum_rows(free))
-        found = np.where(entries, self.lower + free * share[self.mdp.row], 0)
-        return found if self.ball is None else self._into_ball(found, entries, self.ball)
+        probability = np.where(entries, self.lower + free * share[self.mdp.row], 0)
+        return (
+            probability if self.ball is None else self._into_ball(probability, entries, self.ball)
+        )
 
     def _into_ball(self, p: Floats, entries: Booleans, ball: Ball) -> Floats:
         """Moves distributions towards the center until they lie in the ball."""
@@ -180,12 +182,12 @@ class UncertainMDP:
 
     def nearest_distributions(self, probability: Floats) -> tuple[Floats, bool]:
         """Distributions near computed ones, right to their last digits; and if all rows have one."""
-        found, able = probability.copy(), True
+        nearest, able = probability.copy(), True
         for table in self.tables:
             p, fits = table.nearest(probability[table.entry])
             able &= bool(fits.all())
-            scatter(table, p, found)
-        return found, able
+            scatter(table, p, nearest)
+        return nearest, able
 
     # --- derived models -----------------------------------------------------------------------
 
@@ -234,12 +236,12 @@ class UncertainMDP:
         return UncertainMDP(small, lower, upper, ball), row
 
 
-def scatter(table: RowTable, mass: Floats, found: Floats) -> None:
+def scatter(table: RowTable, mass: Floats, probability: Floats) -> None:
     """Writes the masses ``float64[W, N]`` of a table into ``float64[T]``."""
     if table.used is None:
-        found[table.entry] = mass
+        probability[table.entry] = mass
     else:
-        found[table.entry[table.used]] = mass[table.used]
+        probability[table.entry[table.used]] = mass[table.used]
 
 
 def uncertainty_sets(

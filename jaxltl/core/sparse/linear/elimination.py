@@ -85,7 +85,7 @@ class Factors(NamedTuple):
 
     def other(self, chosen: Integers) -> Factors | None:
         """The factors of another policy, in the same order unless that fills more."""
-        found = []
+        blocks = []
         for block in self.blocks:
             swept = block.factor is None
             new = _block(
@@ -95,14 +95,14 @@ class Factors(NamedTuple):
                 return None
             if not swept and (new.factor is None or new.fill > _FILL * block.fill):
                 return factorize(self.rows, self.label, chosen)
-            found.append(new._replace(fill=block.fill))
-        return self._replace(blocks=tuple(found))
+            blocks.append(new._replace(fill=block.fill))
+        return self._replace(blocks=tuple(blocks))
 
     def eliminated(self, chosen: Integers) -> Factors | None:
         """The factors without Krylov methods, for policies on which these fail; None if too large."""
         if not any(x.factor is None for x in self.blocks):
             return None
-        found, matrix = [], self.rows[chosen]
+        blocks, matrix = [], self.rows[chosen]
         for block in self.blocks:
             nodes, swept = block.order, block.factor is None
             if (
@@ -114,8 +114,8 @@ class Factors(NamedTuple):
             new = _block(self.rows, self.label, nodes, chosen, min_degree=swept or block.min_degree)
             if new is None or new.factor is None:
                 return None
-            found.append(new)
-        return self._replace(blocks=tuple(found))
+            blocks.append(new)
+        return self._replace(blocks=tuple(blocks))
 
 
 def factorize(rows: SparseMatrix, label: Integers, chosen: Integers) -> Factors | None:
@@ -128,15 +128,15 @@ def factorize(rows: SparseMatrix, label: Integers, chosen: Integers) -> Factors 
             return None
         if one is not None and one.factor is not None:
             return Factors(rows, label, (one,))
-    found = []
+    blocks = []
     for nodes in _parts(label, size):
         order = elimination_order(matrix[nodes][:, nodes], label[nodes], _WORK)
         kept = nodes if order is None else nodes[order]
         block = _block(rows, label, kept, chosen, swept=order is None)
         if block is None:
             return None
-        found.append(block)
-    return Factors(rows, label, tuple(found))
+        blocks.append(block)
+    return Factors(rows, label, tuple(blocks))
 
 
 def _parts(label: Integers, size: Integers) -> list[Integers]:
@@ -217,9 +217,9 @@ def _block(
     if swept or _too_much(inner, label[order]):
         return _Block(order, inner, outer, None, 0)
     # In one large component minimum degree fills less (Liu 1985).
-    most = np.bincount(label[order]).max(initial=0)
+    largest = np.bincount(label[order]).max(initial=0)
     wide = (
-        most > max(order.size / 2, _LARGE)
+        largest > max(order.size / 2, _LARGE)
         and inner.nnz > _SEVERAL * order.size
         and _bandwidth(inner) > _NARROW
     )
@@ -241,16 +241,16 @@ def _bandwidth(matrix: SparseMatrix) -> float:
     """The mean distance of the first entries of rows and columns from the diagonal."""
     size = matrix.shape[0]
     source = np.repeat(np.arange(size), np.diff(matrix.indptr))
-    left, top = _first_entries(source, matrix.indices, size)
-    return float((2 * np.arange(size) - left - top).mean()) / 2
+    first, top = _first_entries(source, matrix.indices, size)
+    return float((2 * np.arange(size) - first - top).mean()) / 2
 
 
 def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integers, Integers]:
     """The first entry of each row, and of each column; at most the diagonal."""
-    left, top = np.arange(size), np.arange(size)
-    np.minimum.at(left, source, target.astype(left.dtype))  # of one type, which is far faster
+    first, top = np.arange(size), np.arange(size)
+    np.minimum.at(first, source, target.astype(first.dtype))  # of one type, which is far faster
     np.minimum.at(top, target, source.astype(top.dtype))
-    return left, top
+    return first, top
 
 
 def _too_much(matrix: SparseMatrix, label: Integers) -> bool:
@@ -270,8 +270,8 @@ def _too_much(matrix: SparseMatrix, label: Integers) -> bool:
     first = np.minimum(source[between], target[between])
     allowed = _MOST - size - int((last[label[first]] - first).sum())
     source, target = source[~between], target[~between]
-    left, top = _first_entries(source, target, size)
-    if int((2 * np.arange(size) - left - top).sum()) <= allowed:
+    leftmost, top = _first_entries(source, target, size)
+    if int((2 * np.arange(size) - leftmost - top).sum()) <= allowed:
         return False
     return allowed <= 0 or 2 * _counted(source, target, size) > allowed
 
@@ -326,25 +326,25 @@ def _transposed_system(matrix: SparseMatrix) -> SparseMatrix:
 def _swept(matrix: SparseMatrix, b: Floats) -> Floats:
     """Solution by BiCGSTAB (van der Vorst 1992), then by sweeps while the residual shrinks."""
     size = np.abs(b).max(initial=0)
-    x, left = np.zeros(b.size), np.array(b)
+    x, residual = np.zeros(b.size), np.array(b)
 
     def enough() -> bool:
         # Where x is far larger than b, its own rounding remains.
         least = max(_LEFT * size, _ROUNDED * float(np.abs(x).max(initial=0)))
-        return bool(np.abs(left).max(initial=0) <= least)
+        return bool(np.abs(residual).max(initial=0) <= least)
 
     for _ in range(_AGAIN):  # restarts where it stagnates or breaks down
         with np.errstate(all="ignore"):
-            more = iterate(matrix, left, np.zeros(b.size), _LEFT * size, _KRYLOV)
-        after = left - (more - matrix @ more)
-        if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(left).max():
+            more = iterate(matrix, residual, np.zeros(b.size), _LEFT * size, _KRYLOV)
+        after = residual - (more - matrix @ more)
+        if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(residual).max():
             break
-        x, left = x + more, after
+        x, residual = x + more, after
         if enough():
             return x
     for _ in range(_SWEEPS):
         if enough():
             return x
-        x = x + left
-        left = matrix @ left
+        x = x + residual
+        residual = matrix @ residual
     return np.full(b.size, np.nan)

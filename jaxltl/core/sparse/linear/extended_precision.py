@@ -171,15 +171,15 @@ def _solution(rows: _Rows, policy: Integers, solve: Solver) -> _Pair | None:
     """A policy's value in two floats, by iterative refinement (Wilkinson 1963)."""
     with np.errstate(all="ignore"):
         high = solve(rows.cost[policy])
-        found = _Pair(high, np.zeros_like(high), float(np.abs(high).max(initial=0)))
+        value = _Pair(high, np.zeros_like(high), float(np.abs(high).max(initial=0)))
         for _ in range(_STEPS):
-            more = solve(rows.balance(found.high, found.low)[0][policy])
+            more = solve(rows.balance(value.high, value.low)[0][policy])
             step = float(np.abs(more).max(initial=0))
-            if not step < found.step / 2:  # also where it is NaN
+            if not step < value.step / 2:  # also where it is NaN
                 break
-            high, lost = two_sum(found.high, more)
-            found = _Pair(*two_sum(high, found.low + lost), step)
-    return found if np.isfinite(found.high).all() else None
+            high, lost = two_sum(value.high, more)
+            value = _Pair(*two_sum(high, value.low + lost), step)
+    return value if np.isfinite(value.high).all() else None
 
 
 def _with_ties(pair: _Pair, level: float) -> tuple[Floats, Floats]:

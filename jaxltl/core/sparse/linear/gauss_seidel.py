@@ -64,9 +64,9 @@ def row_blocks(
     from scipy import sparse
 
     size, entries = row_start.size - 1, int(entry_start[-1])
-    most = min(max(entries // _BLOCKS, _MIN_BLOCK), _MAX_BLOCK)
+    entries_per_block = min(max(entries // _BLOCKS, _MIN_BLOCK), _MAX_BLOCK)
     first = entry_start[row_start]  # of each node
-    node = np.unique(np.searchsorted(first, np.arange(0, entries, most))).tolist()
+    node = np.unique(np.searchsorted(first, np.arange(0, entries, entries_per_block))).tolist()
     node = sorted({0, *node, size})
     single: list[SparseMatrix] = []
     double: list[SparseMatrix] = []
@@ -74,9 +74,9 @@ def row_blocks(
         start = entry_start[row_start[a] : row_start[b] + 1]
         part, index = slice(int(start[0]), int(start[-1])), start - start[0]
         shape = (index.size - 1, num_columns)
-        for found, dtype in ((single, np.float32), (double, np.float64)):
+        for blocks, dtype in ((single, np.float32), (double, np.float64)):
             data = weight[part].astype(dtype, copy=False)
-            found.append(sparse.csr_array((data, column[part], index), shape=shape))
+            blocks.append(sparse.csr_array((data, column[part], index), shape=shape))
     count = np.diff(row_start)
     same = size > 0 and bool((count == count[0]).all()) and count[0] <= _COLUMNS
     arrays = weight.astype(np.float64, copy=False), column, entry_start
@@ -143,10 +143,10 @@ def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBo
     if time is None:
         if not search.sweep(value, 0.0, _ROUGH):
             return None
-        found = search.truncated_time(search.chain(search.greedy(value)[1])[0])
-        if found is None:
+        timed = search.truncated_time(search.chain(search.greedy(value)[1])[0])
+        if timed is None:
             return None
-        extra = search.extra_cost(value, found[0])
+        extra = search.extra_cost(value, timed[0])
     else:
         extra = search.extra_cost(value, np.full(1, time))
     if not search.sweep(value, extra, 0.0):
@@ -224,10 +224,10 @@ class _Search:
         if not width:
             return better.reduceat(image, self.parts[i].begin)
         table = image.reshape(-1, width)
-        found = table[:, 0].copy()
+        optimum = table[:, 0].copy()
         for k in range(1, width):
-            better(found, table[:, k], out=found)
-        return found
+            better(optimum, table[:, k], out=optimum)
+        return optimum
 
     def sweep(self, value: Values, extra: float, rough: float) -> bool:
         """Sweeps in place until little changes; False where that would take too long."""
@@ -242,11 +242,11 @@ class _Search:
         while True:
             old = value.copy()
             for blocks in self.in_pairs(one):
-                for i, found in blocks:
+                for i, optimum in blocks:
                     a, b = self.parts[i].a, self.parts[i].b
                     if extra:
-                        found += shift
-                    np.copyto(value[a:b], found, where=self.problem.live[a:b])
+                        optimum += shift
+                    np.copyto(value[a:b], optimum, where=self.problem.live[a:b])
             change: Values = np.subtract(value, old, out=old)
             self.sweeps += 1
             largest = float(np.abs(change).max(initial=0))
@@ -273,15 +273,15 @@ class _Search:
 
     def is_hopeless(self, changes: list[float], goal: float) -> bool:
         """True if there would be too many sweeps at the rate of the last ones."""
-        most = self.settings.max_sweeps
-        if self.sweeps >= most:
+        max_sweeps = self.settings.max_sweeps
+        if self.sweeps >= max_sweeps:
             return True
         if len(changes) < _TRIAL:
             return False
         rate = (changes[-1] / changes[-1 - _RECENT]) ** (1 / _RECENT)
         if rate >= 1:
             return len(changes) > 2 * _TRIAL
-        return bool(self.sweeps + np.log(goal / changes[-1]) / np.log(rate) > 2 * most)
+        return bool(self.sweeps + np.log(goal / changes[-1]) / np.log(rate) > 2 * max_sweeps)
 
     def greedy(self, value: Values) -> tuple[Values, Integers]:
         """The backup of a value that stays as it is, and the first row that attains it."""
@@ -290,13 +290,13 @@ class _Search:
 
         def one(i: int) -> tuple[Values, Integers]:
             image = self.images(i, value)
-            found = self.best(i, image)
-            return found, _first(image, found, self.parts[i].begin, self.problem.blocks.width)
+            optimum = self.best(i, image)
+            return optimum, _first(image, optimum, self.parts[i].begin, self.problem.blocks.width)
 
         for blocks in self.in_pairs(one):
-            for i, (found, first) in blocks:
+            for i, (optimum, first) in blocks:
                 a, b = self.parts[i].a, self.parts[i].b
-                best[a:b], row[a:b] = found, self.problem.blocks.row_start[a] + first
+                best[a:b], row[a:b] = optimum, self.problem.blocks.row_start[a] + first
         return np.where(self.problem.interior, best, 0), row
 
     def chain(self, row: Integers) -> tuple[SparseMatrix, Floats | None]:
@@ -348,10 +348,10 @@ class _Search:
             return None
         outer = np.where(live, value[:nodes], best + sign * slack)
         chain, cost = self.chain(row)
-        found = self.truncated_time(chain)
-        if found is None:
+        timed = self.truncated_time(chain)
+        if timed is None:
             return None
-        time, least = found
+        time, least = timed
         known = self._known_width()
         loss = _MARGIN * (extra * (1 + 2 * _LEFT) + 4 * unit * float(value.max(initial=0))) / least
         attained = np.where(problem.live, value - sign * (loss * time + known), problem.attained)
@@ -364,11 +364,11 @@ class _Search:
         attained = np.where(live, attained[:nodes], image - sign * slack)
         return SweptBounds(attained, outer, row, self.sweeps, float(time.max(initial=0)))
 
-    def excess(self, found: SweptBounds) -> float:
+    def excess(self, bounds: SweptBounds) -> float:
         """The width of bounds beyond that of the known values, in tolerances."""
-        width = np.abs(found.outer - found.attained)[self.problem.interior] - self._known_width()
+        width = np.abs(bounds.outer - bounds.attained)[self.problem.interior] - self._known_width()
         if self.settings.relative:
-            size = np.abs(found.attained if self.sign > 0 else found.outer)[self.problem.interior]
+            size = np.abs(bounds.attained if self.sign > 0 else bounds.outer)[self.problem.interior]
             width = width / np.maximum(size, 1e-300)
         return float(width.max(initial=0)) / self.settings.tolerance
 

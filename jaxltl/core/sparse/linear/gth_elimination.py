@@ -39,14 +39,14 @@ def gth_solver(matrix: SparseMatrix, leaving: Floats) -> Solver | None:
     total, out = np.empty(size), leaving[order].astype(np.float64)
     first = np.maximum(np.arange(size) - width, 0).tolist()
     for k in reversed(range(size)):
-        near = slice(first[k], k)
-        total[k] = band[k, near].sum() + out[k]
+        earlier = slice(first[k], k)
+        total[k] = band[k, earlier].sum() + out[k]
         if not total[k] > 0:
             return None
-        share = band[near, k]
+        share = band[earlier, k]
         share /= total[k]
-        band[near, near] += share[:, None] * band[k, near]
-        out[near] += share * out[k]
+        band[earlier, earlier] += share[:, None] * band[k, earlier]
+        out[earlier] += share * out[k]
 
     def solve(b: Floats) -> Floats:
         x = b[order]

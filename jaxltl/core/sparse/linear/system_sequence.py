@@ -35,15 +35,15 @@ class SystemSequence:
     ) -> Floats | None:
         """The solution up to a residual, or up to rounding if that is more; None if singular."""
         if self.mixes:
-            found = bicgstab(matrix, b, start, residual, steps=_STEPS)
-            if found is not None:
-                return found
+            solution = bicgstab(matrix, b, start, residual, steps=_STEPS)
+            if solution is not None:
+                return solution
             self.mixes = False
         if self.factors is not None and self.matrix is not matrix and b.size > _DIRECT:
             old = self.factors.solve
-            found = bicgstab(matrix, b, start, residual, steps=_PRECONDITIONED, precondition=old)
-            if found is not None:
-                return found
+            solution = bicgstab(matrix, b, start, residual, steps=_PRECONDITIONED, precondition=old)
+            if solution is not None:
+                return solution
         return self.solve_directly(matrix, b)
 
     def solve_directly(self, matrix: SparseMatrix, b: Floats) -> Floats | None:

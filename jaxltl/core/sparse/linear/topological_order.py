@@ -37,12 +37,12 @@ class Levels(NamedTuple):
 
 def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels:
     """Levels of the nodes that reach no cycle, by Kahn's algorithm (1962)."""
-    found: list[Integers] = []
+    levels: list[Integers] = []
     start = [0]
     frontier: Integers = np.flatnonzero(among & (number == 0))
-    most = _ROUNDS + number.size // _NODES
-    while frontier.size and len(found) < most:
-        found.append(frontier)
+    max_levels = _ROUNDS + number.size // _NODES
+    while frontier.size and len(levels) < max_levels:
+        levels.append(frontier)
         start.append(start[-1] + frontier.size)
         among[frontier] = False
         first = back.start[frontier]
@@ -50,7 +50,7 @@ def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels
         decrement(number, source)
         frontier = sorted_unique(source[(number[source] == 0) & among[source]], number.size)
     none: Integers = np.zeros(0, np.int64)
-    return Levels(np.concatenate(found) if found else none, start)
+    return Levels(np.concatenate(levels) if levels else none, start)
 
 
 def ordered_components(edges: Edges) -> Integers:

@@ -40,21 +40,21 @@ def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
     distance, normal, share = 0.0, np.full(scale.size, 1 / scale.size), np.eye(len(points))[0]
     for _ in range(_ZOOMS):
         size = float(np.abs(ahead[chosen]).max())
-        found = _apart(ahead[chosen] / size, np.ones(scale.size)) if size > 0 else None
-        if found is None:
+        face = _apart(ahead[chosen] / size, np.ones(scale.size)) if size > 0 else None
+        if face is None:
             break
-        distance, normal, share = found[0] * size, found[1], np.zeros(len(points))
-        share[chosen] = found[2]
+        distance, normal, share = face[0] * size, face[1], np.zeros(len(points))
+        share[chosen] = face[2]
         height = ahead @ normal
         top = height[chosen].max()
         beyond = np.flatnonzero(height > top + 8 * _EPS * np.abs(ahead).max(1))
-        near = np.flatnonzero(height >= top - _NEAR * size)
+        upper = np.flatnonzero(height >= top - _NEAR * size)
         if beyond.size:
             chosen = np.union1d(chosen, beyond)
-        elif np.abs(ahead[near]).max() > size / 2:
+        elif np.abs(ahead[upper]).max() > size / 2:
             break
         else:
-            chosen = near
+            chosen = upper
     return Separation(distance, normal / scale, share)
 
 
@@ -63,7 +63,7 @@ def _apart(ahead: Floats, along: Floats) -> tuple[float, Floats, Floats] | None:
     from scipy import optimize
 
     count, size = ahead.shape
-    found = optimize.linprog(
+    program = optimize.linprog(
         np.append(np.zeros(count), 1.0),
         A_ub=np.hstack([-ahead.T, -along[:, None]]),
         b_ub=np.zeros(size),
@@ -73,13 +73,13 @@ def _apart(ahead: Floats, along: Floats) -> tuple[float, Floats, Floats] | None:
         method="highs",
         options=_EXACT,
     )
-    if found.status != 0:
+    if program.status != 0:
         return None
-    normal = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
+    normal = np.maximum(-np.asarray(program.ineqlin.marginals), 0)
     total = normal.sum()
-    share = np.maximum(found.x[:-1], 0)
+    share = np.maximum(program.x[:-1], 0)
     return (
-        float(found.x[-1]),
+        float(program.x[-1]),
         normal / total if total > 0 else np.full(size, 1 / size),
         share / share.sum(),
     )
@@ -88,8 +88,8 @@ def _apart(ahead: Floats, along: Floats) -> tuple[float, Floats, Floats] | None:
 def mixture(lower: Floats, share: Floats) -> Floats:
     """Lower bound of the value of a mixture of policies, ``float64[n]``."""
     scale = 4 * _EPS * (len(share) + 2) / max(share.sum(), 1e-300)
-    found: Floats = share @ lower - scale * (share @ np.abs(lower))
-    return found
+    lower_bound: Floats = share @ lower - scale * (share @ np.abs(lower))
+    return lower_bound
 
 
 def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
@@ -118,8 +118,8 @@ def plain(share: Floats) -> Floats:
     >>> plain(np.array([0.25000000000000006, 0.75])).tolist()
     [0.25, 0.75]
     """
-    near = np.array([float(Fraction(float(x)).limit_denominator(1000)) for x in share])
-    return np.where(np.abs(near - share) < 1e-12, near, share)
+    simple = np.array([float(Fraction(float(x)).limit_denominator(1000)) for x in share])
+    return np.where(np.abs(simple - share) < 1e-12, simple, share)
 
 
 def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
@@ -174,10 +174,10 @@ def _largest_mixtures(
     inner = separation(points[:, constrained], least[constrained], scale[constrained]).share
     kept = np.append(constrained, index)
     ahead = (points - np.where(np.isfinite(least), least, 0))[:, kept] / scale[kept]
-    found = _apart(ahead, np.append(np.zeros(constrained.size), 1.0))
-    if found is None:
+    face = _apart(ahead, np.append(np.zeros(constrained.size), 1.0))
+    if face is None:
         return [inner]
-    best = found[2]
+    best = face[2]
     # A program is rounded: a small share of an inner point makes up for its error.
     misses = (least - mixture(points, best))[constrained] + 4 * _EPS * np.abs(least[constrained])
     misses = np.maximum(misses, 0)
@@ -200,20 +200,20 @@ def _outer(
     goal = np.zeros(size)
     goal[index] = -1
     floor = [(x / s if np.isfinite(x) else None, None) for x, s in zip(least, scale, strict=True)]
-    found = optimize.linprog(
+    program = optimize.linprog(
         goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT
     )
-    if found.status != 0:
+    if program.status != 0:
         return np.inf, None
-    weight = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
+    weight = np.maximum(-np.asarray(program.ineqlin.marginals), 0)
     # Any nonnegative combination of half-spaces is one; the others meet their thresholds.
     normal, bound = weight @ normals, float(weight @ bounds)
     if not normal[index] > 0:
-        return np.inf, found.x * scale
+        return np.inf, program.x * scale
     others = np.arange(size) != index
     needless = others & ~constrained
     if (normal[needless] > 1e-12 * normal[index]).any():
-        return np.inf, found.x * scale
+        return np.inf, program.x * scale
     taken = np.where(others & constrained, least, 0)
     upper = (bound - normal @ taken) / normal[index]
     slack = (
@@ -223,7 +223,7 @@ def _outer(
         * (weight @ np.abs(bounds) + normal @ np.abs(taken))
         / normal[index]
     )
-    return float(upper + slack), found.x * scale
+    return float(upper + slack), program.x * scale
 
 
 def corners(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
@@ -247,10 +247,10 @@ def corners(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
     if inner.status != 0 or inner.x[-1] <= 1e-12:
         return np.zeros((0, size))
     sides = np.hstack([faces, -limits[:, None]])
-    found: Floats = spatial.HalfspaceIntersection(
+    vertices: Floats = spatial.HalfspaceIntersection(
         sides, inner.x[:-1], qhull_options="QJ"
     ).intersections
-    return found
+    return vertices
 
 
 def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
@@ -265,5 +265,5 @@ def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
     points = np.stack([(c * b[:, 1] - d * a[:, 1]) / det, (a[:, 0] * d - b[:, 0] * c) / det], -1)
     slack = 1e-9 * (1 + np.abs(limits) + np.abs(faces) @ np.abs(floor))
     kept = (points @ faces.T <= limits + slack).all(1)
-    found: Floats = points[kept]
-    return found
+    vertices: Floats = points[kept]
+    return vertices

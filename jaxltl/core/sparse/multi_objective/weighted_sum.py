@@ -61,7 +61,7 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
     if (sums.start > 0)[~inside].any():
         return None
     count = len(sums.priority)
-    sets, found = [], []
+    sets, inside_of_set = [], []
     for size in range(count, -1, -1):
         for chosen in itertools.combinations(range(count), size):
             wanted = np.zeros(count, bool)
@@ -69,23 +69,23 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
             region = _satisfying(mdp, sums.priority[wanted], homes.inside & rows)
             if region.any():
                 sets.append(wanted)
-                found.append(region)
-    return FinalComponents(rows, np.array(sets, bool).reshape(len(sets), count), found)
+                inside_of_set.append(region)
+    return FinalComponents(rows, np.array(sets, bool).reshape(len(sets), count), inside_of_set)
 
 
 def _satisfying(mdp: HostMDP, priority: Integers, rows: Booleans) -> Booleans:
     """Rows of end components with even least priorities; others are searched without odd rows."""
     while True:
-        found = end_components(mdp, rows=rows)
-        leader = found.component[mdp.state]
+        components = end_components(mdp, rows=rows)
+        leader = components.component[mdp.state]
         bad = np.zeros(mdp.num_rows, bool)
         for level in priority:
             least = np.full(mdp.num_states, np.iinfo(np.int64).max)
-            np.minimum.at(least, leader[found.inside], level[found.inside])
-            bad |= found.inside & (least[leader] % 2 == 1) & (level == least[leader])
+            np.minimum.at(least, leader[components.inside], level[components.inside])
+            bad |= components.inside & (least[leader] % 2 == 1) & (level == least[leader])
         if not bad.any():
-            return found.inside
-        rows = found.inside & ~bad
+            return components.inside
+        rows = components.inside & ~bad
 
 
 class WeightedOptimum(NamedTuple):
@@ -172,12 +172,12 @@ def _solved(
     costs = loss.any()
     if costs and (gain[moves] > 0).any():
         return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
-    most = quotient.known.max() if costs else 0.0
-    amount = np.where(moves, loss, most - quotient.known) if costs else gain
+    highest = quotient.known.max() if costs else 0.0
+    amount = np.where(moves, loss, highest - quotient.known) if costs else gain
     amount[-1] = 0
     problem = ShortestPathProblem(mdp, ~end, np.zeros(end.size), amount, proper_policy=first)
-    found = policy_iteration(problem, maximize=not costs, tolerance=tolerance, relative=False)
-    return (most - found.lower if costs else found.upper), found.row
+    enclosure = policy_iteration(problem, maximize=not costs, tolerance=tolerance, relative=False)
+    return (highest - enclosure.lower if costs else enclosure.upper), enclosure.row
 
 
 def _signed(
@@ -251,13 +251,13 @@ def _policy(
     goal = home.copy()
     moving = np.flatnonzero(~stops & (own >= 0))
     goal[mdp.state[own[moving]]] = True
-    found = shortest_path_rows(mdp, goal, free.inside & region[mdp.state])
+    policy = shortest_path_rows(mdp, goal, free.inside & region[mdp.state])
     exits = np.zeros(mdp.num_states, bool)
     exits[mdp.state[own[moving]]] = True
     at = exits & (own >= 0) & (mdp.state[np.maximum(own, 0)] == np.arange(mdp.num_states))
-    found = np.where(at, own, found)
+    policy = np.where(at, own, policy)
     weight = np.zeros(mdp.num_rows)
-    weight[found] = 1
+    weight[policy] = 1
     weight[home[mdp.state]] = 0
     count = np.bincount(mdp.state[inside], minlength=mdp.num_states)
     weight[inside] = 1 / count[mdp.state[inside]]

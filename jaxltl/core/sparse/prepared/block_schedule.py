@@ -60,11 +60,11 @@ class Schedule(NamedTuple):
 
 def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
     """The block schedule of a system."""
-    count, most, width = nodes.number, *_shape(nodes)
+    count, depth, width = nodes.number, *_shape(nodes)
     nodes, _ = _split(nodes, width, one, of_rows=False)
-    nodes, choices = _split(nodes, most, one, of_rows=True)
+    nodes, choices = _split(nodes, depth, one, of_rows=True)
     parts = [[level for level in part if level.size] for part in _ordered(nodes)]
-    size = _block_size([x.size for part in parts for x in part], most * width)
+    size = _block_size([x.size for part in parts for x in part], depth * width)
     place: Integers = np.zeros(nodes.number, np.int32)
     blocks, start = [], 0
     for part in parts:
@@ -73,7 +73,7 @@ def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
             place[level] = start + np.arange(level.size)
             start += -(-level.size // size) * size
     blocks.append(start // size)
-    target, source, name = _filled(nodes, place, start, (most, width, size), nothing)
+    target, source, name = _filled(nodes, place, start, (depth, width, size), nothing)
     segments = [Segment(target[a:b], source[a:b], name[a:b]) for a, b in pairwise(blocks)]
     levels = sum(map(len, parts))
     return Schedule((segments[0], segments[1], segments[2]), place[:count], start, levels, choices)
@@ -190,13 +190,13 @@ def _graph(source: Integers, target: Integers, size: int) -> Edges:
 
 def _peeled(back: Edges, degree: Integers, among: Booleans) -> list[Integers]:
     """All levels of the nodes that reach no cycle; removes them from a set."""
-    found: list[Integers] = []
+    levels: list[Integers] = []
     number = degree.astype(np.int32)
     while True:
         more = topological_levels(back, number, among)
         if not more.node.size:
-            return found
-        found += [more.node[a:b] for a, b in pairwise(more.start)]
+            return levels
+        levels += [more.node[a:b] for a, b in pairwise(more.start)]
 
 
 def _layers(source: Integers, target: Integers, size: int) -> list[Integers]:
@@ -235,20 +235,20 @@ def _filled(
     nodes: Nodes, place: Integers, total: int, shape: tuple[int, int, int], nothing: int
 ) -> tuple[Integers, Integers, Integers]:
     """Padded arrays of all blocks."""
-    most, width, size = shape
+    depth, width, size = shape
     blocks = total // size
-    if total * most * width >= 2**31:
+    if total * depth * width >= 2**31:
         raise ValueError(f"the model has {nodes.row.size} entries; a schedule has room for 2^31.")
-    target: Integers = np.full((blocks, most, width, size), total + 1, np.int32)
-    source: Integers = np.full((blocks, most, width, size), nothing, np.int32)
-    name: Integers = np.zeros((blocks, most, size), np.int32)
+    target: Integers = np.full((blocks, depth, width, size), total + 1, np.int32)
+    source: Integers = np.full((blocks, depth, width, size), nothing, np.int32)
+    name: Integers = np.zeros((blocks, depth, size), np.int32)
     at = place[nodes.owner].astype(np.int64)
     rank = _ranks(nodes.owner, nodes.number)
     link = nodes.name < 0
     name[at // size, rank, at % size] = np.where(
         link, -1 - place[np.where(link, -1 - nodes.name, 0)], nodes.name
     )
-    slot = ((at // size * most + rank) * width) * size + at % size
+    slot = ((at // size * depth + rank) * width) * size + at % size
     flat = slot[nodes.row] + _ranks(nodes.row, nodes.owner.size) * size
     inner = nodes.target >= 0
     target.reshape(-1)[flat] = np.where(
@@ -256,10 +256,10 @@ def _filled(
     )
     source.reshape(-1)[flat] = nodes.source
     # Rows that a node has not got are its first one again.
-    count: Integers = np.full(total, most)
+    count: Integers = np.full(total, depth)
     count[place] = np.bincount(nodes.owner, minlength=nodes.number)
     count = count.reshape(blocks, size)
-    for a in range(1, most):
+    for a in range(1, depth):
         c, b = np.nonzero(count <= a)
         target[c, a, :, b], source[c, a, :, b] = target[c, 0, :, b], source[c, 0, :, b]
         name[c, a, b] = name[c, 0, b]

@@ -191,11 +191,11 @@ def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Flo
     code[open_] = np.arange(np.count_nonzero(open_))
     rows = np.flatnonzero(open_[small.state])
     order, place, loops = _scheduled(mdp, whole, code, rows, cost, mixed=True)
-    most = int(np.diff(mdp.row_start).max())
+    max_choices = int(np.diff(mdp.row_start).max())
     row: Integers = mdp.row_start[:-1].astype(np.int32)
     states = place[whole.node].astype(np.int32)
     nowhere = np.full(mdp.num_states, -1, np.int32)
-    return Plan(order, states, nowhere, row, loops, None, _terms(loops) + 2 * most + 4)
+    return Plan(order, states, nowhere, row, loops, None, _terms(loops) + 2 * max_choices + 4)
 
 
 def _terms(loops: Loops | None) -> int:

@@ -78,24 +78,24 @@ def average(
     sign: int = 1,
 ) -> AverageReward:
     """Largest long-run average reward per step."""
-    found = end_components(mdp)
-    states = np.flatnonzero(found.region(mdp))
-    states = states[np.argsort(found.component[states], kind="stable")]
-    leaders, start = np.unique(found.component[states], return_index=True)
+    components = end_components(mdp)
+    states = np.flatnonzero(components.region(mdp))
+    states = states[np.argsort(components.component[states], kind="stable")]
+    leaders, start = np.unique(components.component[states], return_index=True)
     gains = _gains(
-        _submodel(mdp, found.inside, states, start, (reward, magnitude)), tolerance, max_steps
+        _submodel(mdp, components.inside, states, start, (reward, magnitude)), tolerance, max_steps
     )
     middle, half = (gains.lower + gains.upper) / 2, float((gains.upper - gains.lower).max()) / 2
     row = mdp.row_start[:-1].astype(np.int64)
     row[states] = gains.row
     if middle.min() == middle.max():
         value = np.full(mdp.num_states, middle[0])
-        inside = found.region(mdp)
+        inside = components.region(mdp)
         if not inside.all():
             onward = shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool))
             row = np.where(inside, row, onward)
         return AverageReward(value, value - half, value + half, row, half, gains.rounds)
-    stopping = _stopping_problem(mdp, found, leaders)
+    stopping = _stopping_problem(mdp, components, leaders)
     least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
     width = tolerance / 4 * least
     if half <= width:
@@ -108,7 +108,7 @@ def average(
         value=(low + high) / 2,
         lower=low - slack,
         upper=high + slack,
-        row=quotient_policy(mdp, found, taken, row),
+        row=quotient_policy(mdp, components, taken, row),
         residual=half,
         rounds=gains.rounds + rounds,
     )
@@ -133,25 +133,25 @@ class _Stopping:
         relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
         known = np.concatenate([np.zeros(size), worth - shift])
         interior = np.arange(mdp.num_states) < size
-        found = policy_iteration(
+        enclosure = policy_iteration(
             ShortestPathProblem(mdp, interior, known, np.zeros(mdp.num_rows)),
             maximize=sign > 0,
             relative=relative,
             tolerance=tolerance / 4 if relative else width,
         )
         slack = 4 * _EPS * (abs(shift) + known.max()) if shift else 0.0
-        low, high = (x[self.node] + shift for x in (found.lower, found.upper))
+        low, high = (x[self.node] + shift for x in (enclosure.lower, enclosure.upper))
         low, high = (low, high) if sign > 0 else (-high, -low)
         # It is a mean of the gains of the components.
         low, high = np.maximum(low - slack, gain.min()), np.minimum(high + slack, gain.max())
-        return low, high, self.origin[found.row[self.node]], found.rounds
+        return low, high, self.origin[enclosure.row[self.node]], enclosure.rounds
 
 
-def _stopping_problem(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopping:
-    heads = np.flatnonzero(found.component == np.arange(mdp.num_states))
-    node = np.searchsorted(heads, found.component)
+def _stopping_problem(mdp: HostMDP, components: EndComponents, leaders: Integers) -> _Stopping:
+    heads = np.flatnonzero(components.component == np.arange(mdp.num_states))
+    node = np.searchsorted(heads, components.component)
     stops = np.arange(leaders.size) + heads.size
-    row = np.flatnonzero(~found.inside)
+    row = np.flatnonzero(~components.inside)
     ends = np.concatenate([node[leaders], stops]), np.tile(stops, 2)
     small, order = with_stops(mdp, row, node, ends, heads.size + stops.size)
     origin = np.concatenate([row, np.full(2 * stops.size, -1)])
@@ -324,10 +324,10 @@ def _gains(whole: _Submodel, tolerance: float, max_steps: int) -> _Gains:
         settled, v = np.zeros(rest.which.size, bool), rest.v.copy()
         for i in np.flatnonzero(rest.part.size <= _ELIMINATED):
             one = np.arange(settled.size) == i
-            found = _policy_iteration(known, rest.only(one), tolerance)
-            settled[i] = found is None
-            if found is not None:
-                v[np.repeat(one, rest.part.size)] = found
+            bias = _policy_iteration(known, rest.only(one), tolerance)
+            settled[i] = bias is None
+            if bias is not None:
+                v[np.repeat(one, rest.part.size)] = bias
         # Value iteration continues its own values first, and later those of policies.
         rest = (replace(rest, v=v) if turn else rest).only(~settled)
         if not rest.which.size or max_steps <= _SWEEPS:
@@ -423,18 +423,18 @@ def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | No
     if heads.size > 1:
         gains = []
         for head in heads:
-            found = _gain_and_bias(part, chosen, np.flatnonzero(label == head))
-            if found is None:
+            bias = _gain_and_bias(part, chosen, np.flatnonzero(label == head))
+            if bias is None:
                 return None
-            gains.append(found.gain)
+            gains.append(bias.gain)
         heads = heads[[int(np.argmax(gains))]]
         taken = np.zeros(mdp.num_rows, bool)
         taken[chosen] = True
         goal = backward_reachable(mdp, label == heads[0], taken)
         onward = shortest_path_rows(mdp, goal, np.ones(mdp.num_rows, bool))
         chosen = np.where(goal, chosen, onward)
-    found = _gain_and_bias(part, chosen, np.arange(size), np.flatnonzero(label == heads[0]))
-    return None if found is None else (found, chosen)
+    bias = _gain_and_bias(part, chosen, np.arange(size), np.flatnonzero(label == heads[0]))
+    return None if bias is None else (bias, chosen)
 
 
 def _gain_and_bias(

@@ -31,14 +31,18 @@ def discounted_value(
     # The least reward is earned forever, and the rest is at least 0.
     cost = np.append(reward - least, 0)
     problem = ShortestPathProblem(ending, interior, np.zeros(interior.size), cost, depth=depth)
-    found = solve_shortest_path(problem, maximize=True, tolerance=tolerance, relative=False)
+    enclosure = solve_shortest_path(problem, maximize=True, tolerance=tolerance, relative=False)
     always = least / (1 - discount)
-    value, lower, upper = (x[:-1] + always for x in (found.value, found.lower, found.upper))
+    value, lower, upper = (
+        x[:-1] + always for x in (enclosure.value, enclosure.lower, enclosure.upper)
+    )
     # Terms of a reward may cancel; their rounding stays.
     terms = int(np.diff(mdp.entry_start).max()) + depth + 4
     lost = terms * float(magnitude.max()) / (1 - discount)
-    slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always) + lost)
-    return replace(found, value=value, lower=lower - slack, upper=upper + slack, row=found.row[:-1])
+    slack = 4 * _EPS * (np.abs(enclosure.value[:-1]) + abs(always) + lost)
+    return replace(
+        enclosure, value=value, lower=lower - slack, upper=upper + slack, row=enclosure.row[:-1]
+    )
 
 
 def _with_final_state(mdp: HostMDP, discount: float) -> HostMDP:

@@ -112,7 +112,7 @@ def layered_reachability(
     if sets is None:
         return None
     search = _Search(world, sets, 1 if maximize else -1, tolerance)
-    return search.found() if search.solve() else None
+    return search.bounds() if search.solve() else None
 
 
 def _mixes(world: PaddedProduct) -> bool:
@@ -148,7 +148,7 @@ class _Search:
         """The states in which a set holds an automaton state."""
         return (words >> q & 1).astype(bool)
 
-    def open(self, q: int) -> Booleans:
+    def undecided(self, q: int) -> Booleans:
         """The states in which the probability is neither 0 nor 1."""
         return ~self.has(self.sets.one | self.sets.zero, q)
 
@@ -163,7 +163,7 @@ class _Search:
             )
         )
         parts = [np.flatnonzero(label == i) for i in range(label.max() + 1)]
-        parts = [x for x in parts if any(self.open(int(q)).any() for q in x)]
+        parts = [x for x in parts if any(self.undecided(int(q)).any() for q in x)]
         for i, part in enumerate(parts, 1):
             budget = self.tolerance * i / len(parts) - self.known
             if budget <= 0 or not self.component(part, budget):
@@ -178,22 +178,23 @@ class _Search:
         # Columns are pairs that a step may enter; of one memory, numbered by the state.
         problem = _alone(self, int(part[0])) if part.size == 1 else _together(self, part)
         guess = self.guess if part.size == 1 else None
-        found = _solved(problem, self.sign, budget, self.unit, guess)
-        if found is None:
+        bounds = _solved(problem, self.sign, budget, self.unit, guess)
+        if bounds is None:
             return False
-        attained, outer, row = found.attained, found.outer, found.row
-        self.sweeps += found.sweeps
+        attained, outer, row = bounds.attained, bounds.outer, bounds.row
+        self.sweeps += bounds.sweeps
         self.known = max(
-            self.known, float(np.abs(outer - attained)[problem.open[: outer.size]].max(initial=0))
+            self.known,
+            float(np.abs(outer - attained)[problem.undecided[: outer.size]].max(initial=0)),
         )
         for i, q in enumerate(part):
             span = slice(i * host.num_states, (i + 1) * host.num_states)
-            open_ = problem.open[span]
+            open_ = problem.undecided[span]
             np.copyto(self.attained[q], attained[span], where=open_)
             np.copyto(self.outer[q], outer[span], where=open_)
             action = self.rows.action[row[span] - i * host.num_rows]
             np.copyto(self.action[:, q], action, where=open_)
-        self.guess = (self.attained[part[0]], found.time) if part.size == 1 else None
+        self.guess = (self.attained[part[0]], bounds.time) if part.size == 1 else None
         return True
 
     @cached_property
@@ -201,7 +202,7 @@ class _Search:
         """The relative rounding of one backup."""
         return (4 * int(self.world.used.shape[2]) + 16) * _EPS
 
-    def found(self) -> LayeredBounds:
+    def bounds(self) -> LayeredBounds:
         """The final bounds."""
         low, high = (self.attained, self.outer) if self.sign > 0 else (self.outer, self.attained)
         # Products too small for a float to hold are lost; relative errors do not count them.
@@ -216,7 +217,7 @@ class _Problem(NamedTuple):
 
     host: HostMDP  # as many states as columns; the first ones are nodes
     cut: RowBlocks | None  # the blocks of its rows, if known
-    open: Booleans  # as of BlockProblem, for all columns (open, live, attained, outer)
+    undecided: Booleans  # as of BlockProblem, for all columns (open, live, attained, outer)
     live: Booleans
     attained: Floats
     outer: Floats
@@ -230,7 +231,7 @@ def _alone(search: _Search, q: int) -> _Problem:
     world, rows = search.world, search.rows
     after = world.delta[q][world.letter]
     place = np.arange(after.size)
-    inner, open_ = after == q, search.open(q)
+    inner, open_ = after == q, search.undecided(q)
     mask = None if world.allowed is None else rows.of(world.allowed[:, q])
     return _Problem(
         rows.host,
@@ -270,7 +271,7 @@ def _together(search: _Search, part: Integers) -> _Problem:
     every = np.concatenate([part, others])
     attained, outer = (x[every].ravel() for x in (search.attained, search.outer))
     none = np.zeros(ends, bool)
-    open_ = np.concatenate([*map(search.open, part), none])
+    open_ = np.concatenate([*map(search.undecided, part), none])
     stays = np.concatenate([*(search.has(search.sets.stays, q) for q in part), none])
     mask = None
     if world.allowed is not None:
@@ -307,18 +308,20 @@ def _solved(
     settings = SweepSettings(sign=sign, tolerance=budget, relative=False, unit=unit)
     sums = BlockProblem(
         blocks,
-        problem.open[leader],
+        problem.undecided[leader],
         problem.live[leader],
         problem.attained[leader],
         problem.outer[leader],
         None,
         allowed,
     )
-    found = solve_by_sweeps(sums, settings, *(guess or (None, None)))
-    if found is None or part is None or circles is None:
-        return found
-    row = quotient_policy(host, circles, part.row[found.row][part.node])
-    return replace(found, attained=found.attained[part.node], outer=found.outer[part.node], row=row)
+    bounds = solve_by_sweeps(sums, settings, *(guess or (None, None)))
+    if bounds is None or part is None or circles is None:
+        return bounds
+    row = quotient_policy(host, circles, part.row[bounds.row][part.node])
+    return replace(
+        bounds, attained=bounds.attained[part.node], outer=bounds.outer[part.node], row=row
+    )
 
 
 def _cut(host: HostMDP) -> RowBlocks:

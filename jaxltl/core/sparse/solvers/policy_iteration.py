@@ -89,8 +89,8 @@ def policy_iteration(
     _widen(bounds, below.node, sign, grown)
     rounds, method = 0, "levels"
     if among.any():
-        left = np.concatenate([[0], np.cumsum(among[back.target])])
-        in_degree = (left[back.start[1:]] - left[back.start[:-1]]).astype(np.int32)
+        before = np.concatenate([[0], np.cumsum(among[back.target])])
+        in_degree = (before[back.start[1:]] - before[back.start[:-1]]).astype(np.int32)
         above = topological_levels(edges, in_degree, among)
         core = np.flatnonzero(among)
         if core.size:
@@ -98,9 +98,12 @@ def policy_iteration(
             solver = replace(
                 solver, unit=unit, outer_error=grown, tolerance=tolerance, relative=relative
             )
-            found = solver.solve()
-            rounds, method, node = found.rounds, found.method, solver.node
-            bounds[:, node], policy[node] = (found.attained, found.outer, found.value), found.policy
+            solution = solver.solve()
+            rounds, method, node = solution.rounds, solution.method, solver.node
+            bounds[:, node], policy[node] = (
+                (solution.attained, solution.outer, solution.value),
+                solution.policy,
+            )
             # Values are at least 0, as relative errors of the levels above assume.
             lowest = 0 if maximize else 1
             bounds[lowest, node] = np.maximum(bounds[lowest, node], 0)
@@ -234,7 +237,7 @@ class _CoreSolver:
     def _value_iteration(self) -> tuple[Floats, bool]:
         """A value after a few sweeps, in large cores more while states converge; True if all do."""
         equation, large = self.equation, self.equation.size > _LARGE_CORE
-        value, left = np.zeros(equation.size), np.inf
+        value, excess = np.zeros(equation.size), np.inf
         if equation.is_chain:  # one elimination suffices
             return value, False
         num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
@@ -246,11 +249,14 @@ class _CoreSolver:
                 break
             least = _CONVERGED * self.tolerance / k * self._weight(value)
             # Orders of magnitude by which a state changes too much, in the mean.
-            last, left = left, float(np.log(np.maximum(np.abs(value - before) / least, 1)).mean())
-            if not left:
+            last, excess = (
+                excess,
+                float(np.log(np.maximum(np.abs(value - before) / least, 1)).mean()),
+            )
+            if not excess:
                 return value, True
             # The rate varies, so that it may predict more sweeps.
-            if left * _SWEEPS > (last - left) * (2 * _MOST_SWEEPS):
+            if excess * _SWEEPS > (last - excess) * (2 * _MOST_SWEEPS):
                 break
         return value, False
 
@@ -272,11 +278,11 @@ class _CoreSolver:
         last, policy = policy, equation.choices.first(image, best)
         if (policy != last).any():
             time = self._truncated_time(policy, weight)
-        found = None if time is None else self._certified(policy, value, extra, weight, time)
-        if found is None or time is None:
+        attained = None if time is None else self._certified(policy, value, extra, weight, time)
+        if attained is None or time is None:
             return None
         middle = value - sign * extra * time
-        return _CoreValues(found, value, middle, policy, rounds, "value iteration")
+        return _CoreValues(attained, value, middle, policy, rounds, "value iteration")
 
     def _truncated_time(self, policy: Integers, weight: Floats) -> Floats | None:
         """A policy's expected sum of weights but for an eighth of them; None if that takes long."""
@@ -322,10 +328,10 @@ class _CoreSolver:
                 solver = solver.other(policy)
                 continue
             time = solver.solve(weight)
-            found = self._certified(policy, value, extra, weight, time)
-            if found is not None:
+            attained = self._certified(policy, value, extra, weight, time)
+            if attained is not None:
                 middle = value - sign * extra * time
-                best = _CoreValues(found, value, middle, policy, rounds, solver.method)
+                best = _CoreValues(attained, value, middle, policy, rounds, solver.method)
                 if self._is_narrow(best, self.tolerance / 2):
                     break
             else:
@@ -336,7 +342,7 @@ class _CoreSolver:
                 time = solver.solve(weight)
             other = self._extra_cost(time, value, margin)
             # The value of a better policy may need a larger extra for its rounding.
-            if same and extra / 2 <= other <= (2 * extra if found is None else np.inf):
+            if same and extra / 2 <= other <= (2 * extra if attained is None else np.inf):
                 break
             extra = other
         return best, rounds, policy
@@ -396,10 +402,10 @@ class _CoreSolver:
             return None
         return attained
 
-    def _is_narrow(self, found: _CoreValues, tolerance: float) -> bool:
+    def _is_narrow(self, values: _CoreValues, tolerance: float) -> bool:
         sign = self.equation.sign
-        width = sign * (found.outer - found.attained)
-        size = np.abs(found.attained if sign > 0 else found.outer) if self.relative else 1
+        width = sign * (values.outer - values.attained)
+        size = np.abs(values.attained if sign > 0 else values.outer) if self.relative else 1
         return bool((width <= tolerance * size).all())
 
     def _by_refinement(self, policy: Integers) -> _CoreValues | None:
@@ -419,12 +425,16 @@ class _CoreSolver:
     def _refined(
         self, policy: Integers, solver_of: Callable[[Integers], Solver | None]
     ) -> _CoreValues | None:
-        found = refined_optimum(self.equation, self.unit, policy, solver_of, self.tolerance)
-        if found is None:
+        optimum = refined_optimum(self.equation, self.unit, policy, solver_of, self.tolerance)
+        if optimum is None:
             return None
         method = "policy iteration by elimination, refined"
         return self._within(
-            found.value, found.share + self.outer_error, found.policy, found.num_policies, method
+            optimum.value,
+            optimum.share + self.outer_error,
+            optimum.policy,
+            optimum.num_policies,
+            method,
         )
 
     def _by_fractions(self, policy: Integers) -> _CoreValues | None:
@@ -432,11 +442,11 @@ class _CoreSolver:
         if self.equation.size > MAX_FRACTIONS:
             return None
         order = elimination_order(self.equation.matrix[policy], self.label)
-        found = None if order is None else exact_optimum(self.equation, policy, order)
-        if found is None:
+        optimum = None if order is None else exact_optimum(self.equation, policy, order)
+        if optimum is None:
             return None
         share = perturbation_bound(self.unit + self.outer_error, self.equation.size)
-        return self._within(found[0], share, found[1], 0, "policy iteration in fractions")
+        return self._within(optimum[0], share, optimum[1], 0, "policy iteration in fractions")
 
     def _within(
         self, value: Floats, share: float, policy: Integers, rounds: int, method: str

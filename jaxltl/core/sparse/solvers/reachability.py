@@ -117,9 +117,11 @@ def reward_forever(
         earning = reward > 0
         nothing = np.zeros(mdp.num_states, bool)
         never = ~positive_under_all_policies(mdp, nothing, ~earning)
-        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
+        enclosure = total_reward(
+            mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth
+        )
         quiet = never[mdp.state] & ~earning & ~mdp.support.some_successor_in(~never)
-        return replace(found, row=np.where(never, mdp.first_choice(quiet)[1], found.row))
+        return replace(enclosure, row=np.where(never, mdp.first_choice(quiet)[1], enclosure.row))
     components = end_components(mdp)
     earns = np.zeros(mdp.num_states, bool)
     paid = components.inside & (reward > 0)
@@ -133,14 +135,14 @@ def reward_forever(
     row = small.row_start[:-1].astype(np.int64)
     reduced = _finite_part(small, part.cost, finished, part.region(infinite), depth)
     reduced = replace(reduced, known_row=row, highest=np.inf, maximize=True)
-    found = _solve_nodes(reduced, tolerance)
-    leaving = quotient_policy(mdp, components, part.row[found.row][part.node])
+    enclosure = _solve_nodes(reduced, tolerance)
+    leaving = quotient_policy(mdp, components, part.row[enclosure.row][part.node])
     # Where it is infinite: to components with positive reward, and earning there forever.
     some, first = mdp.first_choice(paid)
     inner = shortest_path_rows(mdp, some, components.inside)
     outer = shortest_path_rows(mdp, rich, np.ones(mdp.num_rows, bool))
     endless = np.where(some, first, np.where(rich, inner, outer))
-    return _at(found, part.node, np.where(infinite, endless, leaving))
+    return _at(enclosure, part.node, np.where(infinite, endless, leaving))
 
 
 # --- qualitative preprocessing --------------------------------------------------------------------
@@ -291,37 +293,37 @@ def _smallest_reward(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> 
 
 def _solve(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     """The solution, mapped back to the states of the model."""
-    found = _solve_nodes(reduced, tolerance)
+    enclosure = _solve_nodes(reduced, tolerance)
     mdp, contraction = reduced.mdp, reduced.contraction
     if reduced.quotient is not None and reduced.components is not None:
         node = reduced.quotient.node
-        taken = reduced.quotient.row[found.row][node]
+        taken = reduced.quotient.row[enclosure.row][node]
         row = quotient_policy(contraction.mdp, reduced.components, taken)
         if reduced.fixed is not None and reduced.fixed_row is not None:
             row = np.where(reduced.fixed, reduced.fixed_row, row)
-        found = _at(found, node, row)
+        enclosure = _at(enclosure, node, row)
     if contraction.node.size == contraction.mdp.num_states:
-        return found
+        return enclosure
     row = mdp.row_start[:-1].astype(np.int64)
     # A node is the only state with its rows; all others have one row.
     own = mdp.state[contraction.row[contraction.mdp.row_start[:-1]]]
-    row[own] = contraction.row[found.row]
-    found, earned = _at(found, contraction.node, row), contraction.earned
+    row[own] = contraction.row[enclosure.row]
+    enclosure, earned = _at(enclosure, contraction.node, row), contraction.earned
     if not earned.any():
-        return found
+        return enclosure
     share = contraction.depth * _EPS
     return replace(
-        found,
-        value=found.value + earned,
-        lower=(found.lower + earned * (1 - share)) * (1 - _EPS),
-        upper=(found.upper + earned * (1 + share)) * (1 + _EPS),
+        enclosure,
+        value=enclosure.value + earned,
+        lower=(enclosure.lower + earned * (1 - share)) * (1 - _EPS),
+        upper=(enclosure.upper + earned * (1 + share)) * (1 + _EPS),
     )
 
 
-def _at(found: Enclosure, node: Integers, row: Integers) -> Enclosure:
+def _at(enclosure: Enclosure, node: Integers, row: Integers) -> Enclosure:
     """The bounds of the nodes of some states, with their rows."""
-    value, lower, upper = found.value[node], found.lower[node], found.upper[node]
-    return replace(found, value=value, lower=lower, upper=upper, row=row)
+    value, lower, upper = enclosure.value[node], enclosure.lower[node], enclosure.upper[node]
+    return replace(enclosure, value=value, lower=lower, upper=upper, row=row)
 
 
 def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
@@ -329,29 +331,29 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     if problem is None:
         return Enclosure(known, known, known, reduced.known_row, 0, 0.0, "the graph")
     relative = isinstance(tolerance, RelativeTolerance) or not np.isfinite(highest)
-    found = solve_shortest_path(
+    enclosure = solve_shortest_path(
         problem, maximize=reduced.maximize, tolerance=tolerance, relative=relative
     )
     infinite = np.isinf(known)
     value, lower, upper = (
         np.where(infinite, np.inf, np.clip(x, 0, highest))
-        for x in (found.value, found.lower, found.upper)
+        for x in (enclosure.value, enclosure.lower, enclosure.upper)
     )
-    row = np.where(problem.interior, found.row, reduced.known_row)
-    return replace(found, value=value, lower=lower, upper=upper, row=row)
+    row = np.where(problem.interior, enclosure.row, reduced.known_row)
+    return replace(enclosure, value=value, lower=lower, upper=upper, row=row)
 
 
 def quotient_policy(
     mdp: HostMDP, components: EndComponents, row: Integers, otherwise: Integers | None = None
 ) -> Integers:
     """The policy that leaves end components by some rows; `otherwise` where `row` is -1."""
-    found: Integers = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
+    policy: Integers = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
     moves = row >= 0
     own = moves & (mdp.state[np.maximum(row, 0)] == np.arange(mdp.num_states))
     inner = moves & components.region(mdp) & ~own
     if inner.any():
-        found = np.where(inner, shortest_path_rows(mdp, own, components.inside), found)
-    return np.where(own, row, found)
+        policy = np.where(inner, shortest_path_rows(mdp, own, components.inside), policy)
+    return np.where(own, row, policy)
 
 
 def solve_shortest_path(
@@ -360,11 +362,11 @@ def solve_shortest_path(
     """Certified optimum by sweeps where the model mixes well, by policy iteration otherwise."""
     size = int(np.count_nonzero(problem.interior))
     if size >= _SOME and mixes(problem, size):
-        found = sweep_shortest_path(
+        enclosure = sweep_shortest_path(
             problem, maximize=maximize, tolerance=tolerance, relative=relative
         )
-        if found is not None:
-            return found
+        if enclosure is not None:
+            return enclosure
     return policy_iteration(problem, maximize=maximize, tolerance=tolerance, relative=relative)
 
 
@@ -391,17 +393,17 @@ def expands_fast(
     steps: int = _STEPS,
 ) -> bool:
     """True if few steps from a state lead to many others."""
-    left = (_MET if met is None else met) - 1
+    remaining = (_MET if met is None else met) - 1
     seen: Booleans = np.zeros(num_states, bool)
     seen[start] = True
     for _ in range(steps):
-        if left <= 0:
+        if remaining <= 0:
             return True
         after = follow(start)
         start = np.unique(after[~seen[after]])
         seen[start] = True
-        left -= start.size
-    return left <= 0
+        remaining -= start.size
+    return remaining <= 0
 
 
 def sweep_shortest_path(
@@ -414,7 +416,7 @@ def sweep_shortest_path(
     unit = (4 * widest + problem.depth + 16) * _EPS
     cost = problem.cost if allowed is None else np.where(allowed, problem.cost, 0)
     blocks = row_blocks(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states)
-    found = solve_by_sweeps(
+    bounds = solve_by_sweeps(
         BlockProblem(
             blocks=blocks,
             interior=problem.interior,
@@ -426,16 +428,16 @@ def sweep_shortest_path(
         ),
         SweepSettings(sign=sign, tolerance=tolerance, relative=relative, unit=unit),
     )
-    if found is None:
+    if bounds is None:
         return None
-    low, high = (found.attained, found.outer) if sign > 0 else (found.outer, found.attained)
+    low, high = (bounds.attained, bounds.outer) if sign > 0 else (bounds.outer, bounds.attained)
     low = np.where(problem.interior, np.maximum(low - TINY, 0), known)
     high = np.where(problem.interior, high + TINY, known)
     value = low + (high - low) / 2
     # The operator carries the bounds towards each other, so the value by at most half the width.
     residual = float(((high - value) / np.maximum(value, 1))[problem.interior].max(initial=0))
-    row = np.where(problem.interior, found.row, mdp.row_start[:-1])
-    return Enclosure(value, low, high, row, found.sweeps, residual, "sweeps in place")
+    row = np.where(problem.interior, bounds.row, mdp.row_start[:-1])
+    return Enclosure(value, low, high, row, bounds.sweeps, residual, "sweeps in place")
 
 
 def _stochastic_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | None]:

@@ -41,7 +41,7 @@ class Level(NamedTuple):
     """Probabilities with the whole budget left."""
 
     value: Floats  # float64[S]
-    open: Booleans  # bool[S], where the value is not exact
+    undecided: Booleans  # bool[S], where the value is not exact
     error: float  # of the value there
     # int32[S], the choices with the whole budget left; int32[L + 1, S] with `by_level`
     row: Integers
@@ -65,25 +65,25 @@ def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
     scale = math.lcm(*(x.denominator for x in exact))
     whole = [int(x * scale) for x in exact]
     unit = Fraction(math.gcd(*whole) or scale, scale)
-    most = math.floor(_simplest(float(bound)) / unit)
-    if most > _LEVELS:
+    limit = math.floor(_simplest(float(bound)) / unit)
+    if limit > _LEVELS:
         worst = max(exact, key=lambda x: x.denominator)
         raise ValueError(
             f"the rewards have no unit in common but {float(unit):.3g} (one of them is "
-            f"{float(worst)!r}), and the bound {bound} has {most:.3g} of these; at most {_LEVELS} "
+            f"{float(worst)!r}), and the bound {bound} has {limit:.3g} of these; at most {_LEVELS} "
             "can be counted. Round the rewards to multiples of a larger unit."
         )
     # What costs more than everything costs just too much.
-    units = np.array([min(int(x / unit), most + 1) for x in exact], np.int64)
-    return units[place.reshape(cost.shape)], most
+    units = np.array([min(int(x / unit), limit + 1) for x in exact], np.int64)
+    return units[place.reshape(cost.shape)], limit
 
 
 def _simplest(x: float) -> Fraction:
     exact = Fraction(x)
     for size in (10, 10**3, 10**6, _DENOMINATOR):
-        near = exact.limit_denominator(size)
-        if float(near) == x:
-            return near
+        simple = exact.limit_denominator(size)
+        if float(simple) == x:
+            return simple
     return exact
 
 
@@ -96,10 +96,10 @@ def bounded_cost(
     by_level: bool = False,
 ) -> Level:
     """Optimal probability of a target through `stay`, within a budget of :func:`in_units`."""
-    cost, most = budget
+    cost, limit = budget
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
-    parts = _parts(mdp, shape, target, cost, most)
+    parts = _parts(mdp, shape, target, cost, limit)
     system = _System(shape, parts[0][1], maximal)
     size = parts[-1][0] + 1
     if 8.0 * size * shape.starts.size > _LARGEST:
@@ -109,7 +109,7 @@ def bounded_cost(
         )
     ring = np.zeros((size, shape.starts.size))  # the last levels
     error, every = 0.0, []
-    for level in range(most + 1):
+    for level in range(limit + 1):
         b = parts[0][2].copy()
         for c, matrix, hit in parts[1:]:
             if c > level:
@@ -119,11 +119,11 @@ def bounded_cost(
         value, off = system.solve(b, backup_unit(mdp) * (len(parts) + 1))
         error += off
         ring[level % size] = value
-        if by_level or level == most:
+        if by_level or level == limit:
             every.append(_policy(mdp, shape, system.policy(b, value)))
-    found = target.astype(np.float64)
-    found[shape.member] = ring[most % size][shape.node[shape.member]]
-    return Level(found, shape.member, error, np.stack(every) if by_level else every[-1])
+    probability = target.astype(np.float64)
+    probability[shape.member] = ring[limit % size][shape.node[shape.member]]
+    return Level(probability, shape.member, error, np.stack(every) if by_level else every[-1])
 
 
 class _Shape(NamedTuple):
@@ -141,13 +141,13 @@ def _shape(
 ) -> _Shape:
     free = np.maximum.reduceat(cost, mdp.entry_start[:-1]) == 0
     member = backward_reachable(mdp, target, open_[mdp.state]) & open_
-    found = end_components(mdp, member if maximal else open_, free)
-    inside = found.inside
+    components = end_components(mdp, member if maximal else open_, free)
+    inside = components.inside
     if not maximal:
         # A policy that stays in an end component without cost avoids the target.
-        member &= ~found.region(mdp)
+        member &= ~components.region(mdp)
         inside = np.zeros_like(inside)
-    leader = np.where(member & maximal, found.component, np.arange(mdp.num_states))
+    leader = np.where(member & maximal, components.component, np.arange(mdp.num_states))
     row = np.flatnonzero(member[mdp.state] & ~inside)
     row = row[np.argsort(leader[mdp.state[row]], kind="stable")]
     leaders, starts = np.unique(leader[mdp.state[row]], return_index=True)
@@ -156,7 +156,7 @@ def _shape(
 
 
 def _parts(
-    mdp: HostMDP, shape: _Shape, target: Booleans, cost: Integers, most: int
+    mdp: HostMDP, shape: _Shape, target: Booleans, cost: Integers, limit: int
 ) -> list[tuple[int, csr_array, Floats]]:
     """For each cost: the matrix of the entries of that cost, and the probability of the target."""
     from scipy import sparse
@@ -165,9 +165,9 @@ def _parts(
     entry = concatenated_ranges(mdp.entry_start[shape.row], count)
     row = np.repeat(np.arange(shape.row.size), count)
     goal, probability = mdp.successor[entry], mdp.probability[entry]
-    found = []
+    parts = []
     for c in np.union1d([0], cost[entry]).tolist():
-        if c > most:
+        if c > limit:
             break
         of = cost[entry] == c
         hit = of & target[goal]
@@ -177,22 +177,22 @@ def _parts(
             (probability[of], place), shape=(shape.row.size, shape.starts.size)
         )
         enters = np.bincount(row[hit], probability[hit], shape.row.size).astype(np.float64)
-        found.append((c, matrix, enters))
-    return found
+        parts.append((c, matrix, enters))
+    return parts
 
 
 def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
     """The chosen rows, and in end components the rows that lead to them."""
-    found = mdp.row_start[:-1].astype(np.int32)
+    policy = mdp.row_start[:-1].astype(np.int32)
     row = shape.row[chosen].astype(np.int32)
-    found[mdp.state[row]] = row
+    policy[mdp.state[row]] = row
     if shape.inside.any():
         goal = np.zeros(mdp.num_states, bool)
         goal[mdp.state[row]] = True
         within = np.zeros(mdp.num_states, bool)
         within[mdp.state[shape.inside]] = True
-        found = np.where(within & ~goal, shortest_path_rows(mdp, goal, shape.inside), found)
-    return found
+        policy = np.where(within & ~goal, shortest_path_rows(mdp, goal, shape.inside), policy)
+    return policy
 
 
 class _Layer(NamedTuple):
@@ -245,13 +245,13 @@ class _System:
             depth += ahead
         else:
             return None
-        found = []
+        layers = []
         for d in range(int(depth.max(initial=-1)) + 1):
             nodes = np.flatnonzero(depth == d)
             rows = concatenated_ranges(self.shape.starts[nodes], self.count[nodes])
             starts = np.cumsum(self.count[nodes]) - self.count[nodes]
-            found.append(_Layer(nodes, rows, self.matrix[rows], starts))
-        return found
+            layers.append(_Layer(nodes, rows, self.matrix[rows], starts))
+        return layers
 
     def best(self, image: Floats) -> Floats:
         operation = np.maximum if self.maximal else np.minimum

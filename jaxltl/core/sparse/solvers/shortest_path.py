@@ -18,18 +18,18 @@ def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) ->
     if goal.all():
         return row
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)
-    found = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
-    if not np.isfinite(found.upper).all():
+    time = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
+    if not np.isfinite(time.upper).all():
         return row
-    width = found.upper - found.lower
-    if not (width <= _TOLERANCE * found.upper).all():
+    width = time.upper - time.lower
+    if not (width <= _TOLERANCE * time.upper).all():
         return row
-    ahead = np.where(rows, 1 + mdp.expectation(found.value), np.inf)
-    slack = np.maximum(_TIE * found.value, width)
+    ahead = np.where(rows, 1 + mdp.expectation(time.value), np.inf)
+    slack = np.maximum(_TIE * time.value, width)
     best = mdp.over_choices(np.minimum, ahead) + slack
     first = mdp.first_choice(ahead <= best[mdp.state])[1]
     # A policy still ends if every step costs less than a whole one more.
-    chosen = np.where(slack < 0.1, first, found.row)
+    chosen = np.where(slack < 0.1, first, time.row)
     return np.where(goal, row, chosen)
 
 
@@ -38,10 +38,10 @@ def expected_steps(mdp: HostMDP, row: Integers, goal: Booleans) -> Floats | None
     rows = np.zeros(mdp.num_rows, bool)
     rows[row] = True
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)
-    found = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
-    finite = np.isfinite(found.value)
-    narrow = found.upper[finite] - found.lower[finite] <= 1e-6 * found.upper[finite]
-    return found.value if narrow.all() else None
+    time = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
+    finite = np.isfinite(time.value)
+    narrow = time.upper[finite] - time.lower[finite] <= 1e-6 * time.upper[finite]
+    return time.value if narrow.all() else None
 
 
 def with_exits(mdp: HostMDP, leaving: Booleans) -> HostMDP:

@@ -92,8 +92,8 @@ class InteriorRows:
 
             arrays = self.weight, self.target, self.entry_start
             matrix = sparse.csr_array(arrays, shape=(self.row.size, value.size))
-            found: Floats = self.known + matrix @ value
-            return found
+            images: Floats = self.known + matrix @ value
+            return images
         of = np.repeat(np.arange(self.row.size), np.diff(self.entry_start))
         return self.known + np.bincount(of, self.weight * value[self.target], self.row.size)
 

@@ -89,8 +89,12 @@ class Backup(NamedTuple):
         every: list[Integers] | None = None,
     ) -> Iterate:
         """Backups from a start: all of them, or up to a fixed point or a bounded remainder."""
-        most = _LONG if self.small_chain else int(_WORK / (self.matrix.nnz + _OVERHEAD))
-        last, done, check = num_steps if every is not None else min(num_steps, most), 0, _LONG
+        max_backups = _LONG if self.small_chain else int(_WORK / (self.matrix.nnz + _OVERHEAD))
+        last, done, check = (
+            num_steps if every is not None else min(num_steps, max_backups),
+            0,
+            _LONG,
+        )
         before = value
         while done < last:
             done += 1
@@ -159,17 +163,17 @@ def backup_on(mdp: HostMDP, places: Integers, operation: np.ufunc) -> Backup:
 
 def _policy(mdp: HostMDP, backup: Backup, row: Integers) -> Integers:
     """The choices of some states, and the first rows of the others: ``int32[S]``."""
-    found = mdp.row_start[:-1].astype(np.int32)
-    found[backup.places] = row
-    return found
+    policy = mdp.row_start[:-1].astype(np.int32)
+    policy[backup.places] = row
+    return policy
 
 
 def _policies(mdp: HostMDP, backup: Backup, every: list[Integers], num_steps: int) -> Integers:
     """The choices of all steps, the first step first: ``int32[n, S]``; constant after a fixed point."""
-    found = np.tile(mdp.row_start[:-1].astype(np.int32), (num_steps, 1))
+    policies = np.tile(mdp.row_start[:-1].astype(np.int32), (num_steps, 1))
     for i in range(num_steps):
-        found[num_steps - 1 - i, backup.places] = every[min(i, len(every) - 1)]
-    return found
+        policies[num_steps - 1 - i, backup.places] = every[min(i, len(every) - 1)]
+    return policies
 
 
 def until(
@@ -195,12 +199,12 @@ def until(
         low = np.maximum(limit.lower[places], x.value)
         return bool((limit.upper[places] - low <= _CLOSE).all())
 
-    found = backup.iterate(cost, np.zeros(places.size), num_steps, enough, every)
+    iterate = backup.iterate(cost, np.zeros(places.size), num_steps, enough, every)
     value = target.astype(np.float64)
-    value[places] = found.value
-    complete = found.is_fixed or found.num_steps == num_steps
+    value[places] = iterate.value
+    complete = iterate.is_fixed or iterate.num_steps == num_steps
     relative = relative_error(
-        _unit(mdp, backup, num_steps), num_steps if complete else found.num_steps
+        _unit(mdp, backup, num_steps), num_steps if complete else iterate.num_steps
     )
     error = np.where(open_ & (num_steps > 0), np.minimum(value * relative + UNDERFLOW, 1), 0)
     if places.size and (not complete or relative > _CLOSE):
@@ -215,9 +219,9 @@ def until(
         one = open_ & reached_within(mdp, sets, num_steps, choose, lambda x: ~leads(~x))
         value[one], error[one] = 1, 0
     if every is not None:
-        return Steps(value, error, _policies(mdp, backup, every, num_steps), found.num_steps)
-    row = backup.greedy(cost, found.before)
-    return Steps(value, error, _policy(mdp, backup, row), found.num_steps)
+        return Steps(value, error, _policies(mdp, backup, every, num_steps), iterate.num_steps)
+    row = backup.greedy(cost, iterate.before)
+    return Steps(value, error, _policy(mdp, backup, row), iterate.num_steps)
 
 
 class Limit(Protocol):
@@ -243,36 +247,38 @@ class UnboundedLimit:
 
     mdp: HostMDP
     target: Booleans
-    open: Booleans
+    undecided: Booleans
     num_steps: int
     maximize: bool
     depth: int = 0  # roundings behind each number of the model
 
     @cached_property
-    def found(self) -> Enclosure:
+    def unbounded(self) -> Enclosure:
         """The unbounded probability."""
         return reachability(
             self.mdp,
             self.target,
             maximize=self.maximize,
-            stay=self.open | self.target,
+            stay=self.undecided | self.target,
             tolerance=_CLOSE / 4,
             depth=self.depth,
         )
 
     @property
     def upper(self) -> Floats:
-        return self.found.upper
+        return self.unbounded.upper
 
     @cached_property
     def lower(self) -> Floats:
         mdp = self.mdp
         if self.maximize and not mdp.is_chain:
-            mdp = mdp.chain(self.found.row)
-        ended = ~self.open | ~positive_under_all_policies(mdp, self.target, among=self.open)
+            mdp = mdp.chain(self.unbounded.row)
+        ended = ~self.undecided | ~positive_under_all_policies(
+            mdp, self.target, among=self.undecided
+        )
         one = np.ones(mdp.num_rows)
         time = total_reward(mdp, one, ended, maximize=True, tolerance=0.1, depth=self.depth)
-        return self.found.lower - unfinished(time.upper, self.num_steps)
+        return self.unbounded.lower - unfinished(time.upper, self.num_steps)
 
 
 def unfinished(time: Floats, num_steps: int) -> float:
@@ -357,20 +363,20 @@ def total(
     every: list[Integers] | None = [] if by_step else None
     places, cost, unit = backup.places, reward[backup.row], _unit(mdp, backup, num_steps)
     signed = bool((start < 0).any() or (magnitude != reward).any())
-    most, largest = float(magnitude.max(initial=0)), float(np.abs(start).max(initial=0))
+    largest_reward, largest = float(magnitude.max(initial=0)), float(np.abs(start).max(initial=0))
 
     def rest(x: Iterate) -> tuple[Floats, Floats]:
         """Bounds after all steps: ``T v - v`` is at least, and at most, what each further one adds.
 
         T is monotone and ``T (v + c) = T v + c`` for constants c (Puterman 1994, section 8.5).
         """
-        size = x.num_steps * most + largest
+        size = x.num_steps * largest_reward + largest
         step = x.value - x.before
-        left = num_steps - x.num_steps + 1
-        slack = size * (relative_error(unit, 2 * x.num_steps + 1) + unit * left)
-        low = x.before + left * step.min() - slack
-        high = x.before + left * step.max() + slack
-        if not most:
+        remaining = num_steps - x.num_steps + 1
+        slack = size * (relative_error(unit, 2 * x.num_steps + 1) + unit * remaining)
+        low = x.before + remaining * step.min() - slack
+        high = x.before + remaining * step.max() + slack
+        if not largest_reward:
             slack = size * relative_error(unit, 2 * x.num_steps + 1)
             low, high = (
                 np.maximum(low, x.value.min() - slack),
@@ -388,20 +394,23 @@ def total(
         low, high = rest(x)
         return bool((high - low <= _CLOSE * np.maximum(np.abs(low), 1)).all())
 
-    found = backup.iterate(cost, start[places], num_steps, enough, every)
-    complete = found.is_fixed or found.num_steps == num_steps
-    size: Floats = found.value
+    iterate = backup.iterate(cost, start[places], num_steps, enough, every)
+    complete = iterate.is_fixed or iterate.num_steps == num_steps
+    size: Floats = iterate.value
     if signed:
         # Rounding is relative to the largest sum of absolute values.
         size = _largest_sum(mdp, magnitude, np.abs(start), num_steps)[places]
     relative = relative_error(unit, 2 * num_steps + 1)
     error = size * relative + UNDERFLOW
     value, off = np.zeros(mdp.num_states), np.zeros(mdp.num_states)
-    value[places], off[places] = found.value, error
+    value[places], off[places] = iterate.value, error
     if not complete or (num_steps > _LONG and relative > _CLOSE and every is None):
-        low, high = rest(found)
+        low, high = rest(iterate)
         if complete:
-            low, high = np.maximum(low, found.value - error), np.minimum(high, found.value + error)
+            low, high = (
+                np.maximum(low, iterate.value - error),
+                np.minimum(high, iterate.value + error),
+            )
         value[places], off[places] = (low + high) / 2, np.maximum(high - low, 0) / 2 + UNDERFLOW
     some = start != 0
     some[mdp.state[magnitude > 0]] = True
@@ -409,18 +418,18 @@ def total(
     some = backward_reachable(mdp, some)
     value, off = np.where(some, value, 0), np.where(some & (num_steps > 0), off, 0)
     if every is not None:
-        return Steps(value, off, _policies(mdp, backup, every, num_steps), found.num_steps)
-    row = backup.greedy(cost, found.before)
-    return Steps(value, off, _policy(mdp, backup, row), found.num_steps)
+        return Steps(value, off, _policies(mdp, backup, every, num_steps), iterate.num_steps)
+    row = backup.greedy(cost, iterate.before)
+    return Steps(value, off, _policy(mdp, backup, row), iterate.num_steps)
 
 
 def _largest_sum(mdp: HostMDP, magnitude: Floats, start: Floats, num_steps: int) -> Floats:
     """Largest expected sum of absolute values, ``float64[S]``."""
     backup = backup_on(mdp, np.arange(mdp.num_states), np.maximum)
     places = backup.places
-    found = backup.iterate(magnitude[backup.row], start[places], num_steps, lambda _: True)
+    iterate = backup.iterate(magnitude[backup.row], start[places], num_steps, lambda _: True)
     value = np.zeros(mdp.num_states)
-    value[places] = found.value
-    if not found.is_fixed and found.num_steps < num_steps:
+    value[places] = iterate.value
+    if not iterate.is_fixed and iterate.num_steps < num_steps:
         value[:] = num_steps * magnitude.max() + start.max()
     return value

@@ -95,10 +95,10 @@ class Contest:
 class Bounds(NamedTuple):
     """Bounds of the nodes, and a pair of policy and nature."""
 
-    near: jax.Array  # float[N]: bound that the leader attains; far: bound that it cannot exceed
-    far: jax.Array
-    attained: jax.Array  # whether they are proven
-    bounded: jax.Array
+    lower: jax.Array  # float[N], with the sign: the bound that the leader attains
+    upper: jax.Array  # float[N], the bound that it cannot exceed
+    lower_proven: jax.Array  # whether they are proven
+    upper_proven: jax.Array
     middle: jax.Array  # float[N], the solution between them
     row: jax.Array  # int32[N], rows of the policy
     probability: jax.Array  # float[R, W], nature's distributions
@@ -117,9 +117,9 @@ def rounding(width: Array, dtype: DTypeLike) -> Array:
 
 def greedy_distributions(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
     """Greedy distributions ``float[R, W]`` between the ends; differentiable, the order held fixed."""
-    left, free = _left(lower, upper, key)
-    left = jnp.where(left > rounding(key.shape[1], key.dtype), left, 0)
-    return jnp.where(left >= free, upper, lower + jnp.maximum(left, 0))
+    remaining, free = _left(lower, upper, key)
+    remaining = jnp.where(remaining > rounding(key.shape[1], key.dtype), remaining, 0)
+    return jnp.where(remaining >= free, upper, lower + jnp.maximum(remaining, 0))
 
 
 def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -147,20 +147,20 @@ def system(target: jax.Array, weight: jax.Array) -> tuple[Operator, Operator]:
     weight = jnp.where(target < size, weight, 0)
     place = jnp.minimum(target, size - 1)
 
-    def left(x: jax.Array) -> jax.Array:
+    def product(x: jax.Array) -> jax.Array:
         return x - jnp.sum(weight * x[place], axis=1)
 
     def back(y: jax.Array) -> jax.Array:
         return y - jnp.zeros_like(y).at[place].add(weight * y[:, None])
 
     if size > DENSE_LIMIT:
-        return partial(solve_linear, left), partial(solve_linear, back)
+        return partial(solve_linear, product), partial(solve_linear, back)
     matrix = jnp.eye(size, dtype=weight.dtype)
     inverted = inverse(matrix.at[jnp.arange(size)[:, None], place].add(-weight))
 
     def solve(b: jax.Array) -> jax.Array:
         x = inverted @ b
-        return x + inverted @ (b - left(x))
+        return x + inverted @ (b - product(x))
 
     def transposed(b: jax.Array) -> jax.Array:
         y = b @ inverted
@@ -214,27 +214,27 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
         no,
     )
     apart = jnp.arange(contest.size + 2)
-    near = _played(contest, start, -1.0, apart, tolerance, max_rounds)
+    lower = _played(contest, start, -1.0, apart, tolerance, max_rounds)
     label = apart
     if contest.has_free_cycles:
-        label = jnp.concatenate([_groups(near.base, contest.eps)[0], apart[contest.size :]])
-    again = start._replace(row=near.row, probability=near.probability)
-    far = _played(contest, again, 1.0, label, tolerance, max_rounds)
-    low, high = contest.ahead(near.z), contest.ahead(far.z)
+        label = jnp.concatenate([_groups(lower.base, contest.eps)[0], apart[contest.size :]])
+    again = start._replace(row=lower.row, probability=lower.probability)
+    upper = _played(contest, again, 1.0, label, tolerance, max_rounds)
+    low, high = contest.ahead(lower.z), contest.ahead(upper.z)
     p_low, p_high = contest.greedy(low), contest.greedy(high)
     lows, highs = (jnp.sum(p * d, axis=1) + contest.cost for p, d in ((p_low, low), (p_high, high)))
     # The leader's choices attain the one bound, those of the opponent the other.
     row = contest.best(lows if contest.policy_leads else highs)[1]
-    middle = jnp.where(near.proven & far.proven, (near.z + far.z) / 2, near.base)
+    middle = jnp.where(lower.proven & upper.proven, (lower.z + upper.z) / 2, lower.base)
     return Bounds(
-        near.z,
-        far.z,
-        near.proven,
-        far.proven,
+        lower.z,
+        upper.z,
+        lower.proven,
+        upper.proven,
         middle,
         row,
         p_low if contest.nature_leads else p_high,
-        near.rounds + far.rounds,
+        lower.rounds + upper.rounds,
     )
 
 
@@ -356,9 +356,9 @@ def _proves(contest: Contest, z: jax.Array, sign: float) -> jax.Array:
     width, dtype = contest.target.shape[1], z.dtype
     terms = (2 * width + 8) * contest.eps
     # Mass is known up to rounding where it is not certain to be all or nothing.
-    left, free = _left(contest.lower, contest.upper, contest.key(gain))
+    remaining, free = _left(contest.lower, contest.upper, contest.key(gain))
     miss = rounding(width, dtype)
-    partly = (left > -miss) & (left < free + miss)
+    partly = (remaining > -miss) & (remaining < free + miss)
     slack = terms * (jnp.sum(p * size, axis=1) + jnp.abs(contest.cost))
     slack = slack + miss * jnp.max(jnp.where(partly, size, 0), axis=1)
     slack = slack + (width + 2) * float(jnp.finfo(dtype).tiny) * (slack > 0)

@@ -110,8 +110,8 @@ def robust_reachability(
     target = sides.states(state_mask(world.nominal, target, "target"))
     if stay is not None:
         stay = sides.states(state_mask(world.nominal, stay, "stay")) | sides.added
-    found = reachability(sides.host, target, sides.query(requested), stay=stay)
-    return robust_solution(world, sides, found, requested, relative=False)
+    values = reachability(sides.host, target, sides.query(requested), stay=stay)
+    return robust_solution(world, sides, values, requested, relative=False)
 
 
 @validated()
@@ -155,8 +155,8 @@ def robust_total_reward(
     world, sides = sides_of(model, policy, objective, nature)
     target = sides.states(state_mask(world.nominal, target, "target"))
     earned = np.where(sides.choosing, 0, interval_reward(world, reward)[sides.encoded.row])
-    found = total_reward(sides.host, earned, target, sides.query(requested))
-    return robust_solution(world, sides, found, requested, relative=True)
+    values = total_reward(sides.host, earned, target, sides.query(requested))
+    return robust_solution(world, sides, values, requested, relative=True)
 
 
 @validated()
@@ -195,13 +195,15 @@ def robust_discounted_value(
       ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
     world, sides = sides_of(model, policy, objective, nature)
-    entry, given = sides.encoded.entry, reward_structure(world.nominal, reward)
-    earned = np.where(entry < 0, 0, transition_reward(world.nominal, given)[entry])
+    entry, structure = sides.encoded.entry, reward_structure(world.nominal, reward)
+    earned = np.where(entry < 0, 0, transition_reward(world.nominal, structure)[entry])
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     requested = 1e-8 * max(largest, 1e-300) if tolerance is None else requested_width(tolerance)
     discounts = np.where(sides.choosing, 1.0, float(discount))
-    found = discounted_value(DiscountedModel(sides.host, earned, discounts), sides.query(requested))
-    return robust_solution(world, sides, found, requested, relative=False)
+    values = discounted_value(
+        DiscountedModel(sides.host, earned, discounts), sides.query(requested)
+    )
+    return robust_solution(world, sides, values, requested, relative=False)
 
 
 def robust_expectation(
@@ -259,21 +261,21 @@ def interval_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
 
 
 def robust_solution(
-    world: IntervalMDP, sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
+    world: IntervalMDP, sides: Sides, values: RobustValues, tolerance: float, *, relative: bool
 ) -> Solution:
     """The :class:`Solution` of certified values."""
     size, encoded = world.num_states, sides.encoded
     policy = sides.policy
     if policy is None:
-        policy = encoded.policy(found.row, found.probability).astype(np.int32)
+        policy = encoded.policy(values.row, values.probability).astype(np.int32)
     otherwise = np.asarray(world.nominal.probability)
-    found = replace(found, probability=encoded.nature(found.probability, otherwise))
+    values = replace(values, probability=encoded.nature(values.probability, otherwise))
     states = np.arange(size)
-    return solution_at(found, states, (size,), np.asarray(policy), tolerance, relative=relative)
+    return solution_at(values, states, (size,), np.asarray(policy), tolerance, relative=relative)
 
 
 def solution_at(
-    found: RobustValues,
+    values: RobustValues,
     states: Integers,
     shape: tuple[int, ...],
     policy: Array,
@@ -282,18 +284,20 @@ def solution_at(
     relative: bool = False,
 ) -> Solution:
     """The :class:`Solution` at some states, in a shape."""
-    value, low, high = (x[states].reshape(shape) for x in (found.value, found.lower, found.upper))
+    value, low, high = (
+        x[states].reshape(shape) for x in (values.value, values.lower, values.upper)
+    )
     parts: dict[str, Array] = {
         "value": value,
         "policy": policy,
-        "nature": found.probability,
+        "nature": values.probability,
         "lower": low,
         "upper": high,
-        "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds),
+        "residual": np.float64(values.residual),
+        "num_steps": np.int32(values.rounds),
         "status": np.int32(status_between(low, high, tolerance, relative=relative)),
     }
-    return Solution(**parts, method=found.method)
+    return Solution(**parts, method=values.method)
 
 
 class Sides(NamedTuple):

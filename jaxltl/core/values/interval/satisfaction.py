@@ -74,10 +74,10 @@ def robust_satisfaction(
         world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
     moves = None if system is None else system[product.base_state]
-    found = _solved(host_sides(host, moves, objective, nature), host, verdicts, requested)
-    row = product.base_row[found.row].astype(np.int32)
-    solution = solution_at(found, product.start, product.start.shape, row, requested)
-    return Satisfaction(solution, automaton, letter, product, row, found.value, "exit")
+    values = _solved(host_sides(host, moves, objective, nature), host, verdicts, requested)
+    row = product.base_row[values.row].astype(np.int32)
+    solution = solution_at(values, product.start, product.start.shape, row, requested)
+    return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")
 
 
 @validated()
@@ -114,14 +114,14 @@ def robust_product_satisfaction(
     sides = host_sides(host, None, objective, nature)
     if policy is not None:
         sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
-    found = _solved(sides, host, verdicts, requested)
+    values = _solved(sides, host, verdicts, requested)
     if policy is not None:
-        solution = solution_at(found, product.start, shape, np.asarray(policy), requested)
+        solution = solution_at(values, product.start, shape, np.asarray(policy), requested)
         result: Solution = solution.replace(nature=None)  # type: ignore[attr-defined]
         return result
-    policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
-    found = replace(found, probability=found.probability[: product.host.num_transitions])
-    return solution_at(found, product.start, shape, policy, requested)
+    policy = product.base_row[values.row[product.start]].astype(np.int32).reshape(shape)
+    values = replace(values, probability=values.probability[: product.host.num_transitions])
+    return solution_at(values, product.start, shape, policy, requested)
 
 
 def _product(
@@ -156,9 +156,11 @@ def _product(
 
 def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:
     """The model in which auxiliary states with one choice carry the priorities of entries."""
-    mdp, most = host.mdp, int(priority.max()) + 1
-    place, number = np.unique(mdp.successor.astype(np.int64) * most + priority, return_inverse=True)
-    target, read = np.divmod(place, most)
+    mdp, highest = host.mdp, int(priority.max()) + 1
+    place, number = np.unique(
+        mdp.successor.astype(np.int64) * highest + priority, return_inverse=True
+    )
+    target, read = np.divmod(place, highest)
     one, more = np.ones(place.size), np.arange(1, place.size + 1)
     inner = HostMDP(
         np.append(mdp.row_start, mdp.num_rows + more),
@@ -169,7 +171,7 @@ def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Inte
     ball = host.ball
     if ball is not None:
         ball = Ball(np.append(ball.center, one), np.append(ball.gain, one))
-    level = np.append(np.full(mdp.num_states, most - 1), read)
+    level = np.append(np.full(mdp.num_states, highest - 1), read)
     return (
         UncertainMDP(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
         level,
@@ -184,21 +186,21 @@ def _numbered(model: IntervalMDP) -> HostMDP:
     return HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, number)
 
 
-def _uncertain(model: IntervalMDP, found: SparseProduct) -> tuple[SparseProduct, UncertainMDP]:
+def _uncertain(model: IntervalMDP, product: SparseProduct) -> tuple[SparseProduct, UncertainMDP]:
     """The product of a numbered model, with its probabilities and its intervals."""
     mdp = model.nominal.host
     # The loop of an absorbing state has the number 1, too.
-    entry = found.host.probability.astype(np.int64) - 1
-    loop = found.still[found.host.state[found.host.row]]
+    entry = product.host.probability.astype(np.int64) - 1
+    loop = product.still[product.host.state[product.host.row]]
     chance, lower, upper = (
         np.where(loop, 1.0, x[entry]) for x in (mdp.probability, model.host.lower, model.host.upper)
     )
     ball = model.host.ball
     if ball is not None:
-        ball = ball.select(entry, found.base_row)
+        ball = ball.select(entry, product.base_row)
         ball = replace(ball, center=np.where(loop, 1.0, ball.center))
-    host = HostMDP(found.host.row_start, found.host.entry_start, found.host.successor, chance)
-    return found._replace(host=host), UncertainMDP(host, lower, upper, ball)
+    host = HostMDP(product.host.row_start, product.host.entry_start, product.host.successor, chance)
+    return product._replace(host=host), UncertainMDP(host, lower, upper, ball)
 
 
 def _fixed(
@@ -228,14 +230,14 @@ def _solved(
 ) -> RobustValues:
     """Robust satisfaction probability from all states of the product."""
     size, encoded = host.mdp.num_states, sides.encoded
-    found = _of_sides(sides.host, verdicts.of(encoded.source), sides.query(tolerance))
+    values = _of_sides(sides.host, verdicts.of(encoded.source), sides.query(tolerance))
     return replace(
-        found,
-        value=found.value[:size],
-        lower=found.lower[:size],
-        upper=found.upper[:size],
-        row=encoded.policy(found.row, found.probability),
-        probability=encoded.nature(found.probability, host.mdp.probability),
+        values,
+        value=values.value[:size],
+        lower=values.lower[:size],
+        upper=values.upper[:size],
+        row=encoded.policy(values.row, values.probability),
+        probability=encoded.nature(values.probability, host.mdp.probability),
     )
 
 
@@ -256,9 +258,9 @@ def _of_sides(host: UncertainMDP, verdicts: _Verdicts, query: Query) -> RobustVa
 
 def _largest(host: UncertainMDP, priority: Integers, query: Query) -> RobustValues:
     """Maximal parity probability, for both readings of sums within rounding of one."""
-    found = _as_read(host, priority, query)
+    values = _as_read(host, priority, query)
     wide = host.enlarged
-    return found if wide is None else found.hull(_as_read(wide, priority, query))
+    return values if wide is None else values.hull(_as_read(wide, priority, query))
 
 
 def _as_read(host: UncertainMDP, priority: Integers, query: Query) -> RobustValues:
@@ -266,6 +268,6 @@ def _as_read(host: UncertainMDP, priority: Integers, query: Query) -> RobustValu
         return parity_against_nature(host, priority, tolerance=query.tolerance)
     mdp = host.mdp
     good = joint_accepting_region(host, priority[mdp.state[mdp.row]])
-    found = reachability(host, good.region, query)
-    inside: Floats = np.where(good.region[mdp.state[mdp.row]], good.probability, found.probability)
-    return replace(found, row=np.where(good.region, good.row, found.row), probability=inside)
+    values = reachability(host, good.region, query)
+    inside: Floats = np.where(good.region[mdp.state[mdp.row]], good.probability, values.probability)
+    return replace(values, row=np.where(good.region, good.row, values.row), probability=inside)

@@ -111,11 +111,11 @@ def robust_sensitivity(
     chain, entry = host.under_policy(policy)
     chance = np.asarray(solution.nature, np.float64)[entry]
     visits = _visits(chain.resolve(chance), goal, passed, weight)
-    change, given = _against_the_rest(host, ahead, maximize)
+    change, binds_above = _against_the_rest(host, ahead, maximize)
     taken = np.zeros(host.mdp.num_rows)
     taken[policy] = visits
     change = np.where(taken[host.mdp.row] > 0, change * taken[host.mdp.row], 0)
-    return Sensitivity(np.where(given, 0, change), np.where(given, change, 0))
+    return Sensitivity(np.where(binds_above, 0, change), np.where(binds_above, change, 0))
 
 
 def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> Floats:
@@ -125,31 +125,31 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
 
     open_ = backward_reachable(chain, goal, stay[chain.state]) & stay & ~goal
     states: Integers = np.flatnonzero(open_)
-    found = np.zeros(goal.size)
+    visits = np.zeros(goal.size)
     if not (weight[states] != 0).any():
-        return found
+        return visits
     number = np.cumsum(open_) - 1
     kept = open_[chain.state[chain.row]] & open_[chain.successor]
     place = number[chain.successor[kept]], number[chain.state[chain.row[kept]]]
     shape = (states.size, states.size)
     back = csc_array((chain.probability[kept], place), shape=shape)
-    found[states] = splu((eye_array(states.size, format="csc") - back).tocsc()).solve(
+    visits[states] = splu((eye_array(states.size, format="csc") - back).tocsc()).solve(
         weight[states]
     )
-    return found
+    return visits
 
 
 def _against_the_rest(host: UncertainMDP, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
     """Gain of each entry over the entry that receives the remaining mass of its row."""
     mdp = host.mdp
-    start, far = mdp.entry_start[:-1], np.inf
+    start = mdp.entry_start[:-1]
     key = -ahead if maximize else ahead
     p = host.extreme_distributions(ahead, maximize=maximize)
     free = host.upper > host.lower
     short = free & (p < host.upper)  # those that are not given all that they may take
-    rest = np.minimum.reduceat(np.where(short, key, far), start)
+    rest = np.minimum.reduceat(np.where(short, key, np.inf), start)
     # Where all are, the last of them is the one that would get more.
-    last = np.maximum.reduceat(np.where(free, key, -far), start)
+    last = np.maximum.reduceat(np.where(free, key, -np.inf), start)
     rest = np.where(np.isfinite(rest), rest, np.where(np.isfinite(last), last, key[start]))
     change = key - rest[mdp.row]
     return (-change if maximize else change), change < 0

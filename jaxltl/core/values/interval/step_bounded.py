@@ -196,10 +196,10 @@ def _earned(
     )
 
 
-def _solution(found: StepBoundedValues, highest: float = 1) -> Solution:
+def _solution(values: StepBoundedValues, highest: float = 1) -> Solution:
     """The :class:`Solution` of step-bounded values."""
-    nature: Array = found.probability
+    nature: Array = values.probability
     solution = solution_from_error(
-        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
+        values.value, values.error, values.row.astype(np.int32), values.num_steps, highest=highest
     )
     return replace(solution, nature=nature, method="step by step")

@@ -360,11 +360,12 @@ def _answer(
     """The solution at the states."""
     (lower, upper), (finite, valid) = ends, checks
     is_reward, dtype = contest.relative, contest.lower.dtype
-    near, far, middle = found.near, found.far, found.middle
+    near, far, middle = found.lower, found.upper, found.middle
     most = jnp.inf if is_reward else 1.0
     sign = -1 if is_reward else 1
     low, high = (sign * x for x in ((far, near) if is_reward else (near, far)))
-    sure = (found.bounded, found.attained) if is_reward else (found.attained, found.bounded)
+    sure = found.lower_proven, found.upper_proven
+    sure = sure[::-1] if is_reward else sure
     low = jnp.where(sure[0], jnp.clip(low, 0, most), 0)
     high = jnp.where(sure[1], jnp.clip(high, 0, most), most)
     middle = jnp.clip(sign * middle, low, high)
@@ -372,7 +373,7 @@ def _answer(
     value = _attached(contest, found, middle, sign) if prepared.size else middle
     scale = jnp.where(jnp.isfinite(high), high, 1) if is_reward else 1.0
     narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
-    proven = found.attained & found.bounded
+    proven = found.lower_proven & found.upper_proven
     small = residual <= tolerance * jnp.max(jnp.abs(middle), initial=1 if not is_reward else 0)
     valid |= ~finite  # NaN and infinity have the status NONFINITE
     finite &= jnp.all(jnp.isfinite(lax.stop_gradient(middle)))

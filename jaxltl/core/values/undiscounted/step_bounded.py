@@ -270,7 +270,7 @@ def reward_bounded_reachability(
         )
     budget = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
     found = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
-    error = np.where(found.open, found.error, 0)
+    error = np.where(found.undecided, found.error, 0)
     return solution_from_error(found.value, error, found.row, budget[1] + 1, highest=1)
 
 

@@ -193,7 +193,7 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
     value = np.linalg.solve(np.eye(nodes.size) - chain.matrix.toarray(), chain.earned)
     assert (near.bound <= value + 1e-12).all() and (value - near.bound).max() < 1e-9
     found = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
-    open_ = problem.open
+    open_ = problem.interior
     assert (found.beyond - found.attained)[open_].max() < 6e-7
     monkeypatch.setattr(interval_optimum._Search, "proportional_bound", lambda *_: None)
     other = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
