@@ -209,8 +209,8 @@ def _priorities(
     acceptance: str | None,
 ) -> tuple[str, Integers]:
     """The acceptance and its priorities `[Q, L]`, from the one table that is given."""
-    given = {"final": final, "accepting": accepting, "priority": priority}
-    (name, *more) = [key for key, table in given.items() if table is not None] or [""]
+    acceptance_arrays = {"final": final, "accepting": accepting, "priority": priority}
+    (name, *more) = [key for key, table in acceptance_arrays.items() if table is not None] or [""]
     if not name or more:
         raise ValueError("make_automaton: give exactly one of final, accepting and priority.")
     kinds = [kind for kind, condition in CONDITIONS.items() if condition.table == name]
@@ -290,8 +290,10 @@ def make_alphabet(
             )
         numbers = list(range(2 ** len(names)))
     else:
-        given = as_letters(letters, f"{place.partition(':')[0]}: letters")
-        sums = (sum(1 << p for p, name in enumerate(names) if name in letter) for letter in given)
+        alphabet = as_letters(letters, f"{place.partition(':')[0]}: letters")
+        sums = (
+            sum(1 << p for p, name in enumerate(names) if name in letter) for letter in alphabet
+        )
         numbers = sorted(set(sums))
     if not numbers:
         raise ValueError(

@@ -126,7 +126,7 @@ class CycleTree:
 
     def _maximal(self, part: Part) -> list[Part]:
         accepting = self._holds(self._colors_of(part))
-        found: list[Part] = []
+        parts: list[Part] = []
         seen, waiting = {part}, [part]
         while waiting:
             whole = waiting.pop()
@@ -136,14 +136,14 @@ class CycleTree:
                         continue
                     seen.add(smaller)
                     same = self._holds(self._colors_of(smaller)) == accepting
-                    (waiting if same else found).append(smaller)
+                    (waiting if same else parts).append(smaller)
                     self._examined += 1
                     if self._examined > MAX_SUBSETS:
                         raise ValueError(
                             f"to_parity: more than {MAX_SUBSETS} sets of transitions or colors to "
                             "examine. The acceptance condition has too many independent parts."
                         )
-        return [one for one in found if not any(one < other for other in found)]
+        return [one for one in parts if not any(one < other for other in parts)]
 
     def _to_remove(self, colors: int, accepting: bool) -> list[int]:
         """The colors one of which has to go; one alone if no smaller part can keep it.
@@ -238,13 +238,13 @@ def to_parity(
         return int(np.bitwise_or.reduce(mask[list(part)])) if part else 0
 
     def without(part: Part, color: int) -> list[Part]:
-        kept = np.array([e for e in sorted(part) if not mask[e] >> color & 1], int)
-        states, numbers = np.unique([source[kept], target[kept]], return_inverse=True)
+        remaining = np.array([e for e in sorted(part) if not mask[e] >> color & 1], int)
+        states, numbers = np.unique([source[remaining], target[remaining]], return_inverse=True)
         begin, end = numbers.reshape(2, -1)
         label = strong_components(begin, end, len(states))
         cyclic = label[begin] == label[end]
-        kept, label = kept[cyclic], label[begin[cyclic]]
-        return [frozenset(kept[label == each].tolist()) for each in np.unique(label)]
+        remaining, label = remaining[cyclic], label[begin[cyclic]]
+        return [frozenset(remaining[label == each].tolist()) for each in np.unique(label)]
 
     @cache
     def tree_of(number: int) -> tuple[CycleTree, list[frozenset[int]]]:

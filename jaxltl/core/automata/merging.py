@@ -57,48 +57,51 @@ def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
     columns, _ = distinct_columns(*table[:2])
     few = Table(table.delta[:, columns], table.priority[:, columns], int(table.initial))
     target = np.arange(len(same))
-    kept, gone = _candidates(few, same, order)
-    while len(kept) and work > 0:
-        trial = np.where(target == gone[0], kept[0], target)
+    survivor, gone = _candidates(few, same, order)
+    while len(survivor) and work > 0:
+        trial = np.where(target == gone[0], survivor[0], target)
         small = Table(trial[few.delta], few.priority, int(trial[few.initial]))
         both = product([few, small], max_size=MAX_PAIRS)
         if both is None:
             break
         size = len(both.states)
         work -= size * (few.delta.shape[1] // 4 + 4) + 1000
-        found = next(loops(both.edges, size, DIFFERENT), None)
-        if found is None:
+        difference = next(loops(both.edges, size, DIFFERENT), None)
+        if difference is None:
             few, target = small, trial
-            fine = (target[kept] == kept) & (target[gone] == gone)
+            fine = (target[survivor] == survivor) & (target[gone] == gone)
         else:
-            word = word_through(both.edges, size, *found)
-            fine = np.ones(len(kept), bool)
-            fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], word)
+            word = word_through(both.edges, size, *difference)
+            fine = np.ones(len(survivor), bool)
+            fine[:WINDOW] = _agreeing(few, survivor[:WINDOW], gone[:WINDOW], word)
             fine[0] = False
-        kept, gone = kept[fine], gone[fine]
+        survivor, gone = survivor[fine], gone[fine]
     return Table(target[table.delta], table.priority, int(target[table.initial])), work
 
 
 def _candidates(table: Table, same: Integers, order: int) -> tuple[Integers, Integers]:
     """The pairs of states of one language, those with similar transitions first if order is 1."""
-    kept, gone = np.nonzero((same[:, None] == same[None]) & ~np.eye(len(same), dtype=bool))
-    alike = np.zeros(len(kept), int)
+    survivor, gone = np.nonzero((same[:, None] == same[None]) & ~np.eye(len(same), dtype=bool))
+    alike = np.zeros(len(survivor), int)
     for column in np.concatenate(table[:2], axis=1).T:
-        alike += column[kept] == column[gone]
+        alike += column[survivor] == column[gone]
     ranks = np.argsort(-order * alike, kind="stable")
-    return kept[ranks], gone[ranks]
+    return survivor[ranks], gone[ranks]
 
 
-def _agreeing(table: Table, kept: Integers, gone: Integers, word: Word) -> Booleans:
+def _agreeing(table: Table, survivor: Integers, gone: Integers, word: Word) -> Booleans:
     """The merges, each alone, with which a word seems to have the verdict that it has without."""
     prefix, cycle = word
     letters = np.concatenate([prefix, np.tile(cycle, 2 * TURNS)])
-    kept, gone = np.append(table.initial, kept), np.append(table.initial, gone)  # first: none
-    state = np.where(gone == table.initial, kept, table.initial)
+    survivor, gone = (
+        np.append(table.initial, survivor),
+        np.append(table.initial, gone),
+    )  # first: none
+    state = np.where(gone == table.initial, survivor, table.initial)
     least = table.priority.max() + np.ones_like(state)
     for step, letter in enumerate(letters):
         if step >= len(prefix) + len(cycle) * TURNS:
             least = np.minimum(least, table.priority[state, letter])
         state = table.delta[state, letter]
-        state = np.where(state == gone, kept, state)
+        state = np.where(state == gone, survivor, state)
     return np.asarray((least % 2 == least[0] % 2)[1:])

@@ -59,16 +59,16 @@ def product(
     if starts is None:
         starts = np.array([np.ravel_multi_index([table.initial for table in tables], sizes)])
     number = np.full(math.prod(sizes), -1)
-    frontier, found, count = starts, [], 0
+    frontier, levels, count = starts, [], 0
     while frontier.size:
         number[frontier] = np.arange(count, count + frontier.size)
-        found.append(frontier)
+        levels.append(frontier)
         count += frontier.size
         if count * width > max_size:
             return None
         ends = successors(frontier)
         frontier = np.unique(ends[number[ends] < 0])
-    codes = np.concatenate(found)
+    codes = np.concatenate(levels)
     states, delta = np.unravel_index(codes, sizes), number[successors(codes)]
     priority = np.stack([t.priority[state] for t, state in zip(tables, states, strict=True)])
     code = delta  # of a transition's end and priorities, then its letter
@@ -112,10 +112,10 @@ def loops(
 
 def may(edges: Edges, num_nodes: int, wanted: Collection[Parities]) -> Booleans:
     """Nodes from which some word gives wanted parities: ``bool[N]``."""
-    found = np.zeros(num_nodes, bool)
+    sources = np.zeros(num_nodes, bool)
     for inside, _ in loops(edges, num_nodes, wanted):
-        found[inside.source] = True
-    return forward_reachable(edges.target, edges.source, found)
+        sources[inside.source] = True
+    return forward_reachable(edges.target, edges.source, sources)
 
 
 def states_that_may(table: Table, parity: int) -> Booleans:

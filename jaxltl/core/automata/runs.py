@@ -97,8 +97,10 @@ def _reading(
 def find_lasso(automata: Sequence[Automaton], wanted: Sequence[Parities]) -> Lasso | None:
     """A word on which the least recurring priorities have one of the wanted parities."""
     runs = joint_runs(automata)
-    found = loops(runs.edges, len(runs.states), wanted)
-    nearest = min(found, key=lambda loop: loop[0].source[loop[1].any(axis=0)].min(), default=None)
+    components = loops(runs.edges, len(runs.states), wanted)
+    nearest = min(
+        components, key=lambda loop: loop[0].source[loop[1].any(axis=0)].min(), default=None
+    )
     if nearest is None:
         return None
     word = word_through(runs.edges, len(runs.states), *nearest)

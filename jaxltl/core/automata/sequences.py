@@ -114,16 +114,16 @@ def reach_avoid_sequences(
     reach = np.zeros((count, most, depth, width), bool)
     avoid, length = reach.copy(), np.zeros((count, most), np.int32)
     for q in np.flatnonzero(live & ~done):
-        found: set[tuple[int, bytes, bytes]] = set()
+        keys: set[tuple[int, bytes, bytes]] = set()
         for stem, cycle in _paths(int(q), moves, live, done):
             size, (wanted, shunned) = len(stem) + len(cycle), _steps(tables, stem, cycle, depth)
             key = (size, wanted.tobytes(), shunned.tobytes())
-            if key in found:
+            if key in keys:
                 continue
-            row = len(found)
-            found.add(key)
+            row = len(keys)
+            keys.add(key)
             reach[q, row], avoid[q, row], length[q, row] = wanted, shunned, size
-            if len(found) == most:
+            if len(keys) == most:
                 break
     return Sequences(reach, avoid, length)
 
@@ -142,7 +142,7 @@ def _steps(tables: _Tables, stem: _Path, cycle: _Path, depth: int) -> NDArray[np
     delta, priority, live, distance = tables
     least = min((m.priority for _, m in cycle), default=0)
     turns = -(-max(depth - len(stem), 0) // len(cycle)) if cycle else 0
-    wanted, shunned = found = np.zeros((2, depth, delta.shape[1]), bool)
+    wanted, shunned = letters = np.zeros((2, depth, delta.shape[1]), bool)
     for i, (state, move) in enumerate((stem + cycle * turns)[:depth]):
         wanted[i, list(move.events)] = True
         after = delta[state]
@@ -150,7 +150,7 @@ def _steps(tables: _Tables, stem: _Path, cycle: _Path, depth: int) -> NDArray[np
         if i >= len(stem):
             shunned[i] |= (priority[state] < least) & (priority[state] % 2 == 1)
         shunned[i] &= ~wanted[i]
-    return found
+    return letters
 
 
 def _on_events(
@@ -180,7 +180,7 @@ def _moves(delta: NDArray[np.int32], priority: NDArray[np.int32]) -> list[_Move]
     groups: dict[tuple[int, int], list[int]] = {}
     for event, (target, number) in enumerate(zip(delta.tolist(), priority.tolist(), strict=True)):
         groups.setdefault((target, number), []).append(event)
-    return [_Move(target, number, tuple(found)) for (target, number), found in groups.items()]
+    return [_Move(target, number, tuple(group)) for (target, number), group in groups.items()]
 
 
 def _distances(
@@ -195,9 +195,9 @@ def _distances(
     target, number = delta.ravel(), priority.ravel()
     accepts = done[target]
     for even in np.unique(number[number % 2 == 0]):
-        kept = (number >= even) & live[source] & live[target]
-        part = strong_components(source[kept], target[kept], count)
-        accepts |= kept & (number == even) & (part[source] == part[target])
+        used = (number >= even) & live[source] & live[target]
+        part = strong_components(source[used], target[used], count)
+        accepts |= used & (number == even) & (part[source] == part[target])
     distance = np.where(done, 0.0, np.inf)
     np.minimum.at(distance, source[accepts], np.where(done[source[accepts]], 0.0, 1.0))
     for _ in range(count):

@@ -57,8 +57,8 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
     """Irredundant prime cubes of the chosen letters; letters of neither set are free."""
     if len(chosen) + len(others) < 1 << width:
         # Where few letters occur, a few propositions tell, and guards of others would be long.
-        kept = _telling(chosen, others, width)
-        chosen, others = ({n & kept for n in part} for part in (chosen, others))
+        mask = _telling(chosen, others, width)
+        chosen, others = ({n & mask for n in part} for part in (chosen, others))
     diagrams = Diagrams()
     lower = _diagram_of(chosen, width, diagrams)
     upper = diagrams.negation(_diagram_of(others, width, diagrams))
@@ -68,15 +68,15 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
 
 def _telling(chosen: set[int], others: set[int], width: int) -> int:
     """Propositions, as bits, that tell all chosen letters from the others, found greedily."""
-    kept = 0
+    mask = 0
     while True:
         alike: dict[int, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
         for side, part in enumerate((chosen, others)):
             for n in part:
-                alike[n & kept][side].append(n)
+                alike[n & mask][side].append(n)
         mixed = [(left, right) for left, right in alike.values() if left and right]
         if not mixed:
-            return kept
+            return mask
 
         def score(p: int, mixed: list[tuple[list[int], list[int]]] = mixed) -> int:
             pairs = 0
@@ -85,7 +85,7 @@ def _telling(chosen: set[int], others: set[int], width: int) -> int:
                 pairs += held * (len(right) - others_held) + (len(left) - held) * others_held
             return pairs
 
-        kept |= 1 << max(range(width), key=score)
+        mask |= 1 << max(range(width), key=score)
 
 
 def _diagram_of(letters: set[int], width: int, diagrams: Diagrams) -> int:

@@ -70,10 +70,10 @@ class Tracker:
         whole, _, _ = state
         if not self.guesses and whole in (TRUE, FALSE):
             return _PROVEN if whole == TRUE else _REFUTED
-        found = self.index.setdefault(state, len(self.states))
-        if found == len(self.states):
+        number = self.index.setdefault(state, len(self.states))
+        if number == len(self.states):
             self.states.append(state)
-        return found
+        return number
 
     def awake(self, state: int, needed: bool) -> int:
         """The state with a guess if one is needed, and without one otherwise."""
@@ -98,13 +98,13 @@ class Tracker:
         states, marks = [], []
         for after in self.progression.after:
             left, following = after(whole), turn
-            kept = guess if guess == _ASLEEP else after(guess)
-            refuted = kept == FALSE
+            guessed = guess if guess == _ASLEEP else after(guess)
+            refuted = guessed == FALSE
             if refuted:
                 following = (turn + 1) % max(len(self.guesses), 1)
-                kept = self._guess(left, following)
+                guessed = self._guess(left, following)
             marks.append(refuted and following == 0)
-            states.append(self._number((left, kept, following)))
+            states.append(self._number((left, guessed, following)))
         return states, marks
 
 
@@ -222,11 +222,11 @@ def track_on_demand(run: Trackers, max_states: int) -> Table:
 
     def settled(states: States, condition: Condition, live: int, leaf: int) -> _Node:
         needed = tree_of(condition).missing[leaf]
-        kept = (
+        is_kept = (
             tracker.awake(q, bool(needed >> i & 1)) if live >> i & 1 else IDLE
             for i, (tracker, q) in enumerate(zip(run.trackers, states, strict=True))
         )
-        return tuple(kept), condition, leaf
+        return tuple(is_kept), condition, leaf
 
     def entered(states: States, condition: Condition, live: int) -> _Node:
         return settled(states, condition, live, tree_of(condition).leaf_below(0))

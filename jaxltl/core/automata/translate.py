@@ -128,8 +128,8 @@ def _progression_automaton(
     priority = 1 - (decided if acceptance == "cosafe" else ~decided)
     delta = delta[:, progression.class_of]
     small, base = quotient(Table(delta, np.repeat(priority[:, None], delta.shape[1], axis=1), 0))
-    made = _automaton(small, alphabet, propositions, acceptance)
-    return replace(made, state_names=_names(made, progression, [states[q] for q in base]))
+    automaton = _automaton(small, alphabet, propositions, acceptance)
+    return replace(automaton, state_names=_names(automaton, progression, [states[q] for q in base]))
 
 
 def _automaton(
@@ -183,7 +183,7 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
 
 def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
     """The different combinations of a formula, with how much they track, least first."""
-    found: list[tuple[Combination, int]] = []
+    combinations: list[tuple[Combination, int]] = []
     errors = []
     for steps in (MAX_STEPS // 20, MAX_STEPS):
         for grouped, dual in product((True, False), repeat=2):
@@ -192,10 +192,10 @@ def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
             except ValueError as error:
                 errors.append(error)
                 continue
-            if all(parts != other for other, _ in found):
-                found.append((parts, extent(parts)))
-        if found:
-            return sorted(found, key=lambda entry: entry[1])
+            if all(parts != other for other, _ in combinations):
+                combinations.append((parts, extent(parts)))
+        if combinations:
+            return sorted(combinations, key=lambda entry: entry[1])
     raise errors[-1]
 
 

@@ -83,10 +83,10 @@ class Bounds:
         return self.task.initial(self.lower), upper
 
     @property
-    def open(self) -> Booleans:
+    def undecided(self) -> Booleans:
         """``bool[Q, C]``: product states without tight bounds."""
         undecided = (self.task.decided < 0)[:, None]
-        return (self.lower < 1) & (self.upper > 0) & (self.lower < self.upper) & undecided
+        return undecided & (self.lower < 1) & (self.upper > 0) & (self.lower < self.upper)
 
     def complement(self) -> Bounds:
         """The bounds of the negated formula."""
@@ -123,8 +123,8 @@ def _finite_support(noise: Distribution) -> tuple[float, float, float]:
         reach = noise.scale
         while True:
             end = noise.mean + sign * reach
-            far = (end, np.inf) if sign > 0 else (-np.inf, end)
-            tail = float(noise.probability_bounds(*far, 0.0, 0.0)[1])
+            outer = (end, np.inf) if sign > 0 else (-np.inf, end)
+            tail = float(noise.probability_bounds(*outer, 0.0, 0.0)[1])
             if tail <= TAIL or reach > 1e6 * noise.scale:
                 break
             reach *= 1.1
@@ -179,15 +179,15 @@ class Abstraction:
         In states that are satisfied surely or with probability 1, at least the policy's action is one.
         """
         won, task = bounds.lower >= 1, bounds.task
-        found = np.zeros((*won.shape, len(self.actions)), bool)
+        safe = np.zeros((*won.shape, len(self.actions)), bool)
         cells = np.flatnonzero((won & (task.decided < 0)[:, None]).any(0))
         if len(cells):
             rows = self._rows(bounds.grid, cells, noise_box(self.dynamics))[1]
             for q in np.flatnonzero(task.decided < 0):
                 inside = contained(task, rows, won, int(q)).reshape(len(cells), -1)
-                found[q, cells] = inside & won[q, cells, None]
-        found[task.decided == 1] = True
-        return found
+                safe[q, cells] = inside & won[q, cells, None]
+        safe[task.decided == 1] = True
+        return safe
 
     def _first(self, grid: Grid) -> Bounds:
         """Bounds 0 and 1."""
@@ -229,14 +229,14 @@ class Abstraction:
         """The images of cells under each action, and the cells that they may meet."""
         images = image_boxes(self.step, grid, cells, self.actions, box)
         j, noise = np.array(images.noise_of), self.dynamics.noise
-        least, most = np.append(box.low, 0.0)[j], np.append(box.high, 0.0)[j]
+        lower, upper = np.append(box.low, 0.0)[j], np.append(box.high, 0.0)[j]
         unbounded = np.array([i >= 0 and not np.isfinite(noise[i].support).all() for i in j])
         start = np.empty(images.low.shape, np.int32)
         stop, outside = np.empty_like(start), np.empty(len(start), bool)
         for begin in range(0, len(start), _ROWS):
             part = slice(begin, begin + _ROWS)
             gain = images.gain[part]
-            low, high = images.low[part] + gain * least, images.high[part] + gain * most
+            low, high = images.low[part] + gain * lower, images.high[part] + gain * upper
             random = (unbounded & (gain > 0)) | (box.lost > 0)
             low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
             if self.dynamics.outside == "clip":
@@ -248,7 +248,7 @@ class Abstraction:
     def _improved(self, bounds: Bounds) -> Bounds:
         """Better bounds on the same grid: lower ones, then upper ones as those of the negation."""
         grid, limits = bounds.grid, self.limits
-        cells = np.flatnonzero(bounds.open.any(0) & bounds.needed)
+        cells = np.flatnonzero(bounds.undecided.any(0) & bounds.needed)
         if not len(cells):
             return replace(bounds, needed=np.zeros(grid.num_cells, bool))
         limits.report(f"{grid.num_cells:,} cells: images of {len(cells):,} cells")
@@ -291,9 +291,9 @@ class _Problem:
 
     def needed(self, bounds: Bounds, active: Integers) -> Booleans:
         """Cells ``bool[C]`` at rows' positions."""
-        found = np.zeros(bounds.grid.num_cells, bool)
-        found[self.rows.cells[active]] = True
-        return found
+        needed = np.zeros(bounds.grid.num_cells, bool)
+        needed[self.rows.cells[active]] = True
+        return needed
 
     def improved(self, bounds: Bounds, maximize: bool) -> Bounds:
         """Better lower bounds, by sets and by value iteration."""
@@ -326,9 +326,9 @@ class _Problem:
             if len(active) < len(rows.cells):
                 rows, probabilities = self._part(bounds.grid, active)
             start = value, action
-            found, best = iterate(task, probabilities, rows, start, limits.max_sweeps, maximize)
-            how[found > value] = ITERATED
-        return replace(bounds, lower=found, action=best)
+            lower, best = iterate(task, probabilities, rows, start, limits.max_sweeps, maximize)
+            how[lower > value] = ITERATED
+        return replace(bounds, lower=lower, action=best)
 
     def active(self, bounds: Bounds) -> Integers:
         """Rows' positions of cells that matter for initial states and are not decided."""

@@ -187,11 +187,11 @@ def prove(
     dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
 ) -> tuple[Certificate, Abstraction, Bounds]:
     """The certificate of a step under the best actions of a grid, and its parts."""
-    given: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
-    given["tolerance"] = validation.finite_number("tolerance", given.get("tolerance", 1e-3))
-    if given.get("threshold") is not None:
-        given["threshold"] = validation.finite_number("threshold", given["threshold"])
-    limits = Limits(**given)
+    settings: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
+    settings["tolerance"] = validation.finite_number("tolerance", settings.get("tolerance", 1e-3))
+    if settings.get("threshold") is not None:
+        settings["threshold"] = validation.finite_number("threshold", settings["threshold"])
+    limits = Limits(**settings)
     grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
     abstraction = Abstraction(dynamics, formula, step, actions, limits)
@@ -202,21 +202,21 @@ def prove(
     decided = (ends[1] - ends[0]).max() <= limits.tolerance or limits.decides(*ends)
     status = Status.CONVERGED if decided else Status.MAX_STEPS
     seconds, text = abstraction.seconds, str(formula)
-    made = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
-    return made, abstraction, bounds
+    certificate = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
+    return certificate, abstraction, bounds
 
 
 def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Array]:
     """The step of a world under a policy; checks the shape of actions."""
     n, m = dynamics.num_states, dynamics.num_actions
     try:
-        found = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
+        action_spec = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
     except (TypeError, FlaxError) as error:  # shapes that do not fit
         message = " ".join(f"policy fails with a state float[{n}]: {error}".split())
         raise ValueError(f"{message}; give a function of a state float[{n}].") from error
-    if tuple(getattr(found, "shape", ("?",))) != (m,):
+    if tuple(getattr(action_spec, "shape", ("?",))) != (m,):
         raise ValueError(
-            f"policy returns an array of shape {list(getattr(found, 'shape', ()))} for a state of {n} "
+            f"policy returns an array of shape {list(getattr(action_spec, 'shape', ()))} for a state of {n} "
             f"coordinates; return float[{m}], an action."
         )
 
@@ -245,12 +245,12 @@ def first_grid(
         breakpoints.append(np.unique([*edges, *dynamics.initial.low[:, axis], *ends]))
     shape = tuple(int(k) for k in np.atleast_1d(cells))
     count = int(np.prod([float(k) for k in shape]))
-    most = min(max_cells, PAIRS // num_actions)
-    if count > most:
-        remedy = f"or raise max_cells={max_cells:,}" if most == max_cells else "or fewer actions"
+    limit = min(max_cells, PAIRS // num_actions)
+    if count > limit:
+        remedy = f"or raise max_cells={max_cells:,}" if limit == max_cells else "or fewer actions"
         raise ValueError(
             f"cells={shape} are {count:,} cells, which take about "
             f"{count * num_actions * _BYTES / 2**30:.3g} GiB with {num_actions:,} actions; give at most "
-            f"{most:,}, {remedy}."
+            f"{limit:,}, {remedy}."
         )
     return make_grid(*dynamics.domain, shape, breakpoints)

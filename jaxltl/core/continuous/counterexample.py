@@ -79,5 +79,5 @@ def counterexample(
     if not violated.any():
         return None
     steps = np.where(violated.any(axis=1), violated.argmax(axis=1), num_steps + 1)
-    found: Floats = np.asarray(runs.world.world[steps.argmin(), : steps.min() + 1], np.float64)
-    return found
+    run: Floats = np.asarray(runs.world.world[steps.argmin(), : steps.min() + 1], np.float64)
+    return run

@@ -161,10 +161,10 @@ class Dynamics:
           The successor; differentiable in state, action and disturbance.
         """
         noise = self.sample_noise(key, disturbance).astype(state.dtype)
-        found = jnp.asarray(self.step(state, action, noise), state.dtype)
+        successor = jnp.asarray(self.step(state, action, noise), state.dtype)
         if self.outside != "clip":
-            return found
-        return jnp.clip(found, *(jnp.asarray(x, state.dtype) for x in self.domain))
+            return successor
+        return jnp.clip(successor, *(jnp.asarray(x, state.dtype) for x in self.domain))
 
     def sample_initial(self, key: chex.PRNGKey) -> jax.Array:
         """``float[n]``: an initial state, uniform in a box that is chosen by its volume."""
@@ -244,12 +244,16 @@ def make_dynamics(
             if not region.membership(low[None], np.nextafter(high, np.inf)[None])[1][0]:
                 raise ValueError("no state of the domain belongs to it; give a set that meets it.")
         regions[name] = region
-    given = options.get("noise", ())
-    noise = [given] if isinstance(given, Distribution) else validation.sequence("noise", given)
+    noise_option = options.get("noise", ())
+    noise = (
+        [noise_option]
+        if isinstance(noise_option, Distribution)
+        else validation.sequence("noise", noise_option)
+    )
     for i, one in enumerate(noise):
         validation.instance(f"noise[{i}]", one, Distribution, "gaussian(scale) or another one")
     disturbance, actions = options.get("disturbance"), options.get("actions")
-    made = Dynamics(
+    dynamics = Dynamics(
         step,
         (low, high),
         tuple(noise),
@@ -259,8 +263,8 @@ def make_dynamics(
         outside,
         _initial(options.get("initial"), low, high),
     )
-    _check_step(made)
-    return made
+    _check_step(dynamics)
+    return dynamics
 
 
 def to_environment(dynamics: Dynamics) -> Environment:
@@ -321,8 +325,8 @@ def _environment_step(
         action = jnp.clip(action, *choices)
     else:
         action = jnp.asarray(choices)[action]
-    found = next_state(key, state, action)
-    return Timestep(found, jnp.zeros((), state.dtype), ~inside(found))
+    successor = next_state(key, state, action)
+    return Timestep(successor, jnp.zeros((), state.dtype), ~inside(successor))
 
 
 def _observed(state: jax.Array) -> jax.Array:
@@ -332,11 +336,11 @@ def _observed(state: jax.Array) -> jax.Array:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _bounds(name: str, given: tuple[ArrayLike, ArrayLike]) -> Bounds:
+def _bounds(name: str, value: tuple[ArrayLike, ArrayLike]) -> Bounds:
     """A pair of finite vectors, the first at most the second."""
-    pair = given if isinstance(given, tuple | list) else ()
+    pair = value if isinstance(value, tuple | list) else ()
     if len(pair) != 2:
-        raise ValueError(f"{name} is {validation.shorten(given)}; give (low, high).")
+        raise ValueError(f"{name} is {validation.shorten(value)}; give (low, high).")
     low, high = (validation.float_array(name, x) for x in pair)
     if low.ndim != 1 or low.shape != high.shape or not len(low):
         raise ValueError(
@@ -353,13 +357,13 @@ def _bounds(name: str, given: tuple[ArrayLike, ArrayLike]) -> Bounds:
     return low, high
 
 
-def _actions(given: object) -> Bounds | Floats | None:
+def _actions(value: object) -> Bounds | Floats | None:
     """The box, the grid, or None."""
-    if given is None:
+    if value is None:
         return None
-    if isinstance(given, tuple):
-        return _bounds("actions", given)
-    grid = validation.float_array("actions", given)
+    if isinstance(value, tuple):
+        return _bounds("actions", value)
+    grid = validation.float_array("actions", value)
     if grid.ndim != 2 or not grid.size or not np.isfinite(grid).all():
         raise ValueError(
             f"actions is an array of shape {list(grid.shape)}; give finite numbers [A, m], an action "
@@ -368,11 +372,11 @@ def _actions(given: object) -> Bounds | Floats | None:
     return grid
 
 
-def _initial(given: Any, low: Floats, high: Floats) -> Region:
+def _initial(value: Any, low: Floats, high: Floats) -> Region:
     """The boxes of initial states, intersected with the domain."""
-    if given is None:
+    if value is None:
         return box(low, high)
-    region = as_region("initial", given, len(low))
+    region = as_region("initial", value, len(low))
     if len(region.offset) or region.functions:
         raise ValueError("initial: give boxes alone, of which initial states are sampled.")
     first, last = np.maximum(region.low, low), np.minimum(region.high, high)
@@ -385,24 +389,28 @@ def _initial(given: Any, low: Floats, high: Floats) -> Region:
     return box(first, last)
 
 
-def _check_step(made: Dynamics) -> None:
+def _check_step(dynamics: Dynamics) -> None:
     """Traces the step in both precisions that JAX has, and evaluates it at random states."""
-    n, m, k = made.num_states, made.num_actions, made.num_noise
+    n, m, k = dynamics.num_states, dynamics.num_actions, dynamics.num_noise
     shapes = f"state float[{n}], action float[{m}], noise float[{k}]"
     for dtype in sorted({jnp.dtype(np.float32), jnp.result_type(float)}, key=str):
-        given = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, m, k)]
+        specs = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, m, k)]
         try:
-            found = traced("step", made.step, *given)
+            successor = traced("step", dynamics.step, *specs)
         except Exception as error:
             message = f"step fails with {shapes}: {error}; accept arrays of these shapes."
             if isinstance(error, ValueError):
                 message = f"{error} Its arguments are {shapes}."
             raise ValueError(" ".join(message.split())) from error
-        if getattr(found, "shape", None) != (n,) or not jnp.issubdtype(found.dtype, jnp.floating):
-            array = hasattr(found, "dtype")
-            kind = f"{found.dtype}{list(found.shape)}" if array else type(found).__name__
+        if getattr(successor, "shape", None) != (n,) or not jnp.issubdtype(
+            successor.dtype, jnp.floating
+        ):
+            array = hasattr(successor, "dtype")
+            kind = (
+                f"{successor.dtype}{list(successor.shape)}" if array else type(successor).__name__
+            )
             raise ValueError(f"step returns {kind}; return float[{n}], a state.")
-    _check_finite(made)
+    _check_finite(dynamics)
 
 
 def _check_functions(region: Region, num_states: int) -> None:
@@ -414,22 +422,22 @@ def _check_functions(region: Region, num_states: int) -> None:
             raise ValueError(f"its function returns shape {shape}; return a number.")
 
 
-def _check_finite(made: Dynamics, num_samples: int = 64) -> None:
+def _check_finite(dynamics: Dynamics, num_samples: int = 64) -> None:
     """Raises ValueError if a successor of a random state of the domain is not a number."""
-    low, high = made.domain
+    low, high = dynamics.domain
     draw = np.random.default_rng(0)
     state = draw.uniform(low, high, (num_samples, len(low)))
-    actions = (np.zeros(0), np.zeros(0)) if made.actions is None else made.actions
+    actions = (np.zeros(0), np.zeros(0)) if dynamics.actions is None else dynamics.actions
     if isinstance(actions, tuple):
-        action = draw.uniform(*actions, (num_samples, made.num_actions))
+        action = draw.uniform(*actions, (num_samples, dynamics.num_actions))
     else:
         action = actions[draw.integers(len(actions), size=num_samples)]
     keys = jax.random.split(jax.random.key(0), num_samples)
-    given = (jnp.asarray(x, jnp.result_type(float)) for x in (state, action))
-    found = np.asarray(jax.vmap(made.next_state)(keys, *given))
-    if np.isnan(found).any():
-        i = int(np.argmax(np.isnan(found).any(axis=1)))
+    samples = (jnp.asarray(x, jnp.result_type(float)) for x in (state, action))
+    successor = np.asarray(jax.vmap(dynamics.next_state)(keys, *samples))
+    if np.isnan(successor).any():
+        i = int(np.argmax(np.isnan(successor).any(axis=1)))
         raise ValueError(
-            f"step returns {found[i].tolist()} in state {state[i].round(6).tolist()} with action "
+            f"step returns {successor[i].tolist()} in state {state[i].round(6).tolist()} with action "
             f"{action[i].tolist()}; define it in the whole domain."
         )

@@ -162,8 +162,8 @@ def count_in(table: Integers, start: Integers, stop: Integers) -> Integers:
 
 def volume(start: Integers, stop: Integers) -> Integers:
     """Number of cells in boxes of cells."""
-    found: Integers = np.prod(np.maximum(stop - start, 0), -1, dtype=np.int64)
-    return found
+    count: Integers = np.prod(np.maximum(stop - start, 0), -1, dtype=np.int64)
+    return count
 
 
 def covered(start: Integers, stop: Integers, shape: tuple[int, ...]) -> Booleans:
@@ -176,5 +176,5 @@ def covered(start: Integers, stop: Integers, shape: tuple[int, ...]) -> Booleans
         np.add.at(steps, index, 1 if sum(corner) % 2 == 0 else -1)
     for axis in range(len(shape)):
         steps = np.cumsum(steps, axis, dtype=np.int32)
-    found: Booleans = steps[tuple(slice(k) for k in shape)] > 0
-    return found
+    mask: Booleans = steps[tuple(slice(k) for k in shape)] > 0
+    return mask

@@ -97,7 +97,7 @@ def image_boxes(
     with jax.enable_x64(True):
         program = gain_program(step, [jax.ShapeDtypeStruct((k,), np.float64) for k in sizes])
     num_actions, n = len(actions), grid.num_axes
-    found = [np.empty((len(cells), num_actions, n)) for _ in range(4)]
+    arrays = [np.empty((len(cells), num_actions, n)) for _ in range(4)]
     todo = np.ones(len(cells), bool)
     order, noise_of = tuple(range(n)), (-1,) * n
     index = np.stack(np.unravel_index(cells, grid.shape), -1)
@@ -121,12 +121,12 @@ def image_boxes(
                     form, random, grid, cells[here], of_block[part] - first
                 )
                 accepted |= max(size) == 1
-                for array, new in zip(found, image, strict=True):
+                for array, new in zip(arrays, image, strict=True):
                     array[here[accepted]] = new[accepted]
                 todo[here[accepted]] = False
         if not todo.any():
             break
-    unbounded = ~np.isfinite(found[1] - found[0]).all((1, 2))
+    unbounded = ~np.isfinite(arrays[1] - arrays[0]).all((1, 2))
     if unbounded.any():
         low, high = (x[0].round(6).tolist() for x in grid.boxes(cells[[unbounded.argmax()]]))
         raise ValueError(
@@ -134,7 +134,7 @@ def image_boxes(
             f"{high}; bound it by jnp.clip or jnp.where, give more cells, or a domain without such "
             "states."
         )
-    low, high, gain, varying = (x.reshape(-1, n) for x in found)
+    low, high, gain, varying = (x.reshape(-1, n) for x in arrays)
     return Images(cells, low, high, _compact(gain), noise_of, _compact(varying), order)
 
 
@@ -199,8 +199,8 @@ def _forms(
         gains = gain_bounds(known, (len(row), k, n))
         slope = np.zeros((len(row), width, n))
         slope[:, : form.slope.shape[1]] = form.slope
-        found = (bounds.low, bounds.high, form.middle, form.error, *gains, slope)
-        return [np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found]
+        parts_of_chunk = (bounds.low, bounds.high, form.middle, form.error, *gains, slope)
+        return [np.broadcast_to(x, (len(row), *x.shape[1:])) for x in parts_of_chunk]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(evaluate, range(0, total, _CHUNK)))
@@ -209,9 +209,9 @@ def _forms(
         for x in zip(*parts, strict=True)
     )
     state, gains = slope[:, :, :n], slope[:, :, width - k :]
-    low, high, middle, error, least, most = arrays
+    low, high, middle, error, gain_low, gain_high = arrays
     centre, radius = (first + last) / 2, (last - first) / 2
-    return _Forms(low, high, middle, error, least, most, state, gains, centre, radius)
+    return _Forms(low, high, middle, error, gain_low, gain_high, state, gains, centre, radius)
 
 
 def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -220,14 +220,14 @@ def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int
     The largest gains are random. All other noise is treated as chosen by an adversary that knows the
     noises of earlier coordinates.
     """
-    found = [-1] * form.gains.shape[-1]
+    noise_of = [-1] * form.gains.shape[-1]
     size = np.abs(np.nan_to_num(form.gains)).mean((0, 1))  # [k, n], of one radius of the noise
     for j, i in zip(*scipy.optimize.linear_sum_assignment(-size), strict=True):
         if noise.random[j] and size[j, i] > 0:
-            found[i] = int(j)
+            noise_of[i] = int(j)
     depends = ((form.gain_low != 0) | (form.gain_high != 0)).any((0, 1))
-    own = np.array([size[j, i] if j >= 0 else 0.0 for i, j in enumerate(found)])
-    return conditioning_order(found, depends, own / np.maximum(size.sum(0), 1e-300))
+    own = np.array([size[j, i] if j >= 0 else 0.0 for i, j in enumerate(noise_of)])
+    return conditioning_order(noise_of, depends, own / np.maximum(size.sum(0), 1e-300))
 
 
 def _cell_images(
@@ -244,20 +244,22 @@ def _cell_images(
     slope = form.slope[of_block]
     size = np.abs(slope)
     middle = form.middle[of_block] + np.einsum("ca,cuai->cui", offset, slope)
-    spread = np.einsum("ca,cuai->cui", share, size)
+    half_width = np.einsum("ca,cuai->cui", share, size)
     fuzzy = np.abs(form.middle[of_block]) + size.sum(-2) + np.abs(form.gains[of_block]).sum(-2)
     own, reach, varying = (x[of_block] for x in (random.gain, random.reach, random.varying))
-    least, most = random.least, random.most
+    noise_low, noise_high = random.low, random.high
     error = form.error[of_block] + fuzzy * _ROUNDING
-    allowed = CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
+    allowed = CELL_SHARE * half_width + NOISE_SHARE * own * (noise_high - noise_low) / 2
     small = (error <= allowed) & (varying <= allowed)
-    half = (spread + error + reach) * (1 + _ROUNDING)
-    middle = middle - own * (least + most) / 2  # forms are centred at the middle of the noise
+    half = (half_width + error + reach) * (1 + _ROUNDING)
+    middle = (
+        middle - own * (noise_low + noise_high) / 2
+    )  # forms are centred at the middle of the noise
     low, high = middle - half, middle + half
     # Where these are infinite, the interval with all of the noise.
     unknown = ~(np.isfinite(low) & np.isfinite(high))
-    low = np.where(unknown, form.low[of_block] - own * most, low)
-    high = np.where(unknown, form.high[of_block] - own * least, high)
+    low = np.where(unknown, form.low[of_block] - own * noise_high, low)
+    high = np.where(unknown, form.high[of_block] - own * noise_low, high)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     return [low, high, own, varying], (small & ~unknown).all((1, 2))
 
@@ -269,8 +271,8 @@ class _Random:
     gain: Floats  # [N, A, n]
     reach: Floats
     varying: Floats
-    least: Floats  # [n], bounds of the random noise
-    most: Floats
+    low: Floats  # [n], bounds of the random noise
+    high: Floats
     usual: Floats  # [n], gains to which nearly equal ones are set
 
 
@@ -287,29 +289,29 @@ def _random_part(
         if j < 0:
             continue
         slope = form.gains[:, :, j, i]
-        least, most = form.gain_low[:, :, j, i], form.gain_high[:, :, j, i]
+        low, high = form.gain_low[:, :, j, i], form.gain_high[:, :, j, i]
         if noise.symmetric[j]:  # the noise and its reflection have one distribution
             flip = slope < 0
             slope = np.abs(slope)
-            least, most = np.where(flip, -most, least), np.where(flip, -least, most)
-        known = np.isfinite(least) & np.isfinite(most)
-        least, most = np.where(known, least, 0.0), np.where(known, most, 0.0)
+            low, high = np.where(flip, -high, low), np.where(flip, -low, high)
+        known = np.isfinite(low) & np.isfinite(high)
+        low, high = np.where(known, low, 0.0), np.where(known, high, 0.0)
         # The form's slope errs by its error; the derivative's bounds may be wider, as of a clip.
-        own, wide = least / 2 + most / 2, 2 * form.error[:, :, i] / radius[j]
-        by_form = known & np.isfinite(slope + wide) & (wide < most / 2 - least / 2)
+        own, wide = low / 2 + high / 2, 2 * form.error[:, :, i] / radius[j]
+        by_form = known & np.isfinite(slope + wide) & (wide < high / 2 - low / 2)
         own = np.where(by_form, slope / radius[j], own)
-        least, most = (np.where(by_form, own + d * wide, x) for d, x in ((-1, least), (1, most)))
+        low, high = (np.where(by_form, own + d * wide, x) for d, x in ((-1, low), (1, high)))
         if usual is None:
             typical[i] = np.median(own)
-        near = np.abs(own - typical[i]) <= _EQUAL_GAINS * abs(typical[i])
-        own = np.where(near, typical[i], own)
+        is_typical = np.abs(own - typical[i]) <= _EQUAL_GAINS * abs(typical[i])
+        own = np.where(is_typical, typical[i], own)
         own = np.where(own > 0, own, 0.0)
-        apart = np.maximum(most - own, own - least) * radius[j]
+        apart = np.maximum(high - own, own - low) * radius[j]
         # Bounds of a constant derivative differ by their rounding.
         constant = apart <= _CONSTANT * own * radius[j]
         varying[:, :, i] = np.where((own > 0) & ~constant, apart * (1 + _ROUNDING), 0.0)
         gain[:, :, i] = own
         reach[:, :, i] += np.abs(slope - own * radius[j]) - np.abs(slope)
         reach[:, :, i] = np.maximum(reach[:, :, i], 0) + np.abs(slope) * _ROUNDING
-    least, most = np.array(ends).T
-    return _Random(gain, reach, varying, least, most, typical)
+    low, high = np.array(ends).T
+    return _Random(gain, reach, varying, low, high, typical)

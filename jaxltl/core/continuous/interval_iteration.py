@@ -33,9 +33,9 @@ def iterate(
             break
         change = 0.0
         for q in reversed(np.flatnonzero(task.decided < 0)):
-            found = _expected(task, bounds, value, q, rows.shape).reshape(-1, rows.num_actions)
-            best = found.argmax(1) if maximize else found.argmin(1)
-            new = np.take_along_axis(found, best[:, None], 1)[:, 0]
+            expected = _expected(task, bounds, value, q, rows.shape).reshape(-1, rows.num_actions)
+            best = expected.argmax(1) if maximize else expected.argmin(1)
+            new = np.take_along_axis(expected, best[:, None], 1)[:, 0]
             better = new > value[q, rows.cells]
             action[q, rows.cells[better]] = best[better]
             change = max(change, _raise(value, q, rows.cells, new))
@@ -67,14 +67,14 @@ def _evaluate(
     tolerance: float,
 ) -> None:
     """Sweeps with the chosen actions alone, which cost a fraction of those over all actions."""
-    open_memory = np.flatnonzero(task.decided < 0)
+    undecided = np.flatnonzero(task.decided < 0)
     first = np.arange(len(rows.cells)) * rows.num_actions
-    parts = {q: bounds.part(first + action[q, rows.cells]) for q in open_memory}
+    parts = {q: bounds.part(first + action[q, rows.cells]) for q in undecided}
     for _ in range(_EVALUATION_SWEEPS):
         change = 0.0
-        for q in reversed(open_memory):
-            found = _expected(task, parts[q], value, q, rows.shape)
-            change = max(change, _raise(value, q, rows.cells, found))
+        for q in reversed(undecided):
+            expected = _expected(task, parts[q], value, q, rows.shape)
+            change = max(change, _raise(value, q, rows.cells, expected))
         if change <= tolerance:
             return
 
@@ -87,16 +87,16 @@ def reachable(
     """
     row_of_cell = np.full(initial.shape, -1)
     row_of_cell[rows.cells] = np.arange(len(rows.cells))
-    found = (task.start[task.label_class].T) & initial
-    todo = found & ~finished & (task.decided < 0)[:, None]
+    reached = (task.start[task.label_class].T) & initial
+    todo = reached & ~finished & (task.decided < 0)[:, None]
     while todo.any():
-        new = np.zeros_like(found)
+        new = np.zeros_like(reached)
         for q in np.flatnonzero(todo.any(1)):
             at = row_of_cell[np.flatnonzero(todo[q])]
             at = at[at >= 0]
             index = (at[:, None] * rows.num_actions + np.arange(rows.num_actions)).reshape(-1)
             met = covered(rows.start[index], rows.stop[index], rows.shape).reshape(-1)
             new |= task.moves[q][task.label_class].T & met
-        todo = new & ~found & ~finished & (task.decided < 0)[:, None]
-        found |= new
-    return found
+        todo = new & ~reached & ~finished & (task.decided < 0)[:, None]
+        reached |= new
+    return reached

@@ -61,8 +61,12 @@ def state_policy(policy: Policy, environment: Dynamics | Environment) -> StatePo
       -0.25
     """
     if isinstance(policy, tuple) and len(policy) == 2 and hasattr(policy[0], "apply"):
-        apply, given = policy[0].apply, policy[1]
-        variables = given if isinstance(given, dict) and "params" in given else {"params": given}
+        apply, parameters = policy[0].apply, policy[1]
+        variables = (
+            parameters
+            if isinstance(parameters, dict) and "params" in parameters
+            else {"params": parameters}
+        )
         return lambda state: apply(variables, state)
     if not isinstance(policy, Agent):
         return validation.function("policy", policy)
@@ -127,15 +131,15 @@ def _undecided_row(tables: TaskTables) -> Floats:
     while (more := reached | set(delta[list(reached)].ravel().tolist())) != reached:
         reached = more
     entered = np.unique(delta[list(reached)])  # an observation follows the first label
-    open_ = entered[verdict[entered] == Verdict.UNDECIDED]
-    found: Floats = np.unique(rows[open_], axis=0)
-    if len(found) > 1:
+    undecided = entered[verdict[entered] == Verdict.UNDECIDED]
+    distinct: Floats = np.unique(rows[undecided], axis=0)
+    if len(distinct) > 1:
         raise ValueError(
-            f"the policy observes {len(open_)} undecided automaton states of its task, so that it is "
+            f"the policy observes {len(undecided)} undecided automaton states of its task, so that it is "
             "no function of the state alone; learn with embedding=np.zeros((Q, 1)), which hides them, "
             "or synthesize a policy with memory by synthesize_policy."
         )
-    result: Floats = rows[int(tables.initial)] if not len(found) else found[0]
+    result: Floats = rows[int(tables.initial)] if not len(distinct) else distinct[0]
     return result
 
 

@@ -113,9 +113,9 @@ class Distribution:
           (0.75, 1.0)
         """
         a, b, low, high, scale = (np.asarray(x, np.float64) for x in (a, b, low, high, scale))
-        spread = scale * self.mean if self.symmetric else np.zeros(())
+        shift = scale * self.mean if self.symmetric else np.zeros(())
         # Rounding of the differences and of the quotient, and of the shift that attains the maximum.
-        size = sum(np.where(np.isfinite(x), np.abs(x), 0.0) for x in (a, b, low, high, spread))
+        size = sum(np.where(np.isfinite(x), np.abs(x), 0.0) for x in (a, b, low, high, shift))
         error = 4 * _EPS * size / scale + _TINY
 
         def between(first: Floats, second: Floats, outward: int) -> Floats:
@@ -131,7 +131,7 @@ class Distribution:
         best = high, low
         if self.symmetric:
             with np.errstate(invalid="ignore"):  # -inf + inf: every shift has probability 1
-                middle = 0.5 * a + 0.5 * b - spread
+                middle = 0.5 * a + 0.5 * b - shift
             best = (np.clip(np.where(np.isnan(middle), low, middle), low, high),) * 2
         upper = between(*best, 1)
         return np.clip(lower, 0, 1), np.clip(upper, 0, 1)
@@ -179,8 +179,8 @@ class Distribution:
         middle = 1 - missing * (1 - outward * 2 * _EPS)
         middle = np.where(missing > 0, middle + outward * _EPS, middle)
         lower, upper = second[side] - first[1 - side], first[side] - second[1 - side]
-        found = np.where(right, lower, np.where(left, middle, upper))
-        return np.where(right & ~left, 0.0, found)
+        mass = np.where(right, lower, np.where(left, middle, upper))
+        return np.where(right & ~left, 0.0, mass)
 
     def _tail(self, x: Floats) -> tuple[Floats, Floats]:
         """Bounds of F(x) for x at or below the mean: relative error, exact 0 outside the support."""
@@ -194,12 +194,12 @@ class Distribution:
     def _absolute(self, x: Floats, outward: int) -> Floats:
         """Bound of F(x) by its absolute error; exact outside the support."""
         if self.function is not None:
-            found = self._user_bounds(x)[(outward + 1) // 2]
+            bound = self._user_bounds(x)[(outward + 1) // 2]
         else:
-            found = self.cdf(x) + outward * CDF_ERROR
+            bound = self.cdf(x) + outward * CDF_ERROR
         low, high = self.support
-        found = np.where(x <= low, 0.0, np.where(x >= high, 1.0, np.clip(found, 0, 1)))
-        return np.asarray(found)
+        bound = np.where(x <= low, 0.0, np.where(x >= high, 1.0, np.clip(bound, 0, 1)))
+        return np.asarray(bound)
 
     def _user_bounds(self, x: Floats) -> tuple[Floats, Floats]:
         """Enclosure of the user's distribution function, evaluated by interval arithmetic."""
@@ -342,23 +342,23 @@ def from_cdf(cdf: Function, low: float, high: float) -> Distribution:
     """
     validation.function("cdf", cdf)
     low, high = _ordered(low, high, finite=False)
-    made = Distribution("cdf", (low, high), 0.0, 1.0, False, cdf)
+    distribution = Distribution("cdf", (low, high), 0.0, 1.0, False, cdf)
     share = np.linspace(0, 1, 1002)[1:-1]
     first = low if np.isfinite(low) else (high if np.isfinite(high) else 0.0) - 1e4
     last = high if np.isfinite(high) else (low if np.isfinite(low) else 0.0) + 1e4
     points = first + (last - first) * share
-    lower, upper = made._user_bounds(points)
+    lower, upper = distribution._user_bounds(points)
     missing = np.isnan(np.asarray(cdf(jnp.asarray(points)))).any()
     if missing or not (np.maximum.accumulate(lower) <= upper + CDF_ERROR).all():
         raise ValueError("cdf decreases, or is not a number; give a distribution function.")
     ends = np.array([first, last]) + np.array([1, -1]) * 1e-9 * (last - first)
-    bottom, top = made._user_bounds(ends)
+    bottom, top = distribution._user_bounds(ends)
     if not (bottom[0] < 0.01 and top[1] > 0.99):
         raise ValueError(
             f"cdf is {bottom[0]:.3g} near {first:g} and {top[1]:.3g} near {last:g}; give the support, "
             "with a cdf of 0 at low and 1 at high."
         )
-    return made
+    return distribution
 
 
 def _on_interval(kind: str, low: float, high: float) -> Distribution:

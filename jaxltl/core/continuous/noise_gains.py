@@ -63,8 +63,11 @@ def gain_bounds(known: Enclosed, shape: tuple[int, ...]) -> tuple[Floats, Floats
     """Bounds ``[C, k, n]`` of the derivatives over boxes; infinite where none is known."""
     if len(known.program.outputs) == 1:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    found = known.intervals[known.program.outputs[1]]
-    low, high = (np.broadcast_to(x.reshape(-1, *shape[1:]), shape) for x in (found.low, found.high))
+    derivatives = known.intervals[known.program.outputs[1]]
+    low, high = (
+        np.broadcast_to(x.reshape(-1, *shape[1:]), shape)
+        for x in (derivatives.low, derivatives.high)
+    )
     finite = np.isfinite(low) & np.isfinite(high)
     zero = np.maximum(np.abs(low), np.abs(high)) < _UNDERFLOW
     low, high = np.where(zero, 0.0, low), np.where(zero, 0.0, high)

@@ -71,17 +71,17 @@ class Region:
         low, high, normal, offset = (
             xp.asarray(y, x.dtype) for y in (self.low, self.high, self.normal, self.offset)
         )
-        found: Array = xp.zeros(x.shape[:-1], bool)
+        inside: Array = xp.zeros(x.shape[:-1], bool)
         if len(low):
             y = x[..., None, :]
-            found = found | ((low <= y) & (y < high)).all(-1).any(-1)
+            inside = inside | ((low <= y) & (y < high)).all(-1).any(-1)
         if len(normal):
-            found = found | (x @ normal.T <= offset).any(-1)
+            inside = inside | (x @ normal.T <= offset).any(-1)
         for function in self.functions:
             flat = x.reshape(-1, x.shape[-1])
             positive = jax.vmap(function)(jnp.asarray(flat)) > 0
-            found = found | (np.asarray(positive) if numpy else positive).reshape(found.shape)
-        return found
+            inside = inside | (np.asarray(positive) if numpy else positive).reshape(inside.shape)
+        return inside
 
     def membership(self, low: ArrayLike, high: ArrayLike) -> tuple[Booleans, Booleans]:
         """Cells inside the region, and cells that meet it.
@@ -112,9 +112,9 @@ class Region:
                 terms = np.where(normal == 0, 0.0, normal * ends)
             size = np.abs(terms).sum(axis=-1)
             error = (len(normal) + 2) * np.finfo(np.float64).eps * size
-            least, most = terms.sum(axis=-1) + np.array([[-1], [1]]) * error
-            certain |= most <= offset
-            possible |= ~(least > offset)
+            lower, upper = terms.sum(axis=-1) + np.array([[-1], [1]]) * error
+            certain |= upper <= offset
+            possible |= ~(lower > offset)
         for function in self.functions:
             for start in range(0, len(low), _CHUNK):
                 part = slice(start, start + _CHUNK)
@@ -238,35 +238,35 @@ def union(*regions: Region) -> Region:
         validation.instance("union", region, Region, "regions of box, half_space or where_positive")
     sizes = sorted({region.num_states for region in regions} - {0})
     if len(sizes) > 1 or not regions:
-        found = f"of {sizes} coordinates" if regions else "missing"
-        raise ValueError(f"union: the regions are {found}; give regions of one space.")
+        fault = f"of {sizes} coordinates" if regions else "missing"
+        raise ValueError(f"union: the regions are {fault}; give regions of one space.")
     shape = (-1, sizes[0]) if sizes else (0, 0)
 
     def joined(name: str) -> Floats:
-        given = [getattr(r, name) for r in regions if r.num_states or not sizes]
-        return np.concatenate([x.reshape(shape) for x in given])
+        arrays = [getattr(r, name) for r in regions if r.num_states or not sizes]
+        return np.concatenate([x.reshape(shape) for x in arrays])
 
     offset = np.concatenate([r.offset for r in regions])
     functions = sum((r.functions for r in regions), ())
     return Region(joined("low"), joined("high"), joined("normal"), offset, functions)
 
 
-def as_region(name: str, given: Region | Sequence[ArrayLike], num_states: int) -> Region:
+def as_region(name: str, value: Region | Sequence[ArrayLike], num_states: int) -> Region:
     """A region from a region or a pair of bounds, of `num_states` coordinates."""
-    if not isinstance(given, Region):
-        pair = given if isinstance(given, tuple | list) else ()
+    if not isinstance(value, Region):
+        pair = value if isinstance(value, tuple | list) else ()
         if len(pair) != 2:
             raise ValueError(
-                f"{name} is {validation.shorten(given)}; give a Region or (low, high)."
+                f"{name} is {validation.shorten(value)}; give a Region or (low, high)."
             )
         with validation.errors_in(f"{name}: "):
-            given = box(*pair)
-    if given.num_states not in (0, num_states):
+            value = box(*pair)
+    if value.num_states not in (0, num_states):
         raise ValueError(
-            f"{name} has {given.num_states} coordinates, and the domain {num_states}; give regions "
+            f"{name} has {value.num_states} coordinates, and the domain {num_states}; give regions "
             "of the domain's space."
         )
-    return given
+    return value
 
 
 def extended(region: Region, low: Floats, high: Floats) -> Region:

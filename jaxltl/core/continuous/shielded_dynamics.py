@@ -91,10 +91,12 @@ def _step(
 ) -> Timestep:
     if nearest is not None:
         action = nearest(shielded.state, shielded.world, action)
-    found = Timestep(*step(shielded.world, action, key))
-    return found._replace(world=ShieldedWorld(found.world, update(shielded.state, found.world)))
+    timestep = Timestep(*step(shielded.world, action, key))
+    return timestep._replace(
+        world=ShieldedWorld(timestep.world, update(shielded.state, timestep.world))
+    )
 
 
 def _of_world(function: Partial, shielded: ShieldedWorld) -> jax.Array:
-    found: jax.Array = function(shielded.world)
-    return found
+    result: jax.Array = function(shielded.world)
+    return result

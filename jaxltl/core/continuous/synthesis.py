@@ -160,20 +160,20 @@ def _memory_table(task: TaskProduct) -> Integers:
 
 def _actions(dynamics: Dynamics, actions: ArrayLike | None) -> Floats:
     """The grid of actions."""
-    given = dynamics.actions if actions is None else actions
-    if given is None:
+    value = dynamics.actions if actions is None else actions
+    if value is None:
         return np.zeros((1, 0))
-    if isinstance(given, tuple):
+    if isinstance(value, tuple):
         raise ValueError(
             "the dynamics have a box of actions; give actions=, an array float[A, m] of those that the "
             "policy may choose."
         )
-    found = validation.float_array("actions", given)
-    if found.ndim != 2 or found.shape[1] != dynamics.num_actions or not len(found):
+    grid = validation.float_array("actions", value)
+    if grid.ndim != 2 or grid.shape[1] != dynamics.num_actions or not len(grid):
         raise ValueError(
-            f"actions has shape {list(found.shape)}; give float[A, {dynamics.num_actions}]."
+            f"actions has shape {list(grid.shape)}; give float[A, {dynamics.num_actions}]."
         )
-    return found
+    return grid
 
 
 def simulate_cells(
@@ -209,6 +209,8 @@ def simulate_cells(
         return (after, policy.update(memory, after)), (state, memory, action)
 
     state = jnp.asarray(state)
-    _, found = jax.lax.scan(step, (state, policy.start(state)), jax.random.split(key, num_steps))
-    states, memory, actions = found
+    _, trajectory = jax.lax.scan(
+        step, (state, policy.start(state)), jax.random.split(key, num_steps)
+    )
+    states, memory, actions = trajectory
     return states, memory, actions

@@ -72,11 +72,11 @@ class TaskProduct:
 
     def _least(self, value: NDArray[Number], moves: Booleans) -> NDArray[Number]:
         greatest = True if value.dtype == bool else np.inf
-        found = np.full(value.shape[1:], greatest, value.dtype)
+        least = np.full(value.shape[1:], greatest, value.dtype)
         for q in np.flatnonzero(moves.any(0)):
             here = moves[:, q][self.label_class]
-            found = np.where(here, np.minimum(found, value[q]), found)
-        result: NDArray[Number] = found
+            least = np.where(here, np.minimum(least, value[q]), least)
+        result: NDArray[Number] = least
         return result
 
 
@@ -103,13 +103,15 @@ def task_product(
     pattern = certain.astype(np.int8) + 2 * unknown
     classes, label_class = np.unique(pattern, axis=0, return_inverse=True)
     letters = [_letters(row, propositions) for row in classes]
-    everywhere = {letter for found in letters for letter in found}
+    everywhere = {letter for class_letters in letters for letter in class_letters}
     if outside is not None:
         everywhere.add(frozenset([outside]))
     automaton = to_automaton(formula, letters=sorted(everywhere, key=sorted))
     index = _letter_index(automaton)
     names = set(automaton.propositions)
-    of_class = [sorted({index[letter & names] for letter in found}) for found in letters]
+    of_class = [
+        sorted({index[letter & names] for letter in class_letters}) for class_letters in letters
+    ]
     states, moves, start = _memory(automaton, of_class)
     decided = np.array([_decided(automaton, q) for q, _ in states])
     lasso = np.zeros(len(states), int)

@@ -129,10 +129,12 @@ def transition_bounds(
     order = images.order or tuple(range(grid.num_axes))
     for axis in order:
         j = images.noise_of[axis]
-        one, least, most = (noise[j], box.low[j], box.high[j]) if j >= 0 else (None, 0.0, 0.0)
+        one, low_noise, high_noise = (
+            (noise[j], box.low[j], box.high[j]) if j >= 0 else (None, 0.0, 0.0)
+        )
         rows, number = _distinct(images.columns(axis, only))
         low, high, gain, _ = rows.T
-        ends = low + gain * least, high + gain * most
+        ends = low + gain * low_noise, high + gain * high_noise
         ids.append(number)
         factors.append(_factors(rows, ends, grid.edges[axis], one, clipped))
     shape = tuple(grid.shape[axis] for axis in order)
@@ -180,8 +182,8 @@ def _factors(
     def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
         many = max(_CHUNK // a.shape[1], 1)
         parts = [slice(i, i + many) for i in range(0, len(rows), many)]
-        found = [_bounds(noise, (a[part], b[part]), rows[part]) for part in parts]
-        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
+        chunks = [_bounds(noise, (a[part], b[part]), rows[part]) for part in parts]
+        return np.concatenate([x for x, _ in chunks]), np.concatenate([x for _, x in chunks])
 
     lower, upper = bounds(side(index), side(index + 1))
     first, last = side(start)[:, None], side(start + width)[:, None]
@@ -190,9 +192,11 @@ def _factors(
     rest = np.where(first > bottom, below, 0) + np.where(last < top, above, 0)
     outside = np.zeros((len(rows), 2))
     if not clipped:
-        least, most = bounds(bottoms, tops)
-        outside = np.concatenate([1 - most - _UNIT, most - least + 4 * _UNIT], -1)
-        outside = np.where(np.concatenate([most, least], -1) == 1, 0, np.maximum(outside, 0))
+        total_low, total_high = bounds(bottoms, tops)
+        outside = np.concatenate([1 - total_high - _UNIT, total_high - total_low + 4 * _UNIT], -1)
+        outside = np.where(
+            np.concatenate([total_high, total_low], -1) == 1, 0, np.maximum(outside, 0)
+        )
     gap = np.where(upper > lower, upper - lower + _UNIT, 0)
     return Factors(start, lower, gap, outside, rest[:, 0])
 
@@ -238,9 +242,9 @@ def _stages(
             # Rows far apart with equal factors are two groups: padded ranges stay short.
             pair = group * np.int64(ids[axis].max() + 1) + ids[axis]
             for other in range(axis):
-                near = starts[:, other] // np.int32(2 * widths[other])
+                window = starts[:, other] // np.int32(2 * widths[other])
                 _, pair = np.unique(pair, return_inverse=True)
-                pair = pair.reshape(-1) * np.int64(near.max() + 1) + near
+                pair = pair.reshape(-1) * np.int64(window.max() + 1) + window
             _, new, inverse = np.unique(pair, return_index=True, return_inverse=True)
             inverse = inverse.reshape(-1).astype(np.int32)
         first = np.full((len(new), axis), np.iinfo(np.int32).max, np.int32)
@@ -263,7 +267,7 @@ def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -
     size = max(int(np.prod(stage.width)), 1)
     window = factors.low.shape[1]
     chunk = max(_CHUNK // (size * window), 1)
-    found = np.empty((len(stage.factor), *stage.width))
+    values = np.empty((len(stage.factor), *stage.width))
     strides = np.array([s // source.itemsize for s in source.strides])
     flat = source.reshape(-1)
 
@@ -278,7 +282,7 @@ def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -
             steps = np.arange(count) * strides[1 + axis]
             index = index + steps.reshape(-1, *(1,) * (len(stage.width) - axis))
         index = index + np.arange(window) * strides[-1]
-        found[part] = _least(flat[index], factors, factor, outside)
+        values[part] = _least(flat[index], factors, factor, outside)
 
     begins = range(0, len(stage.factor), chunk)
     if len(begins) < 3:
@@ -286,7 +290,7 @@ def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -
     else:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             list(pool.map(compute, begins))
-    return found
+    return values
 
 
 def _least(value: Floats, factors: Factors, factor: Integers, outside: float) -> Floats:

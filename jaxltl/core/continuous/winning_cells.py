@@ -68,7 +68,7 @@ class _Solver:
     ) -> None:
         self.task, self.rows, self.known, self.maximize = task, rows, known, maximize
         self.action = np.zeros(known.shape, np.int32)
-        self.open: list[int] = np.flatnonzero(task.decided < 0).tolist()
+        self.undecided: list[int] = np.flatnonzero(task.decided < 0).tolist()
 
     def solve(self, priority: int, top: int, outer: list[Booleans]) -> Booleans:
         """The fixed point of the variables from `priority` on, for values of the outer ones."""
@@ -86,8 +86,8 @@ class _Solver:
 
     def step(self, sets: list[Booleans]) -> Booleans:
         """One application of the predecessors of all priorities."""
-        found = self.known.copy()
-        for q in self.open:
+        won_states = self.known.copy()
+        for q in self.undecided:
             priority = int(self.task.priority[q])
             inner = sets[priority]
             good = self.all_inside(inner, q)
@@ -96,10 +96,10 @@ class _Solver:
             grid = good.reshape(-1, self.rows.num_actions)
             won = grid.any(1) if self.maximize else grid.all(1)
             cells = self.rows.cells
-            new = won & ~found[q, cells]
+            new = won & ~won_states[q, cells]
             self.action[q, cells[new]] = grid[new].argmax(1)
-            found[q, cells[new]] = True
-        return found
+            won_states[q, cells[new]] = True
+        return won_states
 
     def all_inside(self, states: Booleans, q: int) -> Booleans:
         """Rows with all successors in a set."""

@@ -189,10 +189,10 @@ def relax(
     if name in ("max", "min"):
         return _relax_extreme(name, inputs[0], inputs[1], parallel)
     if name == "mul" and operation.inputs[0] == operation.inputs[1]:
-        found = _smooth(operation, inputs[0], output, _DERIVATIVES["square"])
-        zero = found.lower_slope[0] * 0
-        slopes = (*found.lower_slope, zero)
-        return Relaxation(slopes, found.lower, slopes, found.upper)
+        square = _smooth(operation, inputs[0], output, _DERIVATIVES["square"])
+        zero = square.lower_slope[0] * 0
+        slopes = (*square.lower_slope, zero)
+        return Relaxation(slopes, square.lower, slopes, square.upper)
     if name == "mul":
         return _relax_product(*inputs)
     if name == "div":
@@ -237,9 +237,11 @@ def _smooth(
     secant = (high.middle - low.middle) / xp.where(positive, width, 1)
     usable = positive & xp.isfinite(first) & xp.isfinite(last) & xp.isfinite(secant)
     slope = xp.where(usable, xp.clip(secant, first, last), 0)
-    spread = xp.where(usable & (last > first), last - first, 1)
+    slope_width = xp.where(usable & (last > first), last - first, 1)
     gap = xp.where(
-        usable, arithmetic.times(arithmetic.times(slope - first, last - slope), width) / spread, 0
+        usable,
+        arithmetic.times(arithmetic.times(slope - first, last - slope), width) / slope_width,
+        0,
     )
     gap = gap * (1 + 16 * eps(gap)) + arithmetic.tiny(gap)
     ends = [
@@ -249,8 +251,8 @@ def _smooth(
     padded = outward(
         xp.minimum(ends[0].low, ends[1].low) - gap, xp.maximum(ends[0].high, ends[1].high) + gap, 2
     )
-    found = arithmetic.where(usable, padded, output)
-    return Relaxation((slope,), found.low, (slope,), found.high)
+    offsets = arithmetic.where(usable, padded, output)
+    return Relaxation((slope,), offsets.low, (slope,), offsets.high)
 
 
 def _at(operation: Elementwise, points: list[Array]) -> Interval:
@@ -292,9 +294,9 @@ def _relax_product(x: Interval, y: Interval) -> Relaxation:
     xp = module_of(x.low)
     middle = arithmetic.multiply(point(x.middle), point(y.middle))
     rest = arithmetic.multiply(point(x.radius), point(y.radius)).high
-    found = outward(-middle.high - rest, -middle.low + rest, 2)
-    slopes = tuple(xp.broadcast_to(side.middle, found.low.shape) for side in (y, x))
-    return Relaxation(slopes, found.low, slopes, found.high)
+    offsets = outward(-middle.high - rest, -middle.low + rest, 2)
+    slopes = tuple(xp.broadcast_to(side.middle, offsets.low.shape) for side in (y, x))
+    return Relaxation(slopes, offsets.low, slopes, offsets.high)
 
 
 def _relax_angle(operation: Elementwise, inputs: list[Interval]) -> Relaxation:

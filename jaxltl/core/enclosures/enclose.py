@@ -62,8 +62,8 @@ def enclose(
         return tree.unflatten(sides[0]), tree.unflatten(sides[1])
 
     def shaped(low: PyTree, high: PyTree) -> tuple[PyTree, PyTree]:
-        found = enclosed(*(jax.tree.map(lambda x: x[None], tree) for tree in (low, high)))
-        result: tuple[PyTree, PyTree] = jax.tree.map(lambda x: x[0], found)
+        batched = enclosed(*(jax.tree.map(lambda x: x[None], tree) for tree in (low, high)))
+        result: tuple[PyTree, PyTree] = jax.tree.map(lambda x: x[0], batched)
         return result
 
     return shaped

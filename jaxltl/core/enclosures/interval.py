@@ -72,8 +72,8 @@ def module_of(x: Array) -> Any:
 
 def size_of(x: Array) -> Array:
     """Absolute value of an array."""
-    found: Array = module_of(x).abs(x)
-    return found
+    size: Array = module_of(x).abs(x)
+    return size
 
 
 def eps(x: Array) -> float:
@@ -194,9 +194,9 @@ def sine(x: Interval, phase: float = 0.0) -> Interval:
     function = xp.cos if phase else xp.sin
     at_low, at_high = function(x.low), function(x.high)
     bounds = outward(xp.minimum(at_low, at_high), xp.maximum(at_low, at_high), ULPS["sin"])
-    far, reduction = _angle_reduction(x)
-    top = _contains_multiple(x, phase - math.pi / 2, 2 * math.pi) | far
-    bottom = _contains_multiple(x, phase + math.pi / 2, 2 * math.pi) | far
+    unreduced, reduction = _angle_reduction(x)
+    top = _contains_multiple(x, phase - math.pi / 2, 2 * math.pi) | unreduced
+    bottom = _contains_multiple(x, phase + math.pi / 2, 2 * math.pi) | unreduced
     return Interval(
         xp.where(bottom, -1.0, xp.maximum(bounds.low - reduction, -1)).astype(x.low.dtype),
         xp.where(top, 1.0, xp.minimum(bounds.high + reduction, 1)).astype(x.low.dtype),
@@ -205,8 +205,8 @@ def sine(x: Interval, phase: float = 0.0) -> Interval:
 
 def tangent(x: Interval) -> Interval:
     """Tangent: increasing between two poles; unbounded where a pole may lie inside."""
-    xp, (far, error) = module_of(x.low), _angle_reduction(x)
-    pole = _contains_multiple(x, -math.pi / 2, math.pi) | far
+    xp, (unreduced, error) = module_of(x.low), _angle_reduction(x)
+    pole = _contains_multiple(x, -math.pi / 2, math.pi) | unreduced
     bounds = monotone(xp.tan, x, ULPS["tan"])
     low, high = (xp.where(pole, 0.0, side) for side in (bounds.low, bounds.high))
     # The derivative 1 + tan^2 multiplies the error.

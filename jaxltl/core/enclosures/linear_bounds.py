@@ -81,13 +81,13 @@ class Enclosed:
     @np.errstate(all="ignore")
     def outputs(self, linear: bool) -> list[Interval]:
         """Bounds of the outputs, with `linear` by backward bounds too: arrays [C, n]."""
-        found = []
+        outputs = []
         for y in self.program.outputs:
             bounds = self.intervals[y]
             if linear and y not in self.program.known and y not in self.program.inputs:
                 bounds = intersect(bounds, backward(self, y).interval())
-            found.append(bounds)
-        return found
+            outputs.append(bounds)
+        return outputs
 
 
 @np.errstate(all="ignore")  # infinite bounds make NaN, which is no bound
@@ -114,16 +114,16 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
             values = [intervals[x] for x in operation.inputs]
             match operation:
                 case MatrixProduct():
-                    found = _product(operation.matrix, *values)
+                    bounds = _product(operation.matrix, *values)
                 case Select():
-                    found = _select(operation, values)
+                    bounds = _select(operation, values)
                 case Elementwise():
-                    found = elementwise.bounds(operation, values)
-            real = jnp.issubdtype(found.low.dtype, jnp.floating)
+                    bounds = elementwise.bounds(operation, values)
+            real = jnp.issubdtype(bounds.low.dtype, jnp.floating)
             if real and any(x in forms for x in operation.inputs):
-                forms[y] = _forward(operation, values, found, forms)
-                found = intersect(found, forms[y].interval())
-            intervals[y] = found
+                forms[y] = _forward(operation, values, bounds, forms)
+                bounds = intersect(bounds, forms[y].interval())
+            intervals[y] = bounds
         for x in operation.inputs:
             if last_use[x] == position and x not in program.outputs:
                 forms.pop(x, None)
@@ -171,13 +171,13 @@ def _product(matrix: Array, x: Interval) -> Interval:
     size = size_of(matrix).T
     middle, radius = x.middle @ matrix.T, x.radius @ size
     error = (x.magnitude @ size) * (2 * (matrix.shape[1] + 2) * eps(middle))
-    found = outward(middle - radius - error, middle + radius + error, 4)
+    bounds = outward(middle - radius - error, middle + radius + error, 4)
     finite = xp.isfinite(error)
-    low = xp.where(finite, found.low, -xp.inf)
+    low = xp.where(finite, bounds.low, -xp.inf)
     # A sum of non-negative terms is not negative: its square root has a lower bound.
     positive = (xp.min(matrix) >= 0) & (x.low >= 0).all(-1, keepdims=True)
     low = xp.where(positive, xp.maximum(low, 0), low)
-    return Interval(low, xp.where(finite, found.high, xp.inf))
+    return Interval(low, xp.where(finite, bounds.high, xp.inf))
 
 
 # --- forward --------------------------------------------------------------------------------------
@@ -219,12 +219,12 @@ def _padded(slope: Array, count: int) -> Array:
 def _forward(
     operation: Select | MatrixProduct | Elementwise,
     values: list[Interval],
-    found: Interval,
+    bounds: Interval,
     forms: Mapping[int, AffineForm],
 ) -> AffineForm:
     """The affine form of an operation's output from those of its inputs."""
     inputs = [
-        forms.get(x) or _constant(value, found.low.dtype)
+        forms.get(x) or _constant(value, bounds.low.dtype)
         for x, value in zip(operation.inputs, values, strict=True)
     ]
     if isinstance(operation, MatrixProduct):
@@ -236,7 +236,7 @@ def _forward(
         return AffineForm(*(_joined(part)[..., operation.index] for part in parts))
     if operation.name in ("add", "sub"):
         return _forward_sum(inputs[0], inputs[1], 1 if operation.name == "add" else -1)
-    return _forward_elementwise(relaxation(operation, values, found, parallel=True), inputs)
+    return _forward_elementwise(relaxation(operation, values, bounds, parallel=True), inputs)
 
 
 def _constant(x: Interval, dtype: np.dtype) -> AffineForm:
@@ -299,13 +299,13 @@ def _forward_elementwise(bounds: Relaxation, inputs: list[AffineForm]) -> Affine
 
 
 def relaxation(
-    operation: Elementwise, values: list[Interval], found: Interval, parallel: bool = False
+    operation: Elementwise, values: list[Interval], bounds: Interval, parallel: bool = False
 ) -> Relaxation:
     """Linear bounds of an elementwise operation; exact for sums and products with known numbers.
 
     With `parallel`, the slopes of both bounds are equal.
     """
-    xp, zero = module_of(found.low), found.low * 0
+    xp, zero = module_of(bounds.low), bounds.low * 0
     zero = xp.where(xp.isnan(zero), 0, zero)
     one = zero + 1
     if operation.name in ("add", "sub"):
@@ -313,12 +313,12 @@ def relaxation(
         return Relaxation(slopes, zero, slopes, zero)
     exact = operation.name == "convert_element_type" and (
         jnp.issubdtype(values[0].low.dtype, jnp.floating)
-        and not narrows(found.low.dtype, values[0].low.dtype)
+        and not narrows(bounds.low.dtype, values[0].low.dtype)
     )
     if operation.name == "neg" or exact:
         slope = -one if operation.name == "neg" else one
         return Relaxation((slope,), zero, (slope,), zero)
-    return elementwise.relax(operation, values, found, parallel)
+    return elementwise.relax(operation, values, bounds, parallel)
 
 
 # --- backward -------------------------------------------------------------------------------------
@@ -422,8 +422,8 @@ def _back_elementwise(
     state: _Coefficients, operation: Elementwise, lower: Array, upper: Array
 ) -> None:
     xp, intervals = state.xp, state.known.intervals
-    values, found = [intervals[x] for x in operation.inputs], intervals[operation.output]
-    bounds = relaxation(operation, values, found)
+    values, output = [intervals[x] for x in operation.inputs], intervals[operation.output]
+    bounds = relaxation(operation, values, output)
     state.constant(Interval(bounds.lower, bounds.upper), lower, upper)
     up, down = xp.maximum(lower, 0), xp.minimum(lower, 0)
     above, below = xp.maximum(upper, 0), xp.minimum(upper, 0)

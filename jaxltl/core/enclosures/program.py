@@ -176,11 +176,11 @@ class _Builder:
         if name in _CALLS:
             inner, outside = equation.params[_CALLS[name]], self.place
             self.place = self._place(equation)
-            found = self.inline(
+            outputs = self.inline(
                 getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs
             )
             self.place = outside
-            return found
+            return outputs
         if name == "scan":
             return self._unroll(equation, inputs)
         if len(self.operations) >= MAX_OPERATIONS:
@@ -225,9 +225,9 @@ class _Builder:
         """A primitive of known numbers."""
         with jax.ensure_compile_time_eval():
             arrays = [jnp.asarray(self.known[x]).reshape(self.shapes[x].shape) for x in inputs]
-            found = equation.primitive.bind(*arrays, **equation.params)
-        found = found if equation.primitive.multiple_results else [found]
-        return [self.constant(x) for x in found]
+            values = equation.primitive.bind(*arrays, **equation.params)
+        values = values if equation.primitive.multiple_results else [values]
+        return [self.constant(x) for x in values]
 
     def _select(self, name: str, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """Selection of entries: the primitive's own result on the entries' numbers."""
@@ -243,8 +243,8 @@ class _Builder:
             numbers.append(self._numbers(x) + start)
             start += numbers[-1].size
         known = [self.known[x].reshape(self.shapes[x].shape) for x in indices]
-        found = zip(_selection(name, equation, numbers, known), equation.outvars, strict=True)
-        return [self._selected(data, index, _spec(variable)) for index, variable in found]
+        selected = zip(_selection(name, equation, numbers, known), equation.outvars, strict=True)
+        return [self._selected(data, index, _spec(variable)) for index, variable in selected]
 
     def _numbers(self, x: int) -> np.ndarray:
         """The numbers of the entries of a variable, in its shape."""
@@ -253,9 +253,9 @@ class _Builder:
 
     def _selected(self, inputs: Sequence[int], index: Array, output: jax.ShapeDtypeStruct) -> int:
         """A new variable of some entries of the inputs."""
-        found = self.new(output)
-        self.operations.append(Select(tuple(inputs), found, np.asarray(index).reshape(-1)))
-        return found
+        y = self.new(output)
+        self.operations.append(Select(tuple(inputs), y, np.asarray(index).reshape(-1)))
+        return y
 
     def _elementwise(
         self, name: str, equation: core.JaxprEqn, inputs: list[int], output: jax.ShapeDtypeStruct
@@ -284,11 +284,11 @@ class _Builder:
         here = jax.ShapeDtypeStruct(output.shape, self.shapes[x].dtype)
         parts = np.moveaxis(self._numbers(x), axes, range(len(axes)))
         first, *others = parts.reshape(-1, math.prod(output.shape))
-        found = self._selected([x], first, here)
+        reduced = self._selected([x], first, here)
         for part in others:
-            inputs = [found, self._selected([x], part, here)]
-            found = self._elementwise(name, equation, inputs, output)
-        return found
+            inputs = [reduced, self._selected([x], part, here)]
+            reduced = self._elementwise(name, equation, inputs, output)
+        return reduced
 
     def _linear(self, equation: core.JaxprEqn, inputs: list[int], index: int) -> int:
         """A primitive that is linear in one input and knows the others, by its matrix."""
@@ -302,9 +302,9 @@ class _Builder:
                 f"{8 * rows * columns:.1e} bytes; split the array."
             )
         matrix = _matrix(equation, [self.known.get(x) for x in inputs], index)
-        found = self.new(output)
-        self.operations.append(MatrixProduct((inputs[index],), found, matrix))
-        return found
+        y = self.new(output)
+        self.operations.append(MatrixProduct((inputs[index],), y, matrix))
+        return y
 
     def _dot(self, equation: core.JaxprEqn, inputs: list[int]) -> int:
         """A dot product: with a known array a matrix; else products of entries, and their sums."""
@@ -325,9 +325,9 @@ class _Builder:
         products = self._elementwise("mul", equation, factors, full)
         rows = math.prod(output.shape)
         matrix = np.repeat(np.eye(rows, dtype=full.dtype), math.prod(full.shape) // rows, axis=1)
-        found = self.new(output)
-        self.operations.append(MatrixProduct((products,), found, matrix))
-        return found
+        y = self.new(output)
+        self.operations.append(MatrixProduct((products,), y, matrix))
+        return y
 
     def _unroll(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """The operations of each step of a scan, with slices of its arrays."""
@@ -358,12 +358,12 @@ class _Builder:
 def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
     """The equations that the outputs depend on; others, as of unused random keys, are left out."""
     needed = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
-    found = []
+    equations = []
     for equation in reversed(jaxpr.eqns):
         if not needed.isdisjoint(equation.outvars):
-            found.append(equation)
+            equations.append(equation)
             needed |= {v for v in equation.invars if isinstance(v, core.Var)}
-    return found[::-1]
+    return equations[::-1]
 
 
 def narrows(new: DTypeLike, old: DTypeLike) -> bool:
@@ -401,8 +401,8 @@ def _selection(
             place[axis] = size
         return [np.broadcast_to(x.reshape(place), p["shape"])]
     with jax.ensure_compile_time_eval():
-        found = equation.primitive.bind(*map(jnp.asarray, [*numbers, *indices]), **p)
-    return list(found) if equation.primitive.multiple_results else [found]
+        entries = equation.primitive.bind(*map(jnp.asarray, [*numbers, *indices]), **p)
+    return list(entries) if equation.primitive.multiple_results else [entries]
 
 
 def _matrix(equation: core.JaxprEqn, known: list[Array | None], index: int) -> Array:

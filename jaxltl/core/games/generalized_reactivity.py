@@ -57,10 +57,10 @@ def solve_gr1(graph: Graph, system: Array, objective: GR1, moves: Array | None =
         for j in range(num_guarantees):
             inside, counters = _keep(arena, moves, inside, counters)
             allowed = _within(arena, moves, inside)
-            found, actions[j] = _pursue(arena, j, inside, allowed)
-            against = _prevent(arena, inside, allowed, found)
-            counters = xp.where(inside & ~found, against, counters)
-            inside = found
+            reached, actions[j] = _pursue(arena, j, inside, allowed)
+            against = _prevent(arena, inside, allowed, reached)
+            counters = xp.where(inside & ~reached, against, counters)
+            inside = reached
         return inside, tuple(actions), counters, xp.any(inside != before)
 
     counters = xp.stack([first] * num_assumptions)
@@ -82,9 +82,9 @@ def _within(arena: _Arena, moves: Array, inside: Array) -> Array:
     return result
 
 
-def _near(arena: _Arena, found: Array) -> Array:
+def _near(arena: _Arena, target: Array) -> Array:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
-    result: Array = arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
+    result: Array = arena.graph.exists(target) & ~arena.graph.on_choices(arena.system)
     return result
 
 
@@ -94,43 +94,43 @@ def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array
     xp = graph.xp
 
     def body(carry: PyTree) -> PyTree:
-        found, action, _ = carry
-        near = attract(graph, found, allowed, rule=system, among=inside)
-        action = xp.where(near.region & ~found, near.action, action)
-        grown = near.region
+        reached, action, _ = carry
+        attracted = attract(graph, reached, allowed, rule=system, among=inside)
+        action = xp.where(attracted.region & ~reached, attracted.action, action)
+        grown = attracted.region
         for i in range(len(objective.assumptions)):
-            covered = _waiting(arena, i, inside, allowed, near.region, near.region)
+            covered = _waiting(arena, i, inside, allowed, attracted.region, attracted.region)
             stays = graph.first(allowed & graph.forall(covered))[1]
             action = xp.where(covered & ~grown, stays, action)
             grown = grown | covered
-        return grown, action, xp.any(grown != near.region)
+        return grown, action, xp.any(grown != attracted.region)
 
     goal = inside & objective.guarantees[j]
     start = (goal, graph.first(allowed)[1], xp.asarray(True))
-    found, action, _ = graph.repeat(body, start)
-    return found, action
+    reached, action, _ = graph.repeat(body, start)
+    return reached, action
 
 
 def _waiting(
-    arena: _Arena, i: int, inside: Array, allowed: Array, near: Array, found: Array
+    arena: _Arena, i: int, inside: Array, allowed: Array, excluded: Array, target: Array
 ) -> Array:
-    """States in which assumption i fails while the play is not near the set `found`."""
-    missed = inside & ~near
+    """States in which assumption i fails while the play is outside `excluded` and not near `target`."""
+    missed = inside & ~excluded
     forced = attract(
         arena.graph,
         ~inside | (missed & arena.objective.assumptions[i]),
-        allowed & ~_near(arena, found),
+        allowed & ~_near(arena, target),
         rule=~arena.system,
         among=missed,
     )
     return inside & ~forced.region
 
 
-def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Array:
+def _prevent(arena: _Arena, inside: Array, allowed: Array, target: Array) -> Array:
     """Moves of the environment, ``int32[M, S]``, that meet every assumption and avoid a set."""
     graph, system, objective = arena
-    missed = inside & ~found
-    allowed = allowed & ~_near(arena, found)
+    missed = inside & ~target
+    allowed = allowed & ~_near(arena, target)
     moves = []
     for assumption in objective.assumptions:
         goal = missed & assumption
@@ -153,19 +153,19 @@ def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:
         goal = region & objective.guarantees[j]
 
         def body(carry: PyTree, goal: Array = goal) -> PyTree:
-            found, rounds, n, _ = carry
-            leads = allowed & graph.exists(found)
+            reached, rounds, n, _ = carry
+            leads = allowed & graph.exists(reached)
             some, all_ = graph.first(leads)[0], ~graph.first(allowed & ~leads)[0]
-            near = goal | (region & xp.where(system, some, all_))
+            excluded = goal | (region & xp.where(system, some, all_))
             covered = xp.stack(
                 [
-                    _waiting(arena, i, region, allowed, near, found)
+                    _waiting(arena, i, region, allowed, excluded, reached)
                     for i in range(len(objective.assumptions))
                 ]
             )
             rounds = xp.where(covered & (rounds == NEVER), n, rounds)
-            grown = found | covered.any(0)
-            return grown, rounds, n + 1, xp.any(grown != found)
+            grown = reached | covered.any(0)
+            return grown, rounds, n + 1, xp.any(grown != reached)
 
         none = xp.zeros(graph.state_shape, bool)
         rounds = xp.full((len(objective.assumptions), *graph.state_shape), NEVER, np.int32)

@@ -318,11 +318,11 @@ def gr1(
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
-        found: list[Array] = [
+        masks: list[Array] = [
             states_with_label(game, x, f"{name}[{i}]") for i, x in enumerate(sets)
         ]
-        xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
-        return jax_array(xp.stack(found))
+        xp, *masks = namespace(*masks or [np.ones(game.state_shape, bool)])
+        return jax_array(xp.stack(masks))
 
     _, inside = namespace(states_with_label(game, safe, "safe"))
     return GR1(

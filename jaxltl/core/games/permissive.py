@@ -129,10 +129,10 @@ def permissive_strategy(
     world, objective = jax.tree.map(np.asarray, (world, goal))
     if isinstance(objective, Parity) and not _closed(graph, objective.won):
         world, objective, origin = _remember_won(world, objective)
-        found = permissive_strategy(world, objective, method=method, bound=bound)
-        state = np.asarray(found.base_state)
+        strategy = permissive_strategy(world, objective, method=method, bound=bound)
+        state = np.asarray(strategy.base_state)
         return replace(
-            found,
+            strategy,
             base_state=to_jax(origin.base_state[state]),
             automaton_state=to_jax(origin.memory[state]),
         )
@@ -228,10 +228,10 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
         return jax_array(xp.where(inside | ~some, policy, first.astype(policy.dtype)))
     if policy.shape != allowed.shape:
         raise ValueError(f"policy has shape {policy.shape}; the mask has {allowed.shape}.")
-    kept = xp.where(allowed, policy, 0)
-    total = kept.sum(-1, keepdims=True)
+    masked = xp.where(allowed, policy, 0)
+    total = masked.sum(-1, keepdims=True)
     uniform = (allowed / xp.maximum(allowed.sum(-1, keepdims=True), 1)).astype(policy.dtype)
-    shielded = xp.where(total > 0, kept / xp.where(total > 0, total, 1), uniform)
+    shielded = xp.where(total > 0, masked / xp.where(total > 0, total, 1), uniform)
     return jax_array(xp.where(some[..., None], shielded, policy))
 
 
@@ -335,10 +335,10 @@ def _explicit(
     if not _is_lazy(game):
         return arena, None
     start = np.where(region, game.initial, 0)
-    found = jax.tree.map(np.asarray, restrict(game, start / start.sum(), allowed=mask))
-    origin = found.base_state * game.state_shape[1] + found.memory
-    model = found.model
-    return _Arena(model, concrete_graph(model), _at(objective, origin)), found
+    restriction = jax.tree.map(np.asarray, restrict(game, start / start.sum(), allowed=mask))
+    origin = restriction.base_state * game.state_shape[1] + restriction.memory
+    model = restriction.model
+    return _Arena(model, concrete_graph(model), _at(objective, origin)), restriction
 
 
 def _at(objective: Parity | GR1, origin: np.ndarray) -> PyTree:
@@ -382,14 +382,16 @@ def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restrict
     objective = _at(objective, first.base_state * width + first.memory)
     game = first.model
     joint = _beside(game, np.array([[0, 1], [1, 1]]), 0, objective.won, "exit")
-    found = jax.tree.map(np.asarray, restrict(joint))
+    restriction = jax.tree.map(np.asarray, restrict(joint))
     origin = Restriction(
-        found.model, first.base_state[found.base_state], first.memory[found.base_state]
+        restriction.model,
+        first.base_state[restriction.base_state],
+        first.memory[restriction.base_state],
     )
-    objective = _at(objective, found.base_state)
-    won = found.memory == 1
+    objective = _at(objective, restriction.base_state)
+    won = restriction.memory == 1
     return (
-        found.model,
+        restriction.model,
         Parity(
             priority=np.where(won, 0, objective.priority),
             won=won,
@@ -411,8 +413,8 @@ def _by_rank(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Pe
     if not _is_buchi(objective):
         raise ValueError('method="rank" is for Buchi and GR(1) objectives; choose parity.')
     goal = region & (objective.priority == 0)
-    near: PyTree = attract(graph, goal, stay, rule=game.system, among=region)
-    nearer = _some_nearer(graph, near.rank, region) | goal[..., None]
+    attracted: PyTree = attract(graph, goal, stay, rule=game.system, among=region)
+    nearer = _some_nearer(graph, attracted.rank, region) | goal[..., None]
     mask = stay & (nearer | ~game.system[..., None])
     return _on(
         game,
@@ -552,8 +554,8 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
     for p in range(num_priorities):
         digits = (p + 1) // 2  # odd priorities up to p
         scale = unit[digits - 1] if digits else total
-        left = number // scale - p % 2
-        delta[:-1, p] = np.where(left >= 0, left * scale + scale - 1, total)
+        remaining = number // scale - p % 2
+        delta[:-1, p] = np.where(remaining >= 0, remaining * scale + scale - 1, total)
     return delta
 
 
@@ -568,14 +570,14 @@ def _safe_beside(
     spent = np.arange(joint.state_shape[1]) == joint.state_shape[1] - 1
     # The objective itself still counts: the environment may move for ever where the system
     # does not, and then no counter of the system's moves runs out.
-    kept = Parity(
+    safe = Parity(
         priority=np.broadcast_to(objective.priority[:, None], joint.state_shape),
         won=np.zeros(joint.state_shape, bool),
         lost=spent | objective.lost[:, None],
         num_priorities=objective.num_priorities,
     )
     graph = concrete_graph(joint)
-    region = _region(_Arena(joint, graph, kept))
+    region = _region(_Arena(joint, graph, safe))
     if not _wins_somewhere(joint, region):
         if bound is None:
             raise ValueError(

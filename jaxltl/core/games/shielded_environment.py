@@ -101,7 +101,7 @@ def shield_environment(
         guide = _guide(strategy)
         _require_actions(guide.allowed, environment.actions.num)
         _require_places(environment, place, 1)
-        made = replace(
+        shielded = replace(
             environment,
             reset=Partial(_reset, guide, place, environment.reset),
             step=Partial(_step, guide, place, environment.step),
@@ -123,8 +123,12 @@ def shield_environment(
             )
         _require_actions(mask, environment.actions.num)
         _require_places(environment, place, mask.ndim - 1)
-        made = replace(environment, allowed=Partial(_looked_up, mask, place, environment.allowed))
-    return make_environment(**{field.name: getattr(made, field.name) for field in fields(made)})
+        shielded = replace(
+            environment, allowed=Partial(_looked_up, mask, place, environment.allowed)
+        )
+    return make_environment(
+        **{field.name: getattr(shielded, field.name) for field in fields(shielded)}
+    )
 
 
 def _require_actions(mask: Array, num_actions: int) -> None:
@@ -136,13 +140,13 @@ def _require_actions(mask: Array, num_actions: int) -> None:
 
 
 def _require_places(environment: Environment, place: Callable[..., PyTree], count: int) -> None:
-    found = jax.eval_shape(lambda key: place(environment.reset(key)), jax.random.key(0))
-    parts = found if isinstance(found, tuple) else (found,)
+    states = jax.eval_shape(lambda key: place(environment.reset(key)), jax.random.key(0))
+    parts = states if isinstance(states, tuple) else (states,)
     if len(parts) != count or any(
         not hasattr(x, "dtype") or x.shape != () or x.dtype.kind not in "iu" for x in parts
     ):
         raise ValueError(
-            f"state_of returns {found}; return {'an integer' if count == 1 else 'a tuple of '}"
+            f"state_of returns {states}; return {'an integer' if count == 1 else 'a tuple of '}"
             f"{'' if count == 1 else f'{count} integers'}, the state of the model that a world is."
         )
 
@@ -157,13 +161,13 @@ def _guide(strategy: Permissive | Winning) -> _Guide:
         strategy = Permissive(
             strategy.game, strategy.region, allowed, every, every, False, "what stays"
         )
-    found = apply_strategy(strategy)
-    game = found.model
+    restriction = apply_strategy(strategy)
+    game = restriction.model
     if not isinstance(game.mdp, MDP):
         raise ValueError("a shield needs successor lists; convert the world by to_padded.")
     used = np.asarray(game.mdp.successor_probability) > 0
     successor = np.asarray(game.mdp.successor)
-    base = np.asarray(strategy.base_state)[np.asarray(found.base_state)]
+    base = np.asarray(strategy.base_state)[np.asarray(restriction.base_state)]
     after = np.where(used, successor, -1).reshape(len(base), -1)
     after = -np.sort(-after, axis=1)  # padding to the end
     return _Guide(
@@ -204,8 +208,8 @@ def _step(
     action: PyTree,
     key: chex.PRNGKey,
 ) -> Timestep:
-    found = Timestep(*step(before.world, action, key))
-    return found._replace(world=_follow(guide, place, before.state, found.world))
+    timestep = Timestep(*step(before.world, action, key))
+    return timestep._replace(world=_follow(guide, place, before.state, timestep.world))
 
 
 def _outcomes(
@@ -215,9 +219,9 @@ def _outcomes(
     before: ShieldedWorld,
     action: PyTree,
 ) -> tuple[Timestep, jax.Array]:
-    found, probability = outcomes(before.world, action)
-    worlds = jax.vmap(lambda world: _follow(guide, place, before.state, world))(found[0])
-    return Timestep(*found)._replace(world=worlds), probability
+    timesteps, probability = outcomes(before.world, action)
+    worlds = jax.vmap(lambda world: _follow(guide, place, before.state, world))(timesteps[0])
+    return Timestep(*timesteps)._replace(world=worlds), probability
 
 
 def _follow(

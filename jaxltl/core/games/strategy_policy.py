@@ -80,9 +80,9 @@ def explored(strategy: Winning | Permissive, player: str = "system") -> Explored
     """The part of a game that a player's strategy reaches from the initial states that it wins."""
     validation.choice("player", player, ("system", "environment"))
     if isinstance(strategy, Permissive):
-        found, region = strategy, np.asarray(strategy.region)
-        base, old = np.asarray(found.base_state), np.asarray(found.automaton_state)
-        game, allowed = found.game, np.asarray(found.allowed)
+        permissive, region = strategy, np.asarray(strategy.region)
+        base, old = np.asarray(permissive.base_state), np.asarray(permissive.automaton_state)
+        game, allowed = permissive.game, np.asarray(permissive.allowed)
         if player != "system":
             raise ValueError("player: a permissive strategy is the system's.")
     else:
@@ -96,18 +96,18 @@ def explored(strategy: Winning | Permissive, player: str = "system") -> Explored
     return Explored(part.model, base[at], memory if not old.any() else key.ravel())
 
 
-def _moves(found: Winning, system: bool) -> tuple[Game, Booleans, Booleans, Integers, Integers]:
+def _moves(winning: Winning, system: bool) -> tuple[Game, Booleans, Booleans, Integers, Integers]:
     """The game with the strategy's memory, region and moves; world and automaton states."""
-    game, region = found.game, np.asarray(found.region) == system
-    action = np.asarray(found.action if system else found.counter_action)
+    game, region = winning.game, np.asarray(winning.region) == system
+    action = np.asarray(winning.action if system else winning.counter_action)
     base = np.arange(base_model(game.mdp).num_states)
     old = np.zeros_like(base)
-    goal = found.objective
+    goal = winning.objective
     if isinstance(goal, GR1):
         if isinstance(game.mdp, Product):  # its nodes, as states
             part = restrict(game, np.full(game.state_shape, 1 / game.num_states))
             base, old = np.asarray(part.base_state), np.asarray(part.memory)
-            number, game = base * found.game.state_shape[1] + old, part.model
+            number, game = base * winning.game.state_shape[1] + old, part.model
             goal = objective_at(goal, number)
             region = region.ravel()[number]
             action = action.reshape(-1, action.shape[-1])[number]
@@ -138,15 +138,15 @@ def policy_of_nodes(
     for memory in (part.memory, np.arange(len(state))):
         count = int(memory.max()) + 1
         if np.unique(state[real] * count + memory[real]).size == real.sum():
-            found = _updates(memory, source, target, state)
-            if found is not None:
+            updates = _updates(memory, source, target, state)
+            if updates is not None:
                 break
     else:
         raise ValueError(
             "the strategy's memory depends on more than the states that are met: on which random "
             "move an adversary has resolved. Solve the game with chance='random'."
         )
-    label_on, read, before, after = found
+    label_on, read, before, after = updates
     automatic = task is not None and memory is part.memory and label_on == task.label_on
     automatic = automatic and task is not None and count <= task.num_memory
     count = task.num_memory if task is not None and automatic else count

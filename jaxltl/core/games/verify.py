@@ -171,10 +171,10 @@ def _refute_system(claim: _Claim) -> str:
         node, action = int(play.owner[pair]), int(claim.moves.action[pair // memories])
         who = "strategy's" if claim.system[node // memories] else "environment's"
         return f"from {_where(claim, play, node)} the {who} action {action} leaves the region"
-    for avoid, meet, what in _failures(claim):
-        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
-        if found is not None:
-            return f"around {_where(claim, play, found)} the run can {what}"
+    for avoid, meet, reason in _failures(claim):
+        witness = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if witness is not None:
+            return f"around {_where(claim, play, witness)} the run can {reason}"
     return ""
 
 
@@ -190,11 +190,11 @@ def _refute_environment(claim: _Claim) -> str:
     play = _fix(claim, ~claim.system, claim.counter_action, claim.assumptions)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
-    for avoid, meet, what in _successes(claim):
-        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
-        if found is not None:
-            where = _where(claim, play, found)
-            return f"around {where}, outside the region, the system can {what}"
+    for avoid, meet, reason in _successes(claim):
+        node = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if node is not None:
+            where = _where(claim, play, node)
+            return f"around {where}, outside the region, the system can {reason}"
     # No component outside the region is a success, so all that is left is to enter the region.
     goal = np.repeat(claim.region & ~claim.lost, memories)
     entering = _almost_surely(play, goal, node_in)
@@ -282,12 +282,12 @@ def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _
     memories = len(goals)
     memory = np.arange(memories)
     after = np.where(goals.T, (memory + 1) % memories, memory)  # [S, memories]
-    kept = ~owner[moves.state, None] | (action[moves.state] == moves.action[:, None])
-    kept = kept[moves.move]
+    allowed = ~owner[moves.state, None] | (action[moves.state] == moves.action[:, None])
+    allowed = allowed[moves.move]
     state = moves.state[moves.move]
-    source = (state[:, None] * memories + memory)[kept]
-    pair = (moves.move[:, None] * memories + memory)[kept]
-    target = (moves.successor[:, None] * memories + after[state])[kept]
+    source = (state[:, None] * memories + memory)[allowed]
+    pair = (moves.move[:, None] * memories + memory)[allowed]
+    target = (moves.successor[:, None] * memories + after[state])[allowed]
     nodes = owner.size * memories
     order = np.argsort(target, kind="stable")
     start = np.searchsorted(target[order], np.arange(nodes + 1))
@@ -308,10 +308,10 @@ def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
     if not inside.any():
         return None
     label = _end_components(play, inside)
-    found = np.unique(label[label >= 0])
+    labels = np.unique(label[label >= 0])
     for met in np.repeat(meet, play.memories, axis=1):
-        found = np.intersect1d(found, label[met & (label >= 0)])
-    return int(np.flatnonzero(label == found[0])[0]) if found.size else None
+        labels = np.intersect1d(labels, label[met & (label >= 0)])
+    return int(np.flatnonzero(label == labels[0])[0]) if labels.size else None
 
 
 def _end_components(play: _Play, inside: Booleans) -> Integers:

@@ -122,12 +122,12 @@ def winning_region(
     """
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
-    given = as_game(game) if chance == "random" else as_padded_game(game)
-    given, objective = on_states(given, spec)
+    arena = as_game(game) if chance == "random" else as_padded_game(game)
+    arena, objective = on_states(arena, spec)
     if chance == "adversarial":
-        given, origin = adversarial_chance(given)
+        arena, origin = adversarial_chance(arena)
         objective = objective_at(objective, origin)
-    return solve(given, objective)
+    return solve(arena, objective)
 
 
 def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
@@ -136,13 +136,13 @@ def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -
     graph = graph_of(form, objective, moves)
     owner, goal, moves = take(graph, (form.system, _flat(form, objective), moves))
     if isinstance(objective, GR1):
-        found: Sequence[Array] = solve_gr1(graph, owner, goal, moves)
+        arrays: Sequence[Array] = solve_gr1(graph, owner, goal, moves)
     else:
         region, action = solve_parity(graph, owner, goal, moves)
-        found = region, action, action
+        arrays = region, action, action
     if form.state_shape != game.state_shape:
-        found = [x.reshape(*game.state_shape, *x.shape[1:]) for x in found]
-    return Winning(game, objective, *to_jax(tuple(found)))
+        arrays = [x.reshape(*game.state_shape, *x.shape[1:]) for x in arrays]
+    return Winning(game, objective, *to_jax(tuple(arrays)))
 
 
 def _flat(form: Game, objective: Parity | GR1) -> PyTree:
@@ -281,19 +281,19 @@ def _even(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _
     here = open_ & (objective.priority == p)
 
     def body(carry: PyTree) -> PyTree:
-        inside, found, _ = carry
+        inside, solution, _ = carry
         # The environment can force the play out with positive probability.
-        left = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
-        action = xp.where(inside & left.region, left.action, found.action)
-        inside = inside & ~left.region
+        escaped = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
+        action = xp.where(inside & escaped.region, escaped.action, solution.action)
+        inside = inside & ~escaped.region
         good = _Found(won.region | (here & inside), action)
         deeper = _level(arena, p + 1, good, open_ & ~here & inside, allowed)
         return deeper.region, deeper, xp.any(deeper.region != inside)
 
     inside = won.region | open_
-    inside, found, _ = graph.repeat(body, (inside, won, xp.asarray(True)))
+    inside, solution, _ = graph.repeat(body, (inside, won, xp.asarray(True)))
     stays = graph.first(allowed & graph.forall(inside))[1]
-    return _Found(inside, xp.where(here & inside & system, stays, found.action))
+    return _Found(inside, xp.where(here & inside & system, stays, solution.action))
 
 
 def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
@@ -305,17 +305,17 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _F
     allowed = allowed & (graph.forall(won.region | open_) | ~graph.on_choices(system))
 
     def body(carry: PyTree) -> PyTree:
-        found, _ = carry
-        drawn = attract(graph, found.region, allowed, rule=system, among=open_)
-        new = drawn.region & ~found.region & system
-        near = _Found(drawn.region, xp.where(new, drawn.action, found.action))
-        remain = open_ & ~here & ~near.region
+        solution, _ = carry
+        drawn = attract(graph, solution.region, allowed, rule=system, among=open_)
+        new = drawn.region & ~solution.region & system
+        attracted = _Found(drawn.region, xp.where(new, drawn.action, solution.action))
+        remain = open_ & ~here & ~attracted.region
         # The environment's other moves help the system.
-        closer = graph.exists(near.region) & ~graph.on_choices(system)
-        deeper = _level(arena, p + 1, near, remain, allowed & ~closer)
-        return deeper, xp.any(deeper.region != near.region)
+        closer = graph.exists(attracted.region) & ~graph.on_choices(system)
+        deeper = _level(arena, p + 1, attracted, remain, allowed & ~closer)
+        return deeper, xp.any(deeper.region != attracted.region)
 
-    found, _ = graph.repeat(body, (won, xp.asarray(True)))
-    avoids = graph.first(allowed & ~graph.exists(found.region))[1]
-    refused = here & ~found.region & ~system
-    return _Found(found.region, xp.where(refused, avoids, found.action))
+    solution, _ = graph.repeat(body, (won, xp.asarray(True)))
+    avoids = graph.first(allowed & ~graph.exists(solution.region))[1]
+    refused = here & ~solution.region & ~system
+    return _Found(solution.region, xp.where(refused, avoids, solution.action))

@@ -109,8 +109,8 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
             a = xp.asarray(a)
             if a.dtype.kind in "iu":
                 return a
-            found = function(a)
-            return xp.where(xp.abs(found) < 2**53, found, _UNDEFINED).astype(dtype)
+            number = function(a)
+            return xp.where(xp.abs(number) < 2**53, number, _UNDEFINED).astype(dtype)
 
         return rounded
 

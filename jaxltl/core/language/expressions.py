@@ -59,9 +59,9 @@ class Expression:
         object.__setattr__(self, "depth", depth + 1)
         object.__setattr__(self, "size", size)
         if depth >= MAX_DEPTH or size > MAX_SIZE:
-            what = f"deeper than {MAX_DEPTH}" if depth >= MAX_DEPTH else f"larger than {MAX_SIZE}"
+            fault = f"deeper than {MAX_DEPTH}" if depth >= MAX_DEPTH else f"larger than {MAX_SIZE}"
             raise LanguageError(
-                self.place, f"the expression is {what} with its formulas; simplify it."
+                self.place, f"the expression is {fault} with its formulas; simplify it."
             )
 
     @property
@@ -128,10 +128,10 @@ _SIGNATURES: dict[str, tuple[Type, Type | None]] = {  # of operands and values, 
 
 
 def _type(e: Expression, types: Mapping[str, Type], known: dict[int, Type]) -> Type:
-    if (found := known.get(id(e))) is None:
+    if (type_ := known.get(id(e))) is None:
         parts = [_type(x, types, known) for x in e.operands]
-        found = known[id(e)] = _node_type(e, parts, types)
-    return found
+        type_ = known[id(e)] = _node_type(e, parts, types)
+    return type_
 
 
 def _node_type(e: Expression, parts: list[Type], types: Mapping[str, Type]) -> Type:
@@ -194,17 +194,17 @@ def substitute(
       '3'
     """
     memory = {} if memory is None else memory
-    if (found := memory.get(id(expression))) is not None:
-        return found
+    if (result := memory.get(id(expression))) is not None:
+        return result
     if expression.operator == "name":
-        found = names.get(str(expression.value), expression)
+        result = names.get(str(expression.value), expression)
     elif not expression.operands:
-        found = expression
+        result = expression
     else:
         parts = tuple([substitute(x, names, memory) for x in expression.operands])
-        found = _simplified(expression, parts)
-    memory[id(expression)] = found
-    return found
+        result = _simplified(expression, parts)
+    memory[id(expression)] = result
+    return result
 
 
 def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
@@ -231,9 +231,9 @@ def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
     return Expression(operator, parts, e.value, e.place)
 
 
-def names_in(expression: Expression, found: set[str] | None = None) -> set[str]:
+def names_in(expression: Expression, names: set[str] | None = None) -> set[str]:
     """The names that occur in an expression."""
-    found = set() if found is None else found
+    names = set() if names is None else names
     stack, seen = [expression], set()
     while stack:
         e = stack.pop()
@@ -241,9 +241,9 @@ def names_in(expression: Expression, found: set[str] | None = None) -> set[str]:
             continue
         seen.add(id(e))
         if e.operator == "name":
-            found.add(str(e.value))
+            names.add(str(e.value))
         stack.extend(e.operands)
-    return found
+    return names
 
 
 def conjuncts(expression: Expression) -> list[Expression]:
@@ -265,8 +265,8 @@ def apply(operator: str, values: list[Any], place: int = -1) -> Value:
     try:
         result: Value = SCALAR[operator](*values)
     except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-        shown = ", ".join(str(x) for x in values)
-        raise LanguageError(place, f"{operator} of {shown} is not defined: {error}.") from None
+        arguments = ", ".join(str(x) for x in values)
+        raise LanguageError(place, f"{operator} of {arguments} is not defined: {error}.") from None
     if isinstance(result, int) and not isinstance(result, bool) and abs(result) > MAX_INTEGER:
         raise LanguageError(place, f"an integer of {operator} is larger than 2^53.")
     return result

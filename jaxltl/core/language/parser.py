@@ -73,21 +73,21 @@ class ExpressionParser(TokenReader):
         self.nesting += 1
         if self.nesting > _MAX_NESTING:
             raise LanguageError(self.place, f"parentheses are nested deeper than {_MAX_NESTING}.")
-        found = self._climb(level)
+        tree = self._climb(level)
         if level == 0 and self.texts[self.at] == "?":
             self.at += 1
             then = self.expression()
             self.expect(":", " of a conditional expression")
-            found = Expression("?:", (found, then, self.expression()), place=found.place)
+            tree = Expression("?:", (tree, then, self.expression()), place=tree.place)
         self.nesting -= 1
-        return found
+        return tree
 
     def whole(self) -> Expression:
         """The expression that is the rest of the text."""
-        found = self.expression()
+        tree = self.expression()
         if self.kinds[self.at] != "end":
             self.fail("an operator or the end")
-        return found
+        return tree
 
     def _climb(self, level: int) -> Expression:
         left = self._prefix(level)
@@ -144,9 +144,9 @@ class ExpressionParser(TokenReader):
             return Expression("name", value=f'"{self.quoted("a label")}"', place=place)
         if not self.accept("("):
             self.fail("an expression, such as a variable or a number")
-        found = self.expression()
+        inner = self.expression()
         self.expect(")", " or an operator")
-        return found
+        return inner
 
     def _word(self, text: str, place: int) -> Expression:
         """A literal, a name, or the call of a function."""
@@ -166,10 +166,10 @@ class ExpressionParser(TokenReader):
             raise LanguageError(place, f"{text} is no function; there are {', '.join(FUNCTIONS)}.")
         operands = self.separated(self.expression)
         self.expect(")", " or ','")
-        least, most = FUNCTIONS[text]
-        if not least <= len(operands) <= most:
+        least, limit = FUNCTIONS[text]
+        if not least <= len(operands) <= limit:
             raise LanguageError(
-                place, f"{text} takes {most} argument{'s' * (most != 1)}, not {len(operands)}."
+                place, f"{text} takes {limit} argument{'s' * (limit != 1)}, not {len(operands)}."
             )
         return Expression(text, tuple(operands), place=place)
 
@@ -262,20 +262,20 @@ class _ProgramParser(ExpressionParser):
             raise LanguageError(self.starts[self.at - 1], "the type of the model is given twice.")
         self.syntax.kind, self.has_type = _KINDS[self.texts[self.at - 1]], True
 
-    def name(self, what: str) -> tuple[str, int]:
+    def name(self, expected: str) -> tuple[str, int]:
         """A name that is no keyword, and its place."""
         place = self.place
-        found = self.word(what)
-        if found in _RESERVED:
+        name = self.word(expected)
+        if name in _RESERVED:
             self.at -= 1
-            self.fail(f"{what}; {found} is a keyword")
-        return found, place
+            self.fail(f"{expected}; {name} is a keyword")
+        return name, place
 
     def action(self) -> str:
         """The action after an opening bracket, "" for none."""
-        found = "" if self.texts[self.at] == "]" else self.name("the name of an action")[0]
+        action = "" if self.texts[self.at] == "]" else self.name("the name of an action")[0]
         self.expect("]", " after the action")
-        return found
+        return action
 
     def constant(self) -> None:
         type_: Type = "int"
@@ -290,12 +290,12 @@ class _ProgramParser(ExpressionParser):
         self.expect(";", " at the end of a constant")
         self.syntax.constants.append(Constant(name, type_, expression, place))
 
-    def defined(self, what: str) -> Expression:
+    def defined(self, kind: str) -> Expression:
         """The expression of a formula or a label."""
         self.expect("=")
-        found = self.expression()
-        self.expect(";", f" at the end of a {what}")
-        return found
+        definition = self.expression()
+        self.expect(";", f" at the end of a {kind}")
+        return definition
 
     def formula(self) -> None:
         name, _ = self.name("the name of a formula")
@@ -356,21 +356,21 @@ class _ProgramParser(ExpressionParser):
         self.syntax.modules.append(Module(name, tuple(declarations), tuple(commands), place))
 
     def renaming(self) -> tuple[tuple[str, str], ...]:
-        found: dict[str, str] = {}
+        renaming: dict[str, str] = {}
 
         def pair() -> None:
             place = self.place
             old = self.word("a name to be replaced")
             self.expect("=")
-            if old in found:
+            if old in renaming:
                 raise LanguageError(place, f"{old} is renamed twice.")
-            found[old], _ = self.name("a new name")
+            renaming[old], _ = self.name("a new name")
 
         self.expect("[")
         self.separated(pair)
         self.expect("]", " or ','")
         self.expect("endmodule")
-        return tuple(found.items())
+        return tuple(renaming.items())
 
     def command(self) -> Command:
         place = self.place
@@ -402,8 +402,8 @@ class _ProgramParser(ExpressionParser):
         return Outcome(lower, upper, self.update())
 
     def update(self) -> tuple[Assignment, ...]:
-        found = self.separated(self.assignment, "&")
-        return tuple(a for a in found if a is not None)
+        assignments = self.separated(self.assignment, "&")
+        return tuple(a for a in assignments if a is not None)
 
     def assignment(self) -> Assignment | None:
         if self.accept("true"):
@@ -412,9 +412,9 @@ class _ProgramParser(ExpressionParser):
         name, place = self.name("a variable")
         self.expect("'", " after the variable that is assigned")
         self.expect("=")
-        found = Assignment(name, self.expression(), place)
+        assignment = Assignment(name, self.expression(), place)
         self.expect(")", " or an operator")
-        return found
+        return assignment
 
     def reward_structure(self) -> None:
         place = self.starts[self.at - 1]
@@ -440,17 +440,17 @@ class _ProgramParser(ExpressionParser):
         place = self.place
         quoted = self.kinds[self.at] == "quoted"
         name = self.quoted("a name") if quoted else self.name("the name of a player")[0]
-        found: dict[str, list[str]] = {"module": [], "action": []}
+        members: dict[str, list[str]] = {"module": [], "action": []}
 
         def controlled() -> None:
             if self.accept("["):
-                found["action"].append(self.name("an action")[0])
+                members["action"].append(self.name("an action")[0])
                 self.expect("]")
             else:
-                found["module"].append(self.name("a module or an action in brackets")[0])
+                members["module"].append(self.name("a module or an action in brackets")[0])
 
         self.separated(controlled)
         self.expect("endplayer", " or ','")
         self.syntax.players.append(
-            Player(name, tuple(found["module"]), tuple(found["action"]), place)
+            Player(name, tuple(members["module"]), tuple(members["action"]), place)
         )

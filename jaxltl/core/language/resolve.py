@@ -67,9 +67,9 @@ def read_program(
 
 def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Program:
     """The program of a syntax tree; arguments, result and errors as of :func:`read_program`."""
-    given = {key: constant_value(key, value) for key, value in (constants or {}).items()}
+    values = {key: constant_value(key, value) for key, value in (constants or {}).items()}
     try:
-        return _Resolver(syntax, given).program()
+        return _Resolver(syntax, values).program()
     except LanguageError as error:
         raise syntax.source.located(error) from None
 
@@ -78,12 +78,12 @@ def constant_value(name: str, value: object) -> Value:
     """A value that is given for a constant: a number, a Boolean, or the text of one."""
     if isinstance(value, str):
         try:
-            found = substitute(ExpressionParser(value).whole(), {})
+            expression = substitute(ExpressionParser(value).whole(), {})
         except LanguageError as error:
             raise ValueError(f"constant {name} = {value!r}: {error.message}") from None
-        if not found.is_literal:
+        if not expression.is_literal:
             raise ValueError(f"constant {name} = {value!r}; give a number, true or false.")
-        value = found.value
+        value = expression.value
     if isinstance(value, bool):
         return value
     if hasattr(value, "item"):
@@ -95,24 +95,24 @@ def constant_value(name: str, value: object) -> Value:
 
 def _changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None) -> Tree:
     """Applies a function to the expressions of a tree, and renames its actions and variables."""
-    found: object = tree
+    result: object = tree
     if isinstance(tree, Expression):
-        found = change(tree)
+        result = change(tree)
     elif isinstance(tree, tuple):
-        found = tuple([_changed(x, change, names) for x in tree])
+        result = tuple([_changed(x, change, names) for x in tree])
     elif isinstance(tree, str):
-        found = (names or {}).get(tree, tree)
+        result = (names or {}).get(tree, tree)
     elif is_dataclass(tree) and not isinstance(tree, type):
         parts = {f.name: _changed(getattr(tree, f.name), change, names) for f in fields(tree)}
-        found = type(tree)(**parts)
-    return cast(Tree, found)
+        result = type(tree)(**parts)
+    return cast(Tree, result)
 
 
 class _Resolver:
     """Stages of the resolution; each method is one stage."""
 
-    def __init__(self, syntax: Syntax, given: Mapping[str, Value]) -> None:
-        self.syntax, self.given = syntax, given
+    def __init__(self, syntax: Syntax, values: Mapping[str, Value]) -> None:
+        self.syntax, self.given = syntax, values
         self.table = {c.name: c for c in syntax.constants}
 
     def program(self) -> Program:
@@ -158,18 +158,18 @@ class _Resolver:
     def renamed(
         self, modules: Sequence[Module | RenamedModule], formulas: Mapping[str, Expression]
     ) -> list[Module]:
-        found: dict[str, Module] = {}
+        by_name: dict[str, Module] = {}
         for m in sorted(modules, key=lambda m: isinstance(m, RenamedModule)):  # copies last
-            if m.name in found:
+            if m.name in by_name:
                 raise LanguageError(m.place, f"there are two modules {m.name}.")
             if isinstance(m, RenamedModule):
-                if m.base not in found:
+                if m.base not in by_name:
                     raise LanguageError(
                         m.place, f"there is no module {m.base} of which {m.name} could be a copy."
                     )
-                m = _renamed(found[m.base], m, formulas)
-            found[m.name] = m
-        return [found[m.name] for m in modules]
+                m = _renamed(by_name[m.base], m, formulas)
+            by_name[m.name] = m
+        return [by_name[m.name] for m in modules]
 
     def check_names(self, modules: Sequence[Module]) -> None:
         """Raises LanguageError if two constants, formulas or variables have one name."""
@@ -190,7 +190,7 @@ class _Resolver:
         table = self.table
         texts = {c.name: expand(c.expression) for c in table.values() if c.expression is not None}
         order = _in_order(texts, "constant", {c.name: c.place for c in table.values()})
-        found: dict[str, Value] = {}
+        values: dict[str, Value] = {}
         known: dict[str, Expression] = {}
         types: dict[str, Type] = {c.name: c.type for c in table.values()}
         for name in (*self.given, *order):
@@ -202,13 +202,13 @@ class _Resolver:
             else:
                 e = literal(self.given[name])
             if e.is_literal:
-                found[name] = _typed(table[name], e.value)
-                e = literal(found[name])
+                values[name] = _typed(table[name], e.value)
+                e = literal(values[name])
             for missing in sorted(names_in(e) & table.keys()):
                 if types[name] != "double" or types[missing] != "double":
                     raise LanguageError(table[name].place, _no_value(missing))
             known[name] = e
-        return found, known
+        return values, known
 
     def variable(self, d: Declaration, module: int | None) -> Variable:
         if d.initial is not None and self.syntax.initial is not None:
@@ -250,13 +250,13 @@ def _check_distinct(names: Sequence[tuple[str, int]], message: str) -> None:
 
 
 def _expanded(
-    items: Sequence[tuple[str, Expression]], what: str, known: Mapping[str, Expression]
+    items: Sequence[tuple[str, Expression]], kind: str, known: Mapping[str, Expression]
 ) -> dict[str, Expression]:
     """Expressions by name, which may use each other; LanguageError for a circle."""
     places = [(name, e.place) for name, e in items]
-    _check_distinct(places, f"the {what} {{}} is defined twice.")
+    _check_distinct(places, f"the {kind} {{}} is defined twice.")
     table, done = dict(items), dict(known)
-    for name in _in_order(table, what, dict(places)):
+    for name in _in_order(table, kind, dict(places)):
         done[name] = substitute(table[name], done)
     return {name: done[name] for name in table}
 
@@ -274,8 +274,8 @@ def _typed(constant: Constant, value: object) -> Value:
     actual = value_type(value)
     if constant.type == "double" and actual == "int":
         return float(value)
-    given = constant.expression is None
-    if given and constant.type == "int" and isinstance(value, float) and value.is_integer():
+    is_argument = constant.expression is None
+    if is_argument and constant.type == "int" and isinstance(value, float) and value.is_integer():
         return int(value)
     if actual != constant.type:
         raise LanguageError(
@@ -298,7 +298,7 @@ def _substitution(names: Mapping[str, Expression]) -> Change:
 
 
 def _in_order(
-    table: Mapping[str, Expression], what: str, places: Mapping[str, int]
+    table: Mapping[str, Expression], kind: str, places: Mapping[str, int]
 ) -> Iterable[str]:
     """Names so that each comes after those that it needs; LanguageError for a circle."""
     needs = {name: sorted(names_in(e) & table.keys()) for name, e in table.items()}
@@ -306,7 +306,7 @@ def _in_order(
         return tuple(TopologicalSorter(needs).static_order())
     except CycleError as error:
         name = min(error.args[1], key=places.__getitem__)
-        raise LanguageError(places[name], f"the {what} {name} depends on itself.") from None
+        raise LanguageError(places[name], f"the {kind} {name} depends on itself.") from None
 
 
 def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expression]) -> Module:
@@ -407,13 +407,13 @@ class _Checker:
                 f"{a.expression} of type {actual} is assigned to {a.variable} of type {expected}{hint}.",
             )
 
-    def boolean(self, e: Expression, what: str) -> None:
+    def boolean(self, e: Expression, role: str) -> None:
         if self.type(e, self.types) != "bool":
-            raise LanguageError(e.place, f"{e} is {what} and no Boolean.")
+            raise LanguageError(e.place, f"{e} is {role} and no Boolean.")
 
-    def number(self, e: Expression, what: str) -> None:
+    def number(self, e: Expression, role: str) -> None:
         if self.type(e, self.with_parameters) == "bool":
-            raise LanguageError(e.place, f"{e} is {what} and no number.")
+            raise LanguageError(e.place, f"{e} is {role} and no number.")
 
     def type(self, e: Expression, types: Mapping[str, Type]) -> Type:
         """The type; LanguageError that names a constant without a value."""

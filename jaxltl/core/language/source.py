@@ -53,17 +53,15 @@ class TokenReader:
     pattern = _TOKEN
 
     def __init__(self, text: str, start: int = 0) -> None:
-        tokens = (
-            found for found in self.pattern.finditer(text, start) if found.lastgroup != "space"
-        )
-        found = list(islice(tokens, MAX_TOKENS + 1))
-        if len(found) > MAX_TOKENS:
+        tokens = (match for match in self.pattern.finditer(text, start) if match.lastgroup != "space")
+        matches = list(islice(tokens, MAX_TOKENS + 1))
+        if len(matches) > MAX_TOKENS:
             raise LanguageError(
-                found[-1].start(), f"the text has more than {MAX_TOKENS} words and signs."
+                matches[-1].start(), f"the text has more than {MAX_TOKENS} words and signs."
             )
-        self.kinds = [*(str(token.lastgroup) for token in found), "end"]
-        self.texts = [*(token[0] for token in found), ""]
-        self.starts = [*(token.start() for token in found), len(text)]
+        self.kinds = [*(str(token.lastgroup) for token in matches), "end"]
+        self.texts = [*(token[0] for token in matches), ""]
+        self.starts = [*(token.start() for token in matches), len(text)]
         self.at = 0
 
     @property
@@ -78,8 +76,8 @@ class TokenReader:
 
     def fail(self, expected: str) -> NoReturn:
         """Raises LanguageError: another token is expected."""
-        found = "the end" if self.kinds[self.at] == "end" else repr(self.texts[self.at])
-        raise LanguageError(self.place, f"found {found}, expected {expected}.")
+        actual = "the end" if self.kinds[self.at] == "end" else repr(self.texts[self.at])
+        raise LanguageError(self.place, f"found {actual}, expected {expected}.")
 
     def accept(self, text: str) -> bool:
         """Takes the next token if it is this sign or word."""
@@ -94,10 +92,10 @@ class TokenReader:
 
     def separated(self, item: Callable[[], Item], sign: str = ",") -> list[Item]:
         """Takes items with a sign between each two."""
-        found = [item()]
+        items = [item()]
         while self.accept(sign):
-            found.append(item())
-        return found
+            items.append(item())
+        return items
 
     def word(self, expected: str, kind: str = "word") -> str:
         """Takes a name."""

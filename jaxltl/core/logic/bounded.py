@@ -83,11 +83,11 @@ def unfolded(path: Bounded) -> Formula:
         return ahead if left == TRUE else left & ahead
 
     if path.upper is None:
-        found = Formula("U", (left, right))
+        path_value = Formula("U", (left, right))
     else:
-        found = right
+        path_value = right
         for _ in range(path.upper - path.lower):
-            found = right | step(found)
+            path_value = right | step(path_value)
     for _ in range(path.lower):
-        found = step(found)
-    return found
+        path_value = step(path_value)
+    return path_value

@@ -51,11 +51,11 @@ class Comparison:
                 raise ValueError(f"{self.text}: {error.message}") from None
         if kind != "bool":
             raise ValueError(f"{self.text} is a number; write a comparison, such as x>0.")
-        found, *parts = compile_expressions([self.expression, *_undefined(self.expression)])(values)
+        truth, *parts = compile_expressions([self.expression, *_undefined(self.expression)])(values)
         if not all(np.isfinite(x).all() for x in parts):
             raise ValueError(f"{self.text} divides by zero or overflows in some state.")
         size = max((np.size(x) for x in valuation.values()), default=0)
-        holds: Booleans = np.broadcast_to(np.asarray(found, bool), (size,))
+        holds: Booleans = np.broadcast_to(np.asarray(truth, bool), (size,))
         return holds
 
     def _type(self, values: Mapping[str, NDArray[np.generic]]) -> Type:
@@ -78,8 +78,8 @@ class Comparison:
 
 def _undefined(expression: Expression) -> list[Expression]:
     """The operands that are not finite everywhere."""
-    found = [x for operand in expression.operands for x in _undefined(operand)]
-    return [*found, expression] if expression.operator in ("/", "log", "pow") else found
+    conditions = [x for operand in expression.operands for x in _undefined(operand)]
+    return [*conditions, expression] if expression.operator in ("/", "log", "pow") else conditions
 
 
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
@@ -94,7 +94,7 @@ class Definitions:
       names: the value of each constant and the expression of each formula.
       variables: the variables of the model.
       rewards: the names of the reward structures in their order, for ``R{2}`` and ``R=?``.
-      given: values of constants that a property file declares without one.
+      constant_values: values of constants that a property file declares without one.
 
     Example:
       >>> sorted(Definitions(variables=("x", "y")).known)
@@ -104,7 +104,7 @@ class Definitions:
     names: Mapping[str, Expression] = field(default_factory=dict)
     variables: tuple[str, ...] = ()
     rewards: tuple[str, ...] = ()
-    given: Mapping[str, Value] = field(default_factory=dict)
+    constant_values: Mapping[str, Value] = field(default_factory=dict)
 
     @cached_property
     def known(self) -> frozenset[str]:
@@ -112,12 +112,14 @@ class Definitions:
         return frozenset(self.names) | frozenset(self.variables)
 
 
-def program_definitions(program: Program, given: Mapping[str, Value] | None = None) -> Definitions:
+def program_definitions(
+    program: Program, constant_values: Mapping[str, Value] | None = None
+) -> Definitions:
     """The constants, formulas, variables and rewards of a program, for ``parse_properties``.
 
     Args:
       program: of ``jaxltl.io.read_program``.
-      given: values of constants that the text of properties declares without one.
+      constant_values: values of constants that the text of properties declares without one.
 
     Returns:
       :class:`Definitions`.
@@ -133,5 +135,5 @@ def program_definitions(program: Program, given: Mapping[str, Value] | None = No
         names | program.formulas,
         tuple(v.name for v in program.variables),
         tuple(r.name for r in program.rewards),
-        given or {},
+        constant_values or {},
     )

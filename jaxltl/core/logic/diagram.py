@@ -26,15 +26,15 @@ class Diagrams:
     def node(self, variable: int, low: int, high: int) -> int:
         if low == high:
             return low
-        found = self._index.setdefault((variable, low, high), len(self.nodes))
-        if found == len(self.nodes):
-            if found >= self.max_nodes:
+        index = self._index.setdefault((variable, low, high), len(self.nodes))
+        if index == len(self.nodes):
+            if index >= self.max_nodes:
                 raise ValueError(
-                    f"to_automaton: the states combine subformulas in more than {found} "
+                    f"to_automaton: the states combine subformulas in more than {index} "
                     "diagrams. Split the formula into parts that are tracked side by side."
                 )
             self.nodes.append((variable, low, high))
-        return found
+        return index
 
     def cofactors(self, diagram: int, variable: int) -> tuple[int, int]:
         top, low, high = self.nodes[diagram]

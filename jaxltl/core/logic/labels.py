@@ -69,8 +69,8 @@ def distinct_rows(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[n
     """The different rows of a Boolean array, and the number of each row among them."""
     width = rows.shape[1]
     if width > _COUNTED:
-        found, number = np.unique(rows, axis=0, return_inverse=True)
-        return found, number.ravel()
+        distinct, number = np.unique(rows, axis=0, return_inverse=True)
+        return distinct, number.ravel()
     code = np.zeros(len(rows), np.int32)
     for i in range(width):
         code = code << 1 | rows[:, i]

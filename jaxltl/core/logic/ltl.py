@@ -275,28 +275,28 @@ def _syntax_error(text: str, error: UnexpectedInput) -> str:
         wanted = "a binary operator (& | xor -> <-> U R W M) or "
         wanted += "')'" if is_open else "the end of the formula"
     if token is None:
-        found = f"{text[position]!r}"
+        actual = f"{text[position]!r}"
         wanted += (
             ". The quote is never closed"
             if text[position] == '"'
             else ". Put names with other characters in double quotes"
         )
     else:
-        found = "the end of the formula" if token.type == "$END" else repr(str(token))
-    return pointed("parse_ltl", text, position, found, wanted)
+        actual = "the end of the formula" if token.type == "$END" else repr(str(token))
+    return pointed("parse_ltl", text, position, actual, wanted)
 
 
-def pointed(place: str, text: str, position: int, found: str, wanted: str) -> str:
+def pointed(place: str, text: str, position: int, actual: str, wanted: str) -> str:
     """Error message for a position of a text, with a caret under it."""
     line_start = text.rfind("\n", 0, position) + 1
     line = text[line_start:].split("\n")[0]
     column = position - line_start
     # A window of the line keeps the caret in sight under a long formula.
-    left = max(0, column - 60)
+    begin = max(0, column - 60)
     row = f"line {text.count(chr(10), 0, position) + 1}, " if "\n" in text else ""
     return (
-        f"{place}: {row}column {column + 1}: found {found}, expected {wanted}.\n"
-        f"  {line[left : left + 78]}\n  {' ' * (column - left)}^"
+        f"{place}: {row}column {column + 1}: found {actual}, expected {wanted}.\n"
+        f"  {line[begin : begin + 78]}\n  {' ' * (column - begin)}^"
     )
 
 
@@ -318,13 +318,13 @@ def _pieces(formula: Formula) -> list[str | Formula]:
         atom = formula.operator == "ap"
         return [proposition_text(formula.proposition) if atom else formula.operator]
     single = len(formula.operands) == 1
-    found: list[str | Formula] = []
+    pieces: list[str | Formula] = []
     for operand in formula.operands:
-        if found:
-            found.append(f" {formula.operator} ")
-        found += ["(", operand, ")"] if len(operand.operands) > 1 else [operand]
+        if pieces:
+            pieces.append(f" {formula.operator} ")
+        pieces += ["(", operand, ")"] if len(operand.operands) > 1 else [operand]
     prefix = formula.operator + ("" if formula.operator == "!" else " ")
-    return [prefix, *found] if single else found
+    return [prefix, *pieces] if single else pieces
 
 
 def render(formula: Formula, operand_texts: Sequence[str]) -> str:

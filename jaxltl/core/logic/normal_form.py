@@ -117,13 +117,13 @@ class Rewriter:
         greatest = _outermost(operand, lambda f: f.operator in GREATEST)
         if greatest is None:
             return whole
-        kept, strong = greatest.operands[0], FALSE
+        weak, strong = greatest.operands[0], FALSE
         if greatest.operator == "W":
             strong = binary("U", *greatest.operands)
         elif greatest.operator == "R":
-            kept, strong = greatest.operands[1], binary("M", *greatest.operands)
+            weak, strong = greatest.operands[1], binary("M", *greatest.operands)
         return _choice(
-            [self.limit_ever(kept), self.limit_often(replace_all(operand, greatest, TRUE))],
+            [self.limit_ever(weak), self.limit_often(replace_all(operand, greatest, TRUE))],
             self.limit_often(replace_all(operand, greatest, strong)),
         )
 
@@ -264,8 +264,8 @@ def _combine(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) ->
         return Part(kind, formula)
     if formula.operator == "X" and formula.operands[0].operator in ("&", "|"):
         below = formula.operands[0]
-        spread = Formula(below.operator, tuple(next_step(f) for f in below.operands))
-        return _combine(spread, grouped, dual, rewriter)
+        distributed = Formula(below.operator, tuple(next_step(f) for f in below.operands))
+        return _combine(distributed, grouped, dual, rewriter)
     if dual:
         return _combine(negated(rewriter.to_sigma2(negated(formula))), grouped, dual, rewriter)
     return _combine(rewriter.to_sigma2(formula), grouped, dual, rewriter)

@@ -134,14 +134,14 @@ class Progression:
 
     def restricted(self, keep: Callable[[Formula], bool]) -> Callable[[int], int]:
         """The function that makes each variable false that is not to be kept."""
-        kept = [keep(variable) for variable in self.variables]
+        mask = [keep(variable) for variable in self.variables]
         diagrams = self.diagrams
         done = {FALSE: FALSE, TRUE: TRUE}
 
         def restrict(diagram: int) -> int:
             if diagram not in done:
                 variable, low, high = diagrams.nodes[diagram]
-                if kept[variable]:
+                if mask[variable]:
                     done[diagram] = diagrams.node(variable, restrict(low), restrict(high))
                 else:
                     done[diagram] = restrict(low)

@@ -149,10 +149,10 @@ def parse_property(text: str, definitions: Definitions | None = None) -> Propert
       >>> print(parse_property('R{"steps"}min=? [ F "goal" ]').reward)
       steps
     """
-    found = parse_properties(text, definitions)
-    if len(found) != 1:
-        raise ValueError(f"property: {text!r} holds {len(found)} properties; give one.")
-    return found[0]
+    properties = parse_properties(text, definitions)
+    if len(properties) != 1:
+        raise ValueError(f"property: {text!r} holds {len(properties)} properties; give one.")
+    return properties[0]
 
 
 _OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
@@ -176,7 +176,7 @@ class _Parser(TokenStream):
     # --- properties ---
 
     def properties(self) -> tuple[Property, ...]:
-        found = []
+        properties = []
         while self.token.kind != "end":
             if self.accept(";"):
                 continue
@@ -188,18 +188,18 @@ class _Parser(TokenStream):
                 name = self.quoted()
                 if not self.accept(":"):  # it is a label
                     name, self.place = None, before
-            found.append(self.outermost(name))
-        self.require(bool(found), 'a property, such as Pmax=? [ F "goal" ]')
-        return tuple(found)
+            properties.append(self.outermost(name))
+        self.require(bool(properties), 'a property, such as Pmax=? [ F "goal" ]')
+        return tuple(properties)
 
     def outermost(self, name: str | None) -> Property:
         """A property, or a state formula, which must hold in each initial state."""
         start, before = self.token, self.place
         begins_formula = start.kind == "quoted" or start.text in ("true", "false", "!", "(")
         if not begins_formula and start.text not in self.known.known | self.names.keys():
-            found = self.property_(name)
-            if found.relation is None or self.token.text not in ("&", "|", "=>", "<=>"):
-                return found
+            prop = self.property_(name)
+            if prop.relation is None or self.token.text not in ("&", "|", "=>", "<=>"):
+                return prop
             self.place = before
         return self.state_property(name)
 
@@ -212,9 +212,9 @@ class _Parser(TokenStream):
     ) -> tuple[_Content, tuple[tuple[str, Comparison | Property], ...]]:
         """The result of a method of the parser, and the definitions in its text."""
         outer, self.definitions = self.definitions, {}
-        found = read()
+        content = read()
         defined, self.definitions = tuple(self.definitions.items()), outer
-        return found, defined
+        return content, defined
 
     def state_property(self, name: str | None = None) -> Property:
         """A state formula as a property: with probability one, which is 0 or 1."""
@@ -405,10 +405,10 @@ class _Parser(TokenStream):
         place, known = self.place, dict(self.definitions)
         try:
             self.expect("(")
-            found = self.path()
+            path = self.path()
             self.expect(")", " or an operator")
             self.require(self.token.text not in _AFTER_OPERAND, "a Boolean operator")
-            return found
+            return path
         except ValueError:
             after, self.place, self.definitions = self.place, place, known
             with contextlib.suppress(ValueError):
@@ -418,18 +418,18 @@ class _Parser(TokenStream):
 
     def comparison_of_variables(self) -> Formula:
         start = self.token
-        found = self.expression(SIMPLE)
-        if found.is_literal and isinstance(found.value, bool):
-            return TRUE if found.value else FALSE
+        comparison = self.expression(SIMPLE)
+        if comparison.is_literal and isinstance(comparison.value, bool):
+            return TRUE if comparison.value else FALSE
         self.require(
-            found.operator != "name" or found.value in self.known.variables,
+            comparison.operator != "name" or comparison.value in self.known.variables,
             f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
             f"such as {start.text}=1",
             start,
         )
-        is_number = found.operator in _NUMBERS or found.is_literal
+        is_number = comparison.operator in _NUMBERS or comparison.is_literal
         self.require(not is_number, "a comparison, such as x+1<=3")
-        return self.defined(Comparison(self.written(start), found))
+        return self.defined(Comparison(self.written(start), comparison))
 
     # --- bounds ---
 
@@ -440,9 +440,9 @@ class _Parser(TokenStream):
             self.expect("{", " and a bound on a reward")
             self.expect("rew", " and the name of a reward")
             self.expect("{", " and the name of a reward")
-            found = self.reward_bound()
+            bound = self.reward_bound()
             self.expect("}")
-            return found
+            return bound
         if self.accept("rew"):
             self.expect("{", " and the name of a reward")
             return self.reward_bound()
@@ -489,9 +489,9 @@ class _Parser(TokenStream):
         kind: Literal["U", "R"] = "U" if operator in "FU" else "R"
         left = {"F": TRUE, "G": FALSE, "W": right}.get(operator, first)
         right = first | right if operator == "W" else right  # a W b is b R (a | b)
-        found = replace(bound, operator=kind, left=left, right=right)
-        boolean = is_boolean(found.left) and is_boolean(found.right)
-        return found if boolean else self.plain(found)
+        path = replace(bound, operator=kind, left=left, right=right)
+        boolean = is_boolean(path.left) and is_boolean(path.right)
+        return path if boolean else self.plain(path)
 
     def plain(self, path: _Path) -> Formula:
         """A formula without bounds."""
@@ -514,10 +514,10 @@ class _Parser(TokenStream):
 
     def state_content(self) -> Formula:
         start = self.token
-        found = self.path()
-        if isinstance(found, Bounded) or not is_boolean(found):
+        path = self.path()
+        if isinstance(path, Bounded) or not is_boolean(path):
             raise self.error(_STATE, start)
-        return found
+        return path
 
     def reward_content(self) -> Formula | Earned:
         if self.accept("S", "LRA"):
@@ -541,10 +541,10 @@ class _Parser(TokenStream):
 
     def reach_content(self, wanted: str = "F and a state formula") -> Formula:
         start = self.token
-        found = self.path()
-        if isinstance(found, Bounded) or found.operator != "F" or not is_boolean(found.operands[0]):
+        path = self.path()
+        if isinstance(path, Bounded) or path.operator != "F" or not is_boolean(path.operands[0]):
             raise self.error(wanted, start)
-        return found
+        return path
 
 
 _AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")

@@ -38,7 +38,7 @@ _TOKEN = re.compile(
 
 
 def _tokens(text: str) -> list[Token]:
-    found, place = [], 0
+    tokens, place = [], 0
     while place < len(text):
         match = _TOKEN.match(text, place)
         if match is None:
@@ -49,11 +49,11 @@ def _tokens(text: str) -> list[Token]:
         # GF"a" is G F "a".
         pieces = match[0] if re.fullmatch("[XFG]{2,}", match[0]) else [match[0]]
         for piece in pieces if kind != "space" else ():
-            found.append(Token(kind, piece, place, place + len(piece)))
+            tokens.append(Token(kind, piece, place, place + len(piece)))
             place += len(piece)
         place = match.end()
     end = len(text.rstrip())
-    return [*found, Token("end", "", end, end)]
+    return [*tokens, Token("end", "", end, end)]
 
 
 class TokenStream:
@@ -72,8 +72,8 @@ class TokenStream:
 
     def error(self, wanted: str, token: Token | None = None) -> ValueError:
         token = token or self.token
-        found = "the end" if token.kind == "end" else repr(token.text)
-        return ValueError(pointed("property", self.text, token.start, found, wanted))
+        actual = "the end" if token.kind == "end" else repr(token.text)
+        return ValueError(pointed("property", self.text, token.start, actual, wanted))
 
     def require(self, holds: bool, wanted: str, token: Token | None = None) -> None:
         if not holds:
@@ -94,10 +94,10 @@ class TokenStream:
         self.one_of((sign,), f"{sign!r}{after}")
 
     def one_of(self, texts: Sequence[str], wanted: str) -> str:
-        found = self.accept(*texts)
-        if found is None:
+        word = self.accept(*texts)
+        if word is None:
             raise self.error(wanted)
-        return found
+        return word
 
     @property
     def last(self) -> Token:
@@ -153,8 +153,8 @@ class TokenStream:
         self.require(fresh, "a name that is not declared yet", start)
         if kind == "const" and not self.accept("="):
             wanted = f"a value of {name}, here or as --const {name}=..."
-            self.require(name in self.known.given, wanted, start)
-            value = literal(self.known.given[name])
+            self.require(name in self.known.constant_values, wanted, start)
+            value = literal(self.known.constant_values[name])
         else:
             if kind != "const":
                 self.expect("=")
@@ -173,15 +173,15 @@ class TokenStream:
         """An expression with constants and formulas substituted."""
         try:
             parser = ExpressionParser(self.text, self.token.start)
-            found = parser.expression(level)
+            tree = parser.expression(level)
             meanings = {f'"{name}"': label.expression for name, label in self.labels.items()}
-            found = substitute(found, {**self.names, **meanings})
+            tree = substitute(tree, {**self.names, **meanings})
         except LanguageError as error:
             place = bisect.bisect_left(self.starts, error.place)
             token = self.tokens[min(place, len(self.tokens) - 1)]
             raise self.error(_expected(error.message), token) from None
         self.place = bisect.bisect_left(self.starts, parser.end)
-        return found
+        return tree
 
     def reward_name(self) -> str:
         """A name in quotes, or the number of a reward structure from 1."""

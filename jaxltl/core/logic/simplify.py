@@ -26,14 +26,14 @@ def disjunction(parts: Iterable[Formula]) -> Formula:
 
 def flattened(operator: str, parts: Iterable[Formula], unit: Formula, zero: Formula) -> Formula:
     """Parts under `&` or `|`, flat and simplified: `unit` if none is left, or `zero`."""
-    kept: dict[Formula, None] = {}
+    operands: dict[Formula, None] = {}
     for part in parts:
         for piece in part.operands if part.operator == operator else (part,):
-            if piece == zero or _opposite(piece) in kept:
+            if piece == zero or _opposite(piece) in operands:
                 return zero
             if piece != unit:
-                kept[piece] = None
-    pieces = _without_implied(operator, list(kept))
+                operands[piece] = None
+    pieces = _without_implied(operator, list(operands))
     if pieces is None:
         return zero
     if not pieces:
@@ -239,9 +239,9 @@ def _limit(outer: str, inner: str, operand: Formula) -> Formula:
         operand = operand.operands[0]
     if operand in (TRUE, FALSE) or is_invariant(operand):
         return operand
-    join, spread = ("&", conjunction) if outer == "F" else ("|", disjunction)
+    join, distribute = ("&", conjunction) if outer == "F" else ("|", disjunction)
     if operand.operator == join:  # F G (f & g) = F G f & F G g
-        return spread(_limit(outer, inner, f) for f in operand.operands)
+        return distribute(_limit(outer, inner, f) for f in operand.operands)
     return Formula(outer, (Formula(inner, (operand,)),))
 
 

@@ -47,11 +47,11 @@ class Layout:
 
     def masks(self, names: Iterable[str]) -> tuple[int, ...]:
         """The bits of some variables in each word."""
-        found = [0] * self.num_words
+        masks = [0] * self.num_words
         for name in names:
             field = self.fields[name]
-            found[field.word] |= field.mask
-        return tuple(found)
+            masks[field.word] |= field.mask
+        return tuple(masks)
 
     def packed(self, columns: dict[str, Integers], size: int) -> Words:
         """Words of N states from the values of all variables."""

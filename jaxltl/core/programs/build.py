@@ -117,43 +117,45 @@ def build_rows(
     )
     try:
         initial = initial_states(program, layout, max_states)
-        found = Search(program, layout, weights, max_states).run(initial, progress)
-        return _rows(program, found, weights)
+        explored = Search(program, layout, weights, max_states).run(initial, progress)
+        return _rows(program, explored, weights)
     except LanguageError as error:
         raise program.source.located(error) from None
 
 
-def _rows(program: Program, found: Explored, weights: Numbers) -> Rows:
-    size = found.words[0].size
-    found.rewards.update((r.name, _reward_parts(found, weights, r.items)) for r in program.rewards)
-    owner = _owners(program, found) if program.kind == "smg" else None
-    deadlock = found.row_count == 0
+def _rows(program: Program, explored: Explored, weights: Numbers) -> Rows:
+    size = explored.words[0].size
+    explored.rewards.update(
+        (r.name, _reward_parts(explored, weights, r.items)) for r in program.rewards
+    )
+    owner = _owners(program, explored) if program.kind == "smg" else None
+    deadlock = explored.row_count == 0
     if deadlock.any():
         count = f"{int(deadlock.sum())} of {size} states are deadlocks"
         _warn(program, f"{count}; each gets a self-loop.")
-        found = with_loops(found)
-    if program.kind == "dtmc" and found.action.size > size:
-        several = f"in {int((found.row_count > 1).sum())} states of a dtmc"
+        explored = with_loops(explored)
+    if program.kind == "dtmc" and explored.action.size > size:
+        several = f"in {int((explored.row_count > 1).sum())} states of a dtmc"
         _warn(program, f"several commands are enabled {several}; each has the same probability.")
-        found = as_chain(found, weights)
-    label = _label_columns(program, found, deadlock)
+        explored = as_chain(explored, weights)
+    label = _label_columns(program, explored, deadlock)
     annotations = {
-        "initial": found.initial,
+        "initial": explored.initial,
         "label": np.stack(list(label.values()), 1) if label else np.zeros((size, 0), bool),
         "propositions": tuple(label),
-        "action": found.action,
-        "action_names": found.actions,
+        "action": explored.action,
+        "action_names": explored.actions,
         "valuation": {
-            v.name: _column(found.layout, found.words, v.name) for v in program.variables
+            v.name: _column(explored.layout, explored.words, v.name) for v in program.variables
         },
     }
     return Rows(
-        offsets_from_counts(found.row_count),
-        offsets_from_counts(found.entry_count),
-        found.successor,
-        found.weight,
+        offsets_from_counts(explored.row_count),
+        offsets_from_counts(explored.entry_count),
+        explored.successor,
+        explored.weight,
         annotations,
-        found.rewards,
+        explored.rewards,
         tuple(weights.expressions) if isinstance(weights, Functions) else (),
         owner,
     )
@@ -188,51 +190,53 @@ def on_states(
 
 
 def _label_columns(
-    program: Program, found: Explored, deadlock: Booleans
+    program: Program, explored: Explored, deadlock: Booleans
 ) -> dict[str, NDArray[np.bool_]]:
     """The states of each label."""
-    columns = on_states(found.layout, found.words, list(program.labels.values()))
+    columns = on_states(explored.layout, explored.words, list(program.labels.values()))
     label = dict(zip(program.labels, columns, strict=True))
-    only = np.flatnonzero(found.row_count == 1)
-    first = offsets_from_counts(found.row_count)[only]
-    entry = offsets_from_counts(found.entry_count)[first]
+    only = np.flatnonzero(explored.row_count == 1)
+    first = offsets_from_counts(explored.row_count)[only]
+    entry = offsets_from_counts(explored.entry_count)[first]
     loops = np.zeros(deadlock.size, bool)
-    loops[only] = (found.entry_count[first] == 1) & (found.successor[entry] == only)
+    loops[only] = (explored.entry_count[first] == 1) & (explored.successor[entry] == only)
     return label if np.array_equal(loops, deadlock) else label | {"deadlock": deadlock}
 
 
 # --- rewards ----------------------------------------------------------------------------------
 
 
-def _reward_parts(found: Explored, weights: Numbers, items: Sequence[RewardItem]) -> RewardParts:
+def _reward_parts(explored: Explored, weights: Numbers, items: Sequence[RewardItem]) -> RewardParts:
     """Rewards of states and of choices; numbers of functions in a program with parameters."""
-    size = found.words[0].size
+    size = explored.words[0].size
     by_action: dict[str | None, list[RewardItem]] = {}
     for i in items:
         by_action.setdefault(i.action, []).append(i)
     state = choices = None
     if None in by_action:
-        state = _earned(found, weights, by_action.pop(None), np.arange(size))
-    of_row = np.repeat(np.arange(size), found.row_count)
-    for number, action in enumerate(found.actions):
-        rows = np.flatnonzero(found.action == number) if action in by_action else np.zeros(0, int)
+        state = _earned(explored, weights, by_action.pop(None), np.arange(size))
+    of_row = np.repeat(np.arange(size), explored.row_count)
+    for number, action in enumerate(explored.actions):
+        rows = (
+            np.flatnonzero(explored.action == number) if action in by_action else np.zeros(0, int)
+        )
         if rows.size:
-            earned = _earned(found, weights, by_action[action], of_row[rows])
+            earned = _earned(explored, weights, by_action[action], of_row[rows])
             choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
             choices[rows] = earned
     return state, choices
 
 
 def _earned(
-    found: Explored, weights: Numbers, items: Sequence[RewardItem], states: Integers
+    explored: Explored, weights: Numbers, items: Sequence[RewardItem], states: Integers
 ) -> NDArray[Any]:
     """The sum of some items in some states."""
-    words = tuple(w[states] for w in found.words)
+    words = tuple(w[states] for w in explored.words)
     if isinstance(weights, Functions):
         terms = [Expression("?:", (i.guard, i.value, literal(0))) for i in items]
         total = Expression("+", (literal(0), *terms))
-        return weights.numbers(total, Reader(found.layout, words), states.size)
-    values = on_states(found.layout, words, [e for i in items for e in (i.guard, i.value)])
+        return weights.numbers(total, Reader(explored.layout, words), states.size)
+    values = on_states(explored.layout, words, [e for i in items for e in (i.guard, i.value)])
     earned = np.zeros(states.size)
     for item, guard, value in zip(items, values[::2], values[1::2], strict=True):
         bad = guard & ~np.isfinite(value.astype(np.float64))
@@ -245,31 +249,31 @@ def _earned(
 # --- deadlocks and overlapping commands -------------------------------------------------------
 
 
-def with_loops(found: Explored) -> Explored:
+def with_loops(explored: Explored) -> Explored:
     """The model with a self-loop in each state without choices."""
-    states = np.flatnonzero(found.row_count == 0)
-    row = offsets_from_counts(found.row_count)[states]
-    entry = offsets_from_counts(found.entry_count)[row]
+    states = np.flatnonzero(explored.row_count == 0)
+    row = offsets_from_counts(explored.row_count)[states]
+    entry = offsets_from_counts(explored.entry_count)[row]
     return replace(
-        found,
-        row_count=np.maximum(found.row_count, 1),
-        action=np.insert(found.action, row, 0),
-        owner=np.insert(found.owner, row, -1),
-        entry_count=np.insert(found.entry_count, row, 1),
-        successor=np.insert(found.successor, entry, states.astype(np.int32)),
-        weight=np.insert(found.weight, entry, 1, axis=0),
+        explored,
+        row_count=np.maximum(explored.row_count, 1),
+        action=np.insert(explored.action, row, 0),
+        owner=np.insert(explored.owner, row, -1),
+        entry_count=np.insert(explored.entry_count, row, 1),
+        successor=np.insert(explored.successor, entry, states.astype(np.int32)),
+        weight=np.insert(explored.weight, entry, 1, axis=0),
         rewards={
             name: (state, None if choice is None else np.insert(choice, row, 0))
-            for name, (state, choice) in found.rewards.items()
+            for name, (state, choice) in explored.rewards.items()
         },
     )
 
 
-def as_chain(found: Explored, weights: Numbers) -> Explored:
+def as_chain(explored: Explored, weights: Numbers) -> Explored:
     """The Markov chain that picks each enabled command with the same probability."""
-    starts = offsets_from_counts(found.row_count)[:-1]
-    share = np.repeat(found.row_count, found.row_count)
-    rewards = dict(found.rewards)
+    starts = offsets_from_counts(explored.row_count)[:-1]
+    share = np.repeat(explored.row_count, explored.row_count)
+    rewards = dict(explored.rewards)
     for name, (state, choice) in rewards.items():
         if choice is not None and isinstance(weights, Functions):
             raise LanguageError(
@@ -280,11 +284,11 @@ def as_chain(found: Explored, weights: Numbers) -> Explored:
         if choice is not None:
             rewards[name] = state, np.add.reduceat(choice / share, starts)
     return replace(
-        found,
-        row_count=np.ones_like(found.row_count),
-        action=np.where(found.row_count == 1, found.action[starts], 0).astype(np.int32),
-        entry_count=np.add.reduceat(found.entry_count, starts),
-        weight=weights.divided(found.weight, np.repeat(share, found.entry_count)),
+        explored,
+        row_count=np.ones_like(explored.row_count),
+        action=np.where(explored.row_count == 1, explored.action[starts], 0).astype(np.int32),
+        entry_count=np.add.reduceat(explored.entry_count, starts),
+        weight=weights.divided(explored.weight, np.repeat(share, explored.entry_count)),
         rewards=rewards,
     )
 
@@ -303,22 +307,22 @@ def _players(program: Program, coalition: Sequence[str] | None) -> list[int]:
     return [names.index(name) for name in coalition]
 
 
-def _owners(program: Program, found: Explored) -> Integers:
+def _owners(program: Program, explored: Explored) -> Integers:
     """The player of each state; LanguageError for a state with choices of several players."""
     modules = [m.name for m in program.modules]
     of_module = np.full(len(modules) + 1, -1)
-    of_action = np.full(len(found.actions), -1)
+    of_action = np.full(len(explored.actions), -1)
     for i, player in enumerate(program.players):
         of_module[[modules.index(m) for m in player.modules]] = i
-        of_action[[found.actions.index(a) for a in player.actions]] = i
-    of_row = np.where(found.action > 0, of_action[found.action], of_module[found.owner])
-    state = np.repeat(np.arange(found.row_count.size), found.row_count)
-    owner = np.zeros(found.row_count.size, np.int64)
+        of_action[[explored.actions.index(a) for a in player.actions]] = i
+    of_row = np.where(explored.action > 0, of_action[explored.action], of_module[explored.owner])
+    state = np.repeat(np.arange(explored.row_count.size), explored.row_count)
+    owner = np.zeros(explored.row_count.size, np.int64)
     owner[state] = of_row
-    several = (owner[state] != of_row) | ((of_row < 0) & (found.row_count[state] > 1))
+    several = (owner[state] != of_row) | ((of_row < 0) & (explored.row_count[state] > 1))
     if several.any():
         i = int(state[np.argmax(several)])
-        text = state_text(Reader(found.layout, tuple(w[i : i + 1] for w in found.words)), 0)
+        text = state_text(Reader(explored.layout, tuple(w[i : i + 1] for w in explored.words)), 0)
         raise LanguageError(
             0,
             f"the choices of the state {text} belong to several players or to none; in a "

@@ -105,12 +105,12 @@ def _holds(conditions: Sequence[Expression], ranges: Sequence[Variable]) -> Bool
         v.name: x.ravel() != 0 if v.type == "bool" else x.ravel()
         for v, x in zip(ranges, grid, strict=True)
     }
-    found = np.ones(prod(map(len, axes)), bool)
+    truth = np.ones(prod(map(len, axes)), bool)
     for condition in compile_expressions([e for e in conditions if names_in(e) <= values.keys()])(
         values
     ):
-        found &= condition
-    return found
+        truth &= condition
+    return truth
 
 
 def _colours(overlap: Booleans) -> list[int]:

@@ -61,9 +61,9 @@ class Explored:
     @property
     def initial(self) -> Floats:
         """``float[S]``: the initial states are equally likely."""
-        found = np.zeros(self.row_count.size)
-        found[: self.num_initial] = 1 / self.num_initial
-        return found
+        distribution = np.zeros(self.row_count.size)
+        distribution[: self.num_initial] = 1 / self.num_initial
+        return distribution
 
 
 @dataclass(frozen=True)
@@ -121,20 +121,20 @@ class Search:
     def _narrow(self, initial: Words) -> int:
         """Expands small levels state by state; returns the number of states that are done."""
         codes, parts = [t.code for t in self.tables], [column.parts for column in self.columns]
-        found = search_narrow(self.program, codes, parts, self.layout, initial, self.max_states)
-        self.known.fill(found.words(self.layout))
+        narrow = search_narrow(self.program, codes, parts, self.layout, initial, self.max_states)
+        self.known.fill(narrow.words(self.layout))
         self._check_size()
-        self.num_transitions = len(found.successor)
-        column = np.array(found.column, np.int64)
+        self.num_transitions = len(narrow.successor)
+        column = np.array(narrow.column, np.int64)
         self._add(
-            row_count=found.row_count,
+            row_count=narrow.row_count,
             action=self.action_of[column],
             owner=self.owner_of[column],
-            entry_count=found.entry_count,
-            successor=found.successor,
-            weight=found.weight,
+            entry_count=narrow.entry_count,
+            successor=narrow.successor,
+            weight=narrow.weight,
         )
-        return len(found.row_count)
+        return len(narrow.row_count)
 
     def _add(self, **parts: ArrayLike) -> None:
         for name, part in parts.items():
@@ -272,7 +272,7 @@ class _Rows:
 
 def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_Column]:
     """The synchronisations of a program."""
-    found = [
+    columns = [
         _Column(0, m, ((m, code.actions.index("")),))
         for m, code in enumerate(codes)
         if "" in code.actions
@@ -280,5 +280,5 @@ def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_Column]
     for i, action in enumerate(actions[1:], 1):
         users = [(m, code) for m, code in enumerate(codes) if action in code.actions]
         parts = tuple((m, code.actions.index(action)) for m, code in users)
-        found.append(_Column(i, -1, parts))
-    return found
+        columns.append(_Column(i, -1, parts))
+    return columns

@@ -57,8 +57,8 @@ def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
         exec(compile("\n".join(lines), "<generated>", "exec"), space)
     except (SyntaxError, RecursionError, MemoryError):
         raise Unsupported from None
-    found: Local = space["local"]
-    return found
+    local_function: Local = space["local"]
+    return local_function
 
 
 def _command(c: Command, column: int, layout: Layout, local: dict[str, str]) -> list[str]:
@@ -83,9 +83,9 @@ def _command(c: Command, column: int, layout: Layout, local: dict[str, str]) -> 
 def fixed_probabilities(c: Command) -> NDArray[np.float64] | None:
     """The probabilities of a command, if they are positive literals with the sum one."""
     values = [o.probability.value for o in c.outcomes if o.probability.is_literal]
-    found = np.array(values, np.float64)
-    valid = found.size == len(c.outcomes) and (found > 0).all()
-    return found if valid and abs(found.sum() - 1) <= ROW_SUM_TOLERANCE else None
+    probabilities = np.array(values, np.float64)
+    valid = probabilities.size == len(c.outcomes) and (probabilities > 0).all()
+    return probabilities if valid and abs(probabilities.sum() - 1) <= ROW_SUM_TOLERANCE else None
 
 
 def may_leave(v: Variable, e: Expression) -> bool:

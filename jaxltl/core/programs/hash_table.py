@@ -38,12 +38,12 @@ class HashTable:
     def insert(self, words: Words) -> NDArray[np.int32]:
         """Numbers ``int32[N]`` of keys; new ones are added."""
         count = words[0].size
-        found = np.empty(count, np.int32)
+        numbers = np.empty(count, np.int32)
         for begin in range(0, count, _PART):
             part = slice(begin, begin + _PART)
             self._grow(self.size + min(_PART, count - begin))
-            found[part] = self._insert(tuple(w[part] for w in words))
-        return found
+            numbers[part] = self._insert(tuple(w[part] for w in words))
+        return numbers
 
     def fill(self, words: Words) -> None:
         """Numbers distinct keys in their order, in an empty table."""

@@ -137,43 +137,43 @@ class ModuleCode:
         outcomes = len(code.targets)
         if code.fixed is None:
             weights = self.weights.of(code.weights, read, size)
-            kept = np.stack([self.weights.possible(w) for w in weights], 1)
+            possible = np.stack([self.weights.possible(w) for w in weights], 1)
             table = np.stack(weights, 1)
             self._check_weights(code.command, weights, read)
         else:
             table = np.ones((size, 1)) * code.fixed
-            kept = table > 0
+            possible = table > 0
         values = iter(code.right(read))
         change = [np.zeros((size, outcomes), np.uint64) for _ in range(self.layout.num_words)]
         for k, fields in enumerate(code.targets):
             for field, checked in fields:
                 new = np.asarray(next(values), np.int64)
                 if checked:
-                    self._check_range(code.command, field, new, kept[:, k], read)
+                    self._check_range(code.command, field, new, possible[:, k], read)
                 moved = (new - read(field.variable.name)).view(np.uint64)
                 change[field.word][:, k] += moved << np.uint64(field.shift)
-        if kept.all():
+        if possible.all():
             flat = tuple(x.reshape(-1) for x in change)
             return np.full(size, outcomes), flat, table.reshape(-1, *table.shape[2:])
-        return kept.sum(1), tuple(x[kept] for x in change), table[kept]
+        return possible.sum(1), tuple(x[possible] for x in change), table[possible]
 
     def _check_weights(self, command: Command, weights: list[Weight], read: Reader) -> None:
         """Raises LanguageError if some probabilities are negative or do not sum to one."""
         if self.weights.dtype is np.int64:
             return
         low, high = np.array([self.weights.ends(w) for w in weights]).swapaxes(0, 1)
-        least, most = 1 - ROW_SUM_TOLERANCE, 1 + ROW_SUM_TOLERANCE
-        valid = ((low >= 0) & (low <= high) & (high <= most)).all(0)
-        bad = ~(valid & (low.sum(0) <= most) & (high.sum(0) >= least))
+        lower, upper = 1 - ROW_SUM_TOLERANCE, 1 + ROW_SUM_TOLERANCE
+        valid = ((low >= 0) & (low <= high) & (high <= upper)).all(0)
+        bad = ~(valid & (low.sum(0) <= upper) & (high.sum(0) >= lower))
         if bad.any():
             i = int(np.argmax(bad))
-            shown = " + ".join(
+            sum_text = " + ".join(
                 f"{a:.9g}" if a == b else f"[{a:.9g}, {b:.9g}]"
                 for a, b in zip(low[:, i], high[:, i], strict=True)
             )
             raise LanguageError(
                 command.place,
-                f"the probabilities of {_shown(command)} are {shown} in the state "
+                f"the probabilities of {_shown(command)} are {sum_text} in the state "
                 f"{state_text(read, i)}; they must be at least 0 and sum to 1.",
             )
 
@@ -185,10 +185,10 @@ class ModuleCode:
         outside = ((new < v.low) | (new > v.high)) & possible
         if outside.any():
             i = int(np.argmax(outside))
-            shown = np.broadcast_to(new, possible.shape)[i]
+            value = np.broadcast_to(new, possible.shape)[i]
             raise LanguageError(
                 command.place,
-                f"{_shown(command)} sets {v.name} to {shown} in the state {state_text(read, i)}; its "
+                f"{_shown(command)} sets {v.name} to {value} in the state {state_text(read, i)}; its "
                 f"range is [{v.low}..{v.high}].",
             )
 

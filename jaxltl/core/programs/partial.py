@@ -161,8 +161,8 @@ def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance
     if part.event.complement:
         solution = complement_event(solution)
     method = f"partial exploration of {part.num_states} states, {part.num_expanded} expanded"
-    found = as_answer(prop, np.arange(lower.size), solution, tolerance, method)
-    return found if found.status == Status.CONVERGED else found._replace(status=status)
+    answer = as_answer(prop, np.arange(lower.size), solution, tolerance, method)
+    return answer if answer.status == Status.CONVERGED else answer._replace(status=status)
 
 
 def _event(program: Program, prop: Property) -> _Event:
@@ -211,10 +211,10 @@ class _Conditions:
         self.names = tuple(dict.fromkeys(name for f in formulas for name in f.propositions))
         self.variables = tuple(v.name for v in program.variables)
         self.comparisons: dict[str, Comparison] = {}
-        for name, found in prop.definitions:
-            if isinstance(found, Property):
+        for name, definition in prop.definitions:
+            if isinstance(definition, Property):
                 raise _unsupported(prop)
-            self.comparisons[name] = found
+            self.comparisons[name] = definition
         labels = [n for n in self.names if n not in self.comparisons and n != "init"]
         if "deadlock" in labels and "deadlock" not in program.labels:
             raise ValueError(
@@ -277,8 +277,8 @@ class _Part:
     def frontier(self) -> Booleans:
         """States that are not expanded and do not decide the event."""
         stay, goal, expanded = self.truths[:, : self.size]
-        found: Booleans = stay & ~goal & ~expanded
-        return found
+        frontier: Booleans = stay & ~goal & ~expanded
+        return frontier
 
     @property
     def room(self) -> int:
@@ -300,8 +300,8 @@ class _Part:
             count = min(states.size, self.room, size - self.num_expanded)
             if self.program.kind == "mdp":
                 weight = self.weight[states]
-                near = int(np.count_nonzero(weight >= _NEAR * weight.max()))
-                count = min(max(near, self.num_expanded // _SHARE), count)
+                likely = int(np.count_nonzero(weight >= _NEAR * weight.max()))
+                count = min(max(likely, self.num_expanded // _SHARE), count)
             if count < states.size:
                 order = np.argpartition(-self.weight[states], count - 1)
                 states = np.sort(states[order[:count]])
@@ -320,8 +320,8 @@ class _Part:
             self.truths = np.pad(self.truths, ((0, 0), (0, 2 * size - self.truths.shape[1])))
             self.weights = np.pad(self.weights, (0, 2 * size - self.weights.size))
         words = self.search.known.words(before, size)
-        found = self.conditions.holds(Reader(self.layout, words), size - before, before == 0)
-        self.truths[:2, before:size] = found
+        truths = self.conditions.holds(Reader(self.layout, words), size - before, before == 0)
+        self.truths[:2, before:size] = truths
         self.weights[before:size] = weight
         self.size = size
 
@@ -372,23 +372,23 @@ class _Part:
 
     def build(self) -> None:
         """Makes the model of the explored part: `model`, whose states are those of `states`."""
-        found, size = self.search.explored(self.num_initial), self.size
+        explored, size = self.search.explored(self.num_initial), self.size
         done = np.concatenate(self.order)
         self.states = np.concatenate([done, np.flatnonzero(~self.truths[2, :size])])
         place = np.empty(size, np.int32)
         place[self.states] = np.arange(size, dtype=np.int32)
-        rows = np.append(found.row_count, np.zeros(size - done.size, np.int32))
-        found = replace(found, row_count=rows, successor=place[found.successor])
-        found = with_loops(found)
-        if self.program.kind == "dtmc" and found.action.size > size:
-            found = as_chain(found, Numbers())
+        rows = np.append(explored.row_count, np.zeros(size - done.size, np.int32))
+        explored = replace(explored, row_count=rows, successor=place[explored.successor])
+        explored = with_loops(explored)
+        if self.program.kind == "dtmc" and explored.action.size > size:
+            explored = as_chain(explored, Numbers())
         truths = (*self.truths[:2, :size], self.frontier)
         self.model = make_sparse(
-            offsets_from_counts(found.row_count),
-            offsets_from_counts(found.entry_count),
-            found.successor,
-            found.weight,
-            initial=found.initial,
+            offsets_from_counts(explored.row_count),
+            offsets_from_counts(explored.entry_count),
+            explored.successor,
+            explored.weight,
+            initial=explored.initial,
             label=np.stack([x[self.states] for x in truths], 1),
             propositions=("stay", "goal", "frontier"),
         )
@@ -407,8 +407,8 @@ class _Part:
                 else Bounded("U", left, right, 0, steps)
             )
             prop = Property("partial exploration", "P", objective, path=path)
-            found = solve_property(self.model, prop, states=states, tolerance=tolerance)
-            return cast(Answer, found)
+            answer = solve_property(self.model, prop, states=states, tolerance=tolerance)
+            return cast(Answer, answer)
 
         lower, upper = solved(stay & ~frontier, goal), solved(stay, goal | frontier)
         row = states

@@ -63,29 +63,29 @@ def search_narrow(
     keys = [0] * initial[0].size
     for w, word in enumerate(initial):
         keys = [k | x << (64 * w) for k, x in zip(keys, word.tolist(), strict=True)]
-    found = Narrow(keys, {k: i for i, k in enumerate(keys)})
+    narrow = Narrow(keys, {k: i for i, k in enumerate(keys)})
     try:
         modules = [
             _Module(generate(m, code.actions, layout), i, code, parts)
             for i, (m, code) in enumerate(zip(program.modules, codes, strict=True))
         ]
     except Unsupported:
-        return found
-    most = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
-    lists: list[list[Any]] = [keys, found.row_count, found.column, found.entry_count]
-    lists += [found.successor, found.weight]
-    while 0 < len(level := keys[len(found.row_count) :]) < most and len(keys) <= max_states:
+        return narrow
+    limit = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
+    lists: list[list[Any]] = [keys, narrow.row_count, narrow.column, narrow.entry_count]
+    lists += [narrow.successor, narrow.weight]
+    while 0 < len(level := keys[len(narrow.row_count) :]) < limit and len(keys) <= max_states:
         marks = list(map(len, lists))
         try:
             for key in level:
-                _expand(key, modules, parts, found)
+                _expand(key, modules, parts, narrow)
         except (Unsupported, ArithmeticError, ValueError):
             for key in keys[marks[0] :]:
-                del found.known[key]
+                del narrow.known[key]
             for items, mark in zip(lists, marks, strict=True):
                 del items[mark:]
             break
-    return found
+    return narrow
 
 
 class _Module:
@@ -110,24 +110,24 @@ class _Module:
         self.joint = [(i, c) for i, c, size in mine if size > 1]
 
     def choices(self, key: int) -> _Choices:
-        found = self.known.get(key & self.mask)
-        if found is None:
+        choices = self.known.get(key & self.mask)
+        if choices is None:
             rows = self.local(key)
             own = [(i, updates) for i, c in self.alone for updates in rows[c]]
             joint = {i: rows[c] for i, c in self.joint if rows[c]}
-            found = self.known[key & self.mask] = own, joint
-        return found
+            choices = self.known[key & self.mask] = own, joint
+        return choices
 
 
 def _expand(
-    key: int, modules: list[_Module], parts: Sequence[tuple[tuple[int, int], ...]], found: Narrow
+    key: int, modules: list[_Module], parts: Sequence[tuple[tuple[int, int], ...]], narrow: Narrow
 ) -> None:
     """Adds the choices and the new successors of a state."""
     local = [m.choices(key) for m in modules]
-    before = len(found.column)
+    before = len(narrow.column)
     for m, (own, joint) in enumerate(local):
         for column, updates in own:
-            _add(key, column, updates, found)
+            _add(key, column, updates, narrow)
         for column in joint:
             if parts[column][0][0] != m:
                 continue
@@ -135,32 +135,32 @@ def _expand(
             together = [rows for rows in others if rows is not None]
             if len(together) == len(others):
                 for updates in _joint(together):
-                    _add(key, column, updates, found)
-    found.row_count.append(len(found.column) - before)
+                    _add(key, column, updates, narrow)
+    narrow.row_count.append(len(narrow.column) - before)
 
 
 def _joint(together: list[list[Updates]]) -> list[Updates]:
     """The joint updates of every combination of commands."""
     if prod(sum(map(len, rows)) for rows in together) > _MAX_UPDATES:
         raise Unsupported
-    found = together[0]
+    updates = together[0]
     for rows in together[1:]:
-        found = [
+        updates = [
             tuple([(d + e, p * q) for d, p in one for e, q in other])
-            for one, other in product(found, rows)
+            for one, other in product(updates, rows)
         ]
-    return found
+    return updates
 
 
-def _add(key: int, column: int, updates: Updates, found: Narrow) -> None:
-    known = found.known
+def _add(key: int, column: int, updates: Updates, narrow: Narrow) -> None:
+    known = narrow.known
     for change, probability in updates:
         target = key + change
         number = known.get(target)
         if number is None:
-            number = known[target] = len(found.keys)
-            found.keys.append(target)
-        found.successor.append(number)
-        found.weight.append(probability)
-    found.column.append(column)
-    found.entry_count.append(len(updates))
+            number = known[target] = len(narrow.keys)
+            narrow.keys.append(target)
+        narrow.successor.append(number)
+        narrow.weight.append(probability)
+    narrow.column.append(column)
+    narrow.entry_count.append(len(updates))

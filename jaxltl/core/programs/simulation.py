@@ -79,7 +79,7 @@ def program_environment(
         _require_name(program, "label", name, {*program.labels, "deadlock"})
     try:
         _check_integers(program)
-        made = _simulation(program, () if reward is None else rewards[reward], names)
+        simulation = _simulation(program, () if reward is None else rewards[reward], names)
         values, size = initial_columns(program, _MAX_STARTS)
     except LanguageError as error:
         raise program.source.located(error) from None
@@ -89,11 +89,11 @@ def program_environment(
     variables = len(program.variables)
     return make_environment(
         Partial(_reset, columns),
-        Partial(made.step),
-        Partial(made.observe) if observe is None else observe,
-        actions=1 if chain else len(made.choices),
-        allowed=None if chain else Partial(made.allowed),
-        labels=Partial(made.labels),
+        Partial(simulation.step),
+        Partial(simulation.observe) if observe is None else observe,
+        actions=1 if chain else len(simulation.choices),
+        allowed=None if chain else Partial(simulation.allowed),
+        labels=Partial(simulation.labels),
         propositions=names,
         observations=make_box(0, 1, (variables,), jnp.result_type(float))
         if observe is None
@@ -229,10 +229,10 @@ class _Simulation:
         return jnp.stack([mask[0] | ~_any(mask), *mask[1:]])
 
     def labels(self, world: World) -> jax.Array:
-        found = [jnp.asarray(x) for x in self.conditions(world, jnp)]
+        marks = [jnp.asarray(x) for x in self.conditions(world, jnp)]
         if self.deadlock >= 0:
-            found[self.deadlock] = ~_any(self._enabled(world))
-        return jnp.stack(found) if found else jnp.zeros(0, bool)
+            marks[self.deadlock] = ~_any(self._enabled(world))
+        return jnp.stack(marks) if marks else jnp.zeros(0, bool)
 
     def observe(self, world: World) -> jax.Array:
         scaled = [(world[v.name] - v.low) / max(1, v.high - v.low) for v in self.variables]
@@ -262,8 +262,8 @@ def _simulation(
 
 def _command_expressions(command: Command) -> list[Expression]:
     """Probabilities and assigned values, in the order in which :func:`_update` reads them."""
-    found = [o.probability for o in command.outcomes]
-    return found + [a.expression for o in command.outcomes for a in o.assignments]
+    probabilities = [o.probability for o in command.outcomes]
+    return probabilities + [a.expression for o in command.outcomes for a in o.assignments]
 
 
 def _update(
@@ -321,11 +321,11 @@ def _check_integers(program: Program) -> None:
         _ends(e, ranges, known)
 
 
-def _require_32_bits(ends: _Ends, place: int, shown: object) -> None:
+def _require_32_bits(ends: _Ends, place: int, text: object) -> None:
     if ends[2] and not (ends[0] > -(2**31) and ends[1] < 2**31):
         raise LanguageError(
             place,
-            f"the integer {shown} may be {ends[0]:.9g} to {ends[1]:.9g}; a simulation has 32-bit "
+            f"the integer {text} may be {ends[0]:.9g} to {ends[1]:.9g}; a simulation has 32-bit "
             "integers. Write 1.0 * for a double, or build the model.",
         )
 

@@ -74,7 +74,7 @@ def find_orbits(program: Program, conditions: Sequence[Expression]) -> tuple[Orb
     if work * (len(live) + len(program.variables)) > _WORK:
         return ()
     before = _Exchange().form(live, conditions)
-    found: list[Orbit] = []
+    orbits: list[Orbit] = []
     for chain in _chains(program, live):
         runs = [[chain[0]]]
         for slot in chain[1:]:
@@ -83,12 +83,12 @@ def find_orbits(program: Program, conditions: Sequence[Expression]) -> tuple[Orb
                 runs[-1].append(slot)
             else:
                 runs.append([slot])
-        found += [orbit for run in runs if len(run) > 1 for orbit in _orbit(run)]
-    slots = [n for o in found for slot in o.slots for n in slot]
-    selectors = {n for o in found for n in o.selectors}
+        orbits += [orbit for run in runs if len(run) > 1 for orbit in _orbit(run)]
+    slots = [n for o in orbits for slot in o.slots for n in slot]
+    selectors = {n for o in orbits for n in o.selectors}
     # Exchanges of different orbits commute if no selector is in a slot.
     separate = len(set(slots)) == len(slots) and not selectors & set(slots)
-    return tuple(found) if separate else ()
+    return tuple(orbits) if separate else ()
 
 
 @dataclass(frozen=True)

@@ -94,33 +94,33 @@ class Functions(Numbers):
             return np.full(size, self._number(substitute(e, {})))
         table = np.stack([read(name).astype(np.int64) for name in names], 1)
         rows, inverse = np.unique(table, axis=0, return_inverse=True)
-        found = []
+        numbers = []
         for row in rows.tolist():
             values = {
                 n: literal(bool(v) if fields[n].variable.type == "bool" else v)
                 for n, v in zip(names, row, strict=True)
             }
-            found.append(self._number(substitute(e, values)))
-        return np.array(found, np.int64)[inverse.ravel()]
+            numbers.append(self._number(substitute(e, values)))
+        return np.array(numbers, np.int64)[inverse.ravel()]
 
     def _number(self, e: Expression) -> int:
         if e.is_literal and e.value in (0, 1):
             e = literal(int(e.value))
-        found = self.number.setdefault(e, len(self.expressions))
-        if found == len(self.expressions):
+        number = self.number.setdefault(e, len(self.expressions))
+        if number == len(self.expressions):
             self.expressions.append(e)
-        return found
+        return number
 
     def product(self, left: Weight, right: Weight) -> Weight:
         pairs, inverse = np.unique(np.stack([left, right], 1), axis=0, return_inverse=True)
-        found = []
+        numbers = []
         for a, b in pairs.tolist():
             if (a, b) not in self.products:
                 both = (self.expressions[a], self.expressions[b])
                 one = b if a == 1 else a if b == 1 else self._number(Expression("*", both))
                 self.products[a, b] = one
-            found.append(self.products[a, b])
-        return np.array(found, np.int64)[inverse.ravel()]
+            numbers.append(self.products[a, b])
+        return np.array(numbers, np.int64)[inverse.ravel()]
 
     def divided(self, weight: Weight, numbers: Integers) -> Weight:
         shares = [self._number(literal(1 / n)) for n in range(1, int(numbers.max()) + 1)]
