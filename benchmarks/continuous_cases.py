@@ -22,12 +22,15 @@ from jaxltl.algos import cce, ppo
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import ActorCritic
 from jaxltl.algos.common.schedules import Linear
-from jaxltl.core.continuous.certificate import Certificate, certify_policy, first_grid
+from jaxltl.core.continuous.certificate import Certificate, certify_policy, first_grid, state_policy
 from jaxltl.core.continuous.dynamics import Dynamics
-from jaxltl.core.continuous.learned_policy import state_policy
 from jaxltl.core.continuous.regions import box
-from jaxltl.core.continuous.shielded_dynamics import shield_dynamics
-from jaxltl.core.continuous.synthesis import CellPolicy, simulate_cells, synthesize_policy
+from jaxltl.core.continuous.synthesis import (
+    CellPolicy,
+    shield_dynamics,
+    simulate_cells,
+    synthesize_policy,
+)
 from jaxltl.core.environments import Environment, Timestep, Verdict, make_agent
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator

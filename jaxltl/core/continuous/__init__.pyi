@@ -1,12 +1,15 @@
-from .certificate import Certificate as Certificate, certify_policy as certify_policy
-from .counterexample import counterexample as counterexample
+from .certificate import (
+    Certificate as Certificate,
+    certify_policy as certify_policy,
+    counterexample as counterexample,
+    state_policy as state_policy,
+)
 from .dynamics import (
     Dynamics as Dynamics,
     make_dynamics as make_dynamics,
     to_environment as to_environment,
 )
 from .grid import Grid as Grid, make_grid as make_grid
-from .learned_policy import state_policy as state_policy
 from .noise import (
     Distribution as Distribution,
     from_cdf as from_cdf,
@@ -22,9 +25,9 @@ from .regions import (
     union as union,
     where_positive as where_positive,
 )
-from .shielded_dynamics import shield_dynamics as shield_dynamics
 from .synthesis import (
     CellPolicy as CellPolicy,
+    shield_dynamics as shield_dynamics,
     simulate_cells as simulate_cells,
     synthesize_policy as synthesize_policy,
 )

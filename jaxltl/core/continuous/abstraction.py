@@ -12,13 +12,17 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid
-from jaxltl.core.continuous.images import Images, NoiseBox, image_boxes
-from jaxltl.core.continuous.interval_iteration import iterate, reachable
+from jaxltl.core.continuous.images import Images, NoiseBox, Step, image_boxes
+from jaxltl.core.continuous.cell_solvers import (
+    Successors,
+    contained,
+    iterate,
+    reachable,
+    winning_cells,
+)
 from jaxltl.core.continuous.noise import Distribution
-from jaxltl.core.continuous.noise_gains import Step
 from jaxltl.core.continuous.task_product import TaskProduct, task_product
 from jaxltl.core.continuous.transition_bounds import TransitionBounds, transition_bounds
-from jaxltl.core.continuous.winning_cells import Successors, contained, winning_cells
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from jaxltl.core import validation
-from jaxltl.core.enclosures.enclose import enclose
+from jaxltl.core.enclosures.linear_bounds import enclose
 from jaxltl.core.pretty_print import brief
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array
-from jaxltl.core.enclosures.enclose import over_boxes
+from jaxltl.core.enclosures.linear_bounds import over_boxes
 from jaxltl.core.pretty_print import brief, count
 
 Floats = NDArray[np.float64]

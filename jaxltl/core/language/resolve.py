@@ -10,8 +10,9 @@ from graphlib import CycleError, TopologicalSorter
 from typing import TypeVar, cast
 
 from jaxltl.core.language.expressions import (
-    MAX_INTEGER,
     Expression,
+    LanguageError,
+    MAX_INTEGER,
     Type,
     Value,
     literal,
@@ -21,7 +22,6 @@ from jaxltl.core.language.expressions import (
     value_type,
 )
 from jaxltl.core.language.parser import ExpressionParser, parse_program
-from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import (
     Assignment,
     Constant,

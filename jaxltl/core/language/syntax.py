@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from jaxltl.core.language.expressions import Expression, Type, Value, names_in
-from jaxltl.core.language.source import Source
+from jaxltl.core.language.expressions import Expression, Source, Type, Value, names_in
 
 Kind = Literal["dtmc", "mdp", "smg"]
 

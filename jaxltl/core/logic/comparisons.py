@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.array_types import Booleans
-from jaxltl.core.language.compiled import compile_expressions
-from jaxltl.core.language.expressions import Expression, Type, Value, literal, names_in, type_of
-from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.expressions import (
+    Expression,
+    LanguageError,
+    Type,
+    Value,
+    compile_expressions,
+    literal,
+    names_in,
+    type_of,
+)
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
 

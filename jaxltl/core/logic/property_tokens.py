@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-from jaxltl.core.language.expressions import Expression, literal, substitute
+from jaxltl.core.language.expressions import Expression, LanguageError, literal, substitute
 from jaxltl.core.language.parser import ADDITIVE, ExpressionParser
-from jaxltl.core.language.source import LanguageError
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.ltl import pointed
 

@@ -12,18 +12,14 @@ from numpy.typing import NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.language.compiled import compile_expressions
-from jaxltl.core.language.expressions import Expression, literal
-from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.expressions import Expression, LanguageError, compile_expressions, literal
 from jaxltl.core.language.syntax import Program, RewardItem
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
-from jaxltl.core.programs.initial import initial_states
-from jaxltl.core.programs.bit_layout import Layout, Reader, Words, make_layout
-from jaxltl.core.programs.local_choices import state_text
-from jaxltl.core.programs.weights import Functions, Intervals, Numbers, Weight
+from jaxltl.core.programs.packed_states import Layout, Reader, Words, initial_states, make_layout
+from jaxltl.core.programs.local_choices import Functions, Intervals, Numbers, Weight, state_text
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 MAX_STATES = 10_000_000

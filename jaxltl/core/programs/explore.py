@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.expressions import LanguageError
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.programs.hash_table import HashTable
-from jaxltl.core.programs.bit_layout import Layout, Words
-from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
+from jaxltl.core.programs.packed_states import HashTable, Layout, Words
+from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode, Numbers, Weight
 from jaxltl.core.programs.scalar_search import search_narrow
 from jaxltl.core.programs.symmetry import Orbit
-from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges
 
 Progress = Callable[[int, int], None]  # of the numbers of states found and expanded
@@ -42,7 +40,7 @@ class Explored:
       owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
       entry_count: ``int64[R]``.
       successor: ``int32[T]``.
-      weight: ``[T]``, see :mod:`~jaxltl.core.programs.weights`.
+      weight: ``[T]``, see :mod:`~jaxltl.core.programs.local_choices`.
       rewards: by name the parts on states and choices.
     """
 

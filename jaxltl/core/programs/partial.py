@@ -10,8 +10,7 @@ import numpy as np
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.language.compiled import compile_expressions
-from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.expressions import LanguageError, compile_expressions
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic.bounded import Bounded, Earned
 from jaxltl.core.logic.comparisons import Comparison, program_definitions
@@ -22,10 +21,9 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
 from jaxltl.core.programs.explore import Search
-from jaxltl.core.programs.initial import initial_states
-from jaxltl.core.programs.bit_layout import Reader, make_layout
+from jaxltl.core.programs.packed_states import Reader, initial_states, make_layout
 from jaxltl.core.programs.symmetry import find_orbits
-from jaxltl.core.programs.weights import Numbers
+from jaxltl.core.programs.local_choices import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import complement_event

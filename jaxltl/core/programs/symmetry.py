@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxltl.core.language.expressions import FALSE, Expression, conjuncts, names_in
 from jaxltl.core.language.syntax import Command, Program
-from jaxltl.core.programs.bit_layout import Layout, Words
+from jaxltl.core.programs.packed_states import Layout, Words
 
 _WORK = 2_000_000  # nodes of expressions that are compared at most; about two seconds
 _COMMUTATIVE = frozenset(("&", "|", "+", "*", "=", "!=", "<=>", "min", "max"))

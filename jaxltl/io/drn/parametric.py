@@ -13,9 +13,8 @@ from typing import NoReturn, cast
 import numpy as np
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.language.expressions import Expression
+from jaxltl.core.language.expressions import Expression, LanguageError
 from jaxltl.core.language.parser import ExpressionParser
-from jaxltl.core.language.source import LanguageError
 from jaxltl.core.programs.build import MAX_STATES, build_rows
 from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
 from jaxltl.io.files import read_bytes

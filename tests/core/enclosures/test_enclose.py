@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxltl.core.enclosures.enclose import enclose, over_boxes
+from jaxltl.core.enclosures.linear_bounds import enclose, over_boxes
 
 # Constants are equal in single and double precision, so that all tests are of one function.
 MATRIX = np.random.default_rng(0).normal(size=(2, 5)).astype(np.float32).astype(float)

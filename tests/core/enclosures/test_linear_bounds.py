@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.enclosures import elementwise
-from jaxltl.core.enclosures.enclose import linear_bounds, over_boxes
 from jaxltl.core.enclosures.interval import Interval
+from jaxltl.core.enclosures.linear_bounds import linear_bounds, over_boxes
 from jaxltl.core.enclosures.program import Elementwise
 
 UNARY = {

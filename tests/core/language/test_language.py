@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.language.compiled import compile_expressions
-from jaxltl.core.language.expressions import substitute
+from jaxltl.core.language.expressions import compile_expressions, substitute
 from jaxltl.core.language.parser import parse_expression, parse_program
 from jaxltl.core.language.resolve import read_program
 

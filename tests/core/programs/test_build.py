@@ -8,7 +8,7 @@ from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.programs import hash_table, local_choices, scalar_search
+from jaxltl.core.programs import local_choices, packed_states, scalar_search
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
 
@@ -251,8 +251,8 @@ def test_variables_of_one_value_and_negative_ranges():
 def test_many_wide_levels_need_parts_and_a_larger_table(trial, monkeypatch):
     monkeypatch.setattr(local_choices, "_DENSE_BITS", 3)
     monkeypatch.setattr(local_choices, "_TRIAL", trial)  # 1: choices are soon evaluated directly
-    monkeypatch.setattr(hash_table, "_FIRST", 16)
-    monkeypatch.setattr(hash_table, "_PART", 7)
+    monkeypatch.setattr(packed_states, "_FIRST", 16)
+    monkeypatch.setattr(packed_states, "_PART", 7)
     model = built("""mdp module m x : [0..40]; [] x<40 -> (x'=x+1); [s] x=40 -> true; endmodule
     module n = m [x=y] endmodule module k = m [x=z] endmodule""")
     assert model.num_states == 41**3

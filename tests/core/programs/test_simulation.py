@@ -14,8 +14,7 @@ from jaxltl.core.environments.episodes import Agent, run_episode, with_time_limi
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
-from jaxltl.core.programs.choices import list_choices
-from jaxltl.core.programs.simulation import program_actions, program_environment
+from jaxltl.core.programs.simulation import list_choices, program_actions, program_environment
 
 CHAIN = """dtmc global g : [0..2];
 formula up = x<3 & b;

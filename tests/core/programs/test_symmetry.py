@@ -5,7 +5,7 @@ import pytest
 
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs import symmetry
-from jaxltl.core.programs.bit_layout import make_layout
+from jaxltl.core.programs.packed_states import make_layout
 from jaxltl.core.programs.partial import solve_program
 from jaxltl.core.programs.symmetry import find_orbits
 
