@@ -183,11 +183,11 @@ def synthesize(
         run_job.claim_directory(out, "game.toml", game_file.read_bytes(), again)
         held.enter_context(float64())
         progress = held.enter_context(_stages(synthesis.STAGES))
-        found = synthesis.synthesize(file, progress)
-        place = report.place_of(found, environment)
+        solved = synthesis.synthesize(file, progress)
+        place = report.place_of(solved, environment)
         progress("writing")
-        written = report.write(found, out, place, time.perf_counter() - begin)
-    click.echo(report.report_of(found).table(written))
+        written = report.write(solved, out, place, time.perf_counter() - begin)
+    click.echo(report.report_of(solved).table(written))
     click.echo(f"\nwrote {out}/result.json and the files beside it")
     if as_json:
         _print_json(written)
@@ -196,7 +196,7 @@ def synthesize(
             "the independent check refutes the result, which is a bug of jaxltl; "
             "please report it with the game file."
         )
-    synthesis.demand(found)
+    synthesis.demand(solved)
 
 
 @contextlib.contextmanager
@@ -378,8 +378,8 @@ def solve(
         ("--relative", reading["relative"] or None, False),
         ("--checkpoint", checkpoint, True),
     )
-    for option, given, with_mesh in options:
-        if given is not None and (devices.mesh is not None) != with_mesh:
+    for option, value, with_mesh in options:
+        if value is not None and (devices.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
     if devices.mesh is not None:
         compilation.use_cache(True)
@@ -396,26 +396,26 @@ def solve(
     with written as file, processes.process_group(devices, launch, say) as group, double():
         if program is not None and method == "partial":
             entry: Record = {"kind": program.kind}
-            found = solving.solve(program, questions, tolerance, max_states)
+            answers = solving.solve(program, questions, tolerance, max_states)
         elif group.mesh is None:
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            found = solving.solve(model, questions, tolerance, relative=reading["relative"])
+            answers = solving.solve(model, questions, tolerance, relative=reading["relative"])
         else:
             from jaxltl.app import solve_on_mesh
 
             sharded, fingerprint, entry = solve_on_mesh.read(model_file, questions, group)
             solver = solve_on_mesh.MeshSolver(group, sharded, fingerprint, tolerance, checkpoint)
             solver.agree(list(properties))
-            found = solver.solve(questions)
+            answers = solver.solve(questions)
         if group.is_first and "states" in entry:
             click.echo(
                 "{kind} of {states} states, {choices} choices, {transitions} transitions, "
                 "read in {seconds:.3f} s".format(**entry)
             )
         results = []
-        for result in found:
+        for result in answers:
             results.append(result)
             if group.is_first:
                 click.echo(f"\n{solving.text(result)}")

@@ -101,7 +101,7 @@ def test_every_example_is_valid(kind):
         ]
         valid = [x for x in tries if isinstance(x, Table)]
         assert valid, (key.name, tries)
-        assert valid[0].given()[key.name] is not None
+        assert valid[0].specified()[key.name] is not None
 
 
 def test_examples_of_names_of_files_are_valid():

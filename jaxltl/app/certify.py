@@ -89,8 +89,8 @@ def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
     if model is not None:
         from jaxltl.app.solve import load
 
-        given = load(model)
-        if not isinstance(given, SparseMDP):
+        source_model = load(model)
+        if not isinstance(source_model, SparseMDP):
             raise ValueError(f"{str(model)!r} has intervals already; solve it by `jaxltl solve`.")
         if labels is not None or terminal or initial:
             raise ValueError(
@@ -99,18 +99,20 @@ def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
             )
         if graph is not None:
             raise ValueError("a model has its graph; leave --graph and --least-probability out.")
-        return _named(given, align_counts(given, read_log(log, given)), "given")
+        return _named(
+            source_model, align_counts(source_model, read_log(log, source_model)), "given"
+        )
     counts = read_log(log)
     if not initial:
         raise ValueError(
             f"{str(log)!r} does not name the states in which episodes begin; add "
             f"{option.format('initial')}STATE. It has the states {_some(counts)}."
         )
-    for what, names in (("initial", initial), ("terminal", terminal)):
+    for option_name, names in (("initial", initial), ("terminal", terminal)):
         unknown = [x for x in names if x not in counts.states]
         if unknown:
             raise ValueError(
-                f"{option.format(what)}{unknown[0]}: the log has no such state; it "
+                f"{option.format(option_name)}{unknown[0]}: the log has no such state; it "
                 f"has {_some(counts)}."
             )
     known = None if labels is None else read_labels(labels, counts.states)
@@ -140,9 +142,9 @@ def graph_of_options(
 
 
 def _some(counts: TransitionCounts) -> str:
-    shown = ", ".join(counts.states[:8])
+    names = ", ".join(counts.states[:8])
     more = len(counts.states) - 8
-    return shown + (f" and {more} more" if more > 0 else "")
+    return names + (f" and {more} more" if more > 0 else "")
 
 
 def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
@@ -181,37 +183,37 @@ def text(evidence: Evidence, result: Record) -> str:
     ).rstrip("\n")
 
 
-def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> Record:
+def entry(evidence: Evidence, query: Query, guarantee: DataGuarantee, seconds: float) -> Record:
     """Guarantee from a log, as a JSON object."""
     return {
         "formula": query.formula,
         "objective": query.objective,
-        "bound": found.bound,
-        "optimistic": found.optimistic,
-        "confidence": found.confidence,
-        "assumption": found.assumption,
+        "bound": guarantee.bound,
+        "optimistic": guarantee.optimistic,
+        "confidence": guarantee.confidence,
+        "assumption": guarantee.assumption,
         "method": query.method,
-        "status": Status(int(found.satisfaction.solution.status)).name,
+        "status": Status(int(guarantee.satisfaction.solution.status)).name,
         "samples": int(evidence.counts.sum()),
-        "claims": found.sets.num_claims,
+        "claims": guarantee.sets.num_claims,
         "states": evidence.model.num_states,
         "choices": evidence.model.num_rows,
-        "sample_next": sample_next(evidence, found),
+        "sample_next": sample_next(evidence, guarantee),
         "seconds": seconds,
     }
 
 
-def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
+def sample_next(evidence: Evidence, guarantee: DataGuarantee) -> list[Record]:
     """Choices of which more samples improve the guarantee most, in decreasing order."""
     return [
         {
             "state": evidence.states[int(evidence.model.host.state[r])],
             "action": evidence.actions[r],
-            "gain": float(found.gain[r]),
-            "samples": int(found.sets.num_samples[r]),
+            "gain": float(guarantee.gain[r]),
+            "samples": int(guarantee.sets.num_samples[r]),
         }
-        for r in np.argsort(-found.gain, kind="stable")[:SHOWN].tolist()
-        if found.gain[r] > 1e-12
+        for r in np.argsort(-guarantee.gain, kind="stable")[:SHOWN].tolist()
+        if guarantee.gain[r] > 1e-12
     ]
 
 
@@ -275,10 +277,10 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
     best = certify(evidence, Query(formula, logged.confidence, logged.method, "max"))
     against = product(best.model, model.automaton, label_on=model.label_on)
     weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
-    found = satisfaction_probability(against, weights, nature="adversarial")
+    worst = satisfaction_probability(against, weights, nature="adversarial")
     share = np.asarray(evidence.model.initial)
-    lower = from_starts(against, found.lower)[share > 0]
-    codes = int(found.status), int(best.satisfaction.solution.status)
+    lower = from_starts(against, worst.lower)[share > 0]
+    codes = int(worst.status), int(best.satisfaction.solution.status)
     status = next((c for c in codes if c != Status.CONVERGED), int(Status.CONVERGED))
     return {
         "confidence": logged.confidence,
@@ -314,18 +316,18 @@ def certify_and_write(
         )
         evidence = read_evidence(log, source)
         begin = time.perf_counter()
-        found = certify(evidence, query)
-        result = entry(evidence, query, found, time.perf_counter() - begin)
+        guarantee = certify(evidence, query)
+        result = entry(evidence, query, guarantee, time.perf_counter() - begin)
         click.echo(text(evidence, result))
         if file is not None:
             about = json.dumps({**result, "seconds": None}, allow_nan=False)
-            learned = project_policy(evidence.model, found.satisfaction, states=evidence.states)
+            learned = project_policy(evidence.model, guarantee.satisfaction, states=evidence.states)
             save_policy(file, learned, {"result": about})
         if picture is not None and drawing is not None:
             from jaxltl import plot
 
             sizes, bound = curve(evidence, query)
             result["curve"] = {"samples": sizes, "bound": bound}
-            figure = plot.guarantees(sizes, {"guaranteed": bound}, reference=found.optimistic)
+            figure = plot.guarantees(sizes, {"guaranteed": bound}, reference=guarantee.optimistic)
             drawing.write(plot.to_bytes(figure, picture.suffix[1:]))
     return result

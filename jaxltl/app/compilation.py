@@ -108,6 +108,6 @@ def cache_directory() -> Path:
     elif sys.platform == "darwin":
         base = home / "Library" / "Caches"
     else:
-        given = os.environ.get("XDG_CACHE_HOME", "")
-        base = Path(given) if os.path.isabs(given) else home / ".cache"
+        xdg = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(xdg) if os.path.isabs(xdg) else home / ".cache"
     return base / "jaxltl" / "programs"

@@ -35,7 +35,7 @@ class Method:
     hparams: PyTree
     agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
     drawn: tuple[str, ...]  # names of the metrics that are drawn
-    kept: tuple[str, ...]  # names of the state's fields that determine a policy
+    policy_fields: tuple[str, ...]  # names of the state's fields that determine a policy
     transitions: int  # bound of the environment's steps in a step of the learner
     description: str  # of the policy
 
@@ -43,17 +43,17 @@ class Method:
 def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
     """The learner of a task file."""
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
-    found = make(task, environment, num_steps)
-    if found.transitions > _LARGEST_COUNT:
+    method = make(task, environment, num_steps)
+    if method.transitions > _LARGEST_COUNT:
         raise ValueError(
-            f"a step of the learner would make {found.transitions:,} simulated steps; at most "
+            f"a step of the learner would make {method.transitions:,} simulated steps; at most "
             f"{_LARGEST_COUNT:,} are counted: simulate fewer or shorter episodes."
         )
     # With concrete numbers, so that the learner's own checks see them.
     jax.eval_shape(
-        lambda key: found.algorithm.init(key, found.problem, found.hparams), jax.random.key(0)
+        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
     )
-    return found
+    return method
 
 
 _LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
@@ -62,13 +62,13 @@ _LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
 def _settings(task: EnvironmentFile) -> Record:
     """The method's keys, with pairs of numbers as schedules and lists as tuples."""
     steps = task.learner.steps
-    found = task.settings.given()
-    for name, value in found.items():
+    hparams = task.settings.specified()
+    for name, value in hparams.items():
         if isinstance(value, tuple):
-            found[name] = Linear(first=value[0], last=value[1], num_steps=steps)
+            hparams[name] = Linear(first=value[0], last=value[1], num_steps=steps)
         elif isinstance(value, list):
-            found[name] = tuple(value)
-    return found
+            hparams[name] = tuple(value)
+    return hparams
 
 
 def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, bool], Agent]:
@@ -156,6 +156,6 @@ def _costs_where_violated(
     step: Callable[..., Timestep], world: PyTree, action: PyTree, key: chex.PRNGKey
 ) -> Timestep:
     """Cost 1 where the formula is violated; its expected sum is the violation probability."""
-    found = Timestep(*step(world, action, key))
+    timestep = Timestep(*step(world, action, key))
     # An episode ends with the first such step.
-    return found._replace(cost=jnp.where(found.world.verdict == Verdict.VIOLATED, 1.0, 0.0))
+    return timestep._replace(cost=jnp.where(timestep.world.verdict == Verdict.VIOLATED, 1.0, 0.0))

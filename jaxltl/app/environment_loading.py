@@ -61,13 +61,13 @@ def load_world(task: EnvironmentFile) -> Environment | Dynamics:
 
 def _made_dynamics(name: str, arguments: Mapping[str, object], folder: Path) -> Dynamics:
     """The dynamics that a user's function returns."""
-    found = _called(name, _function(name, folder), arguments)
-    if isinstance(found, BenchmarkWorld):
-        return found.dynamics
-    if isinstance(found, Dynamics):
-        return found
+    value = _called(name, _function(name, folder), arguments)
+    if isinstance(value, BenchmarkWorld):
+        return value.dynamics
+    if isinstance(value, Dynamics):
+        return value
     raise ValueError(
-        f"{name!r} returns a {type(found).__name__}, no dynamics; let it return those of "
+        f"{name!r} returns a {type(value).__name__}, no dynamics; let it return those of "
         "make_dynamics, or write environment = for one that is only simulated."
     )
 
@@ -92,21 +92,21 @@ def _made(
     root, _, rest = name.partition(":")
     if root in PACKAGES and rest:
         return _of_package(root, rest, arguments, labels, propositions)
-    found = _called(name, _function(BUILT_IN.get(name, name), folder), arguments)
-    if isinstance(found, Dynamics):
+    environment = _called(name, _function(BUILT_IN.get(name, name), folder), arguments)
+    if isinstance(environment, Dynamics):
         raise ValueError(f"{name!r} returns dynamics; write dynamics = {name!r} for them.")
-    if not isinstance(found, Environment):
+    if not isinstance(environment, Environment):
         raise ValueError(
-            f"{name!r} returns a {type(found).__name__}, no Environment; let it return one of "
+            f"{name!r} returns a {type(environment).__name__}, no Environment; let it return one of "
             "make_environment, or of an adapter such as from_gymnax."
         )
     if labels is None:
-        return found
+        return environment
     with _user_errors("labels"):
         names = ["actions", "allowed", "observations", "horizon", "starts", "outcomes", "ending"]
         return make_environment(
-            *(found.reset, found.step, found.observe),
-            **{name: getattr(found, name) for name in names},
+            *(environment.reset, environment.step, environment.observe),
+            **{name: getattr(environment, name) for name in names},
             labels=labels,
             propositions=propositions,
         )
@@ -131,8 +131,8 @@ def _of_package(
     adapter = getattr(importlib.import_module("jaxltl.envs"), f"from_{root}")
     ours = {x: arguments[x] for x in inspect.getfullargspec(adapter).kwonlyargs if x in arguments}
     with _user_errors(f"{root}:{name}"):
-        made = make(name, **extra, **{k: v for k, v in arguments.items() if k not in ours})
-        pair = made if isinstance(made, tuple) else (made,)
+        value = make(name, **extra, **{k: v for k, v in arguments.items() if k not in ours})
+        pair = value if isinstance(value, tuple) else (value,)
         return adapter(*pair, **ours | {"labels": labels, "propositions": propositions})
 
 
@@ -146,8 +146,8 @@ def _function(name: str, folder: Path) -> Callable[..., Any]:
             f"for a file beside the task file, or one of {known}."
         )
     module = _module_of_file(folder / place) if place.endswith(".py") else _module(place)
-    found = getattr(module, attribute, None)
-    if not callable(found):
+    value = getattr(module, attribute, None)
+    if not callable(value):
         there = [
             n
             for n, x in vars(module).items()
@@ -159,7 +159,7 @@ def _function(name: str, folder: Path) -> Callable[..., Any]:
         raise ValueError(
             f"{attribute!r} {is_} in {place!r}; its functions are {', '.join(there) or '(none)'}."
         )
-    return found
+    return value
 
 
 def _module(name: str) -> ModuleType:

@@ -28,7 +28,7 @@ from jaxltl.app.wording import Record
 
 _COARSE = 1e-6  # width of the enclosure of a probability that is positive or not
 _LOSS = 1e-9  # of the best probability, that counts as a rounding error
-_KEPT = 3  # policies that are compared after mixing for the expected steps
+_COMPARED = 3  # policies that are compared after mixing for the expected steps
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,12 @@ class Guarantee:
     # until a mistake has left the best probability; later ones are not used
     used: np.ndarray | None = None
 
-    def unused(self, shown: Trajectories) -> np.ndarray:
+    def unused(self, demonstrations: Trajectories) -> np.ndarray:
         """``bool[N, T]``, the steps after the formula or the best probability is lost."""
-        length = np.asarray(shown.length) if self.used is None else self.used
-        return np.asarray(shown.mask) & (np.arange(shown.state.shape[1]) >= length[:, None])
+        length = np.asarray(demonstrations.length) if self.used is None else self.used
+        return np.asarray(demonstrations.mask) & (
+            np.arange(demonstrations.state.shape[1]) >= length[:, None]
+        )
 
     @property
     def allowed(self) -> np.ndarray | None:
@@ -63,68 +65,70 @@ class Guarantee:
 def ask(
     model: Product,
     world: World,
-    shown: Trajectories,
+    demonstrations: Trajectories,
     best: Solution,
     requested: str | float,
     over: str = "mean",
 ) -> Guarantee:
     """Guarantee for a product, as the task file requests it."""
-    nothing = np.zeros(np.shape(shown.state), bool)
+    nothing = np.zeros(np.shape(demonstrations.state), bool)
     if requested == "none":
-        used = used_steps(model, best, nothing, shown)
+        used = used_steps(model, best, nothing, demonstrations)
         return Guarantee(requested, over, best, None, nothing, None, used=used)
     if not isinstance(requested, str):
         require_attainable(model, best, requested, over, world.place)
         if requested == 1:  # attained by optimal policies alone
             requested = "best"
     actions = optimal_actions(model, best)
-    lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
-    used = used_steps(model, best, lost if isinstance(requested, str) else nothing, shown)
+    lost, cost = _losing(model, best, np.asarray(actions.allowed), demonstrations)
+    used = used_steps(model, best, lost if isinstance(requested, str) else nothing, demonstrations)
     lost_use = (lost & (np.arange(lost.shape[1]) < used[:, None])).sum(1)
     useless = np.flatnonzero((used > 0) & (lost_use == used))
     if not isinstance(requested, str):
         return Guarantee(requested, over, best, actions, nothing, None, not useless.size, used)
     if useless.size:
         n, count = useless[0], int(lost_use[useless[0]])
-        first = "its first step" if shown.length[n] > 1 else "its only step"
-        what = first if count == 1 else f"each of its {count} steps"
+        first = "its first step" if demonstrations.length[n] > 1 else "its only step"
+        steps = first if count == 1 else f"each of its {count} steps"
         raise ValueError(
-            f"demonstration {n + 1}: {what} lowers the best probability of satisfying the formula, "
+            f"demonstration {n + 1}: {steps} lowers the best probability of satisfying the formula, "
             'so that none is left to learn from; leave it out, or write guarantee = "none".'
         )
     return Guarantee(requested, over, best, actions, lost, cost, used=used)
 
 
 def used_steps(
-    model: Product, best: Solution, mistake: np.ndarray, shown: Trajectories
+    model: Product, best: Solution, mistake: np.ndarray, demonstrations: Trajectories
 ) -> np.ndarray:
     """Steps ``int[N]`` until the formula is lost, or a mistake leads to less probability."""
-    state = np.asarray(shown.state)
-    memory, inside = memory_along(model, state), np.asarray(shown.mask)
+    state = np.asarray(demonstrations.state)
+    memory, inside = memory_along(model, state), np.asarray(demonstrations.mask)
     value, upper = (np.asarray(x, float)[state, memory] for x in (best.value, best.upper))
     less = mistake[:, :-1] & inside[:, 1:] & (value[:, 1:] < value[:, :-1] - _LOSS)
     gone = inside & (upper <= 0)
     gone[:, 1:] |= less
-    length = np.asarray(shown.length)
+    length = np.asarray(demonstrations.length)
     used = np.where(gone.any(1), gone.argmax(1), length)
     return used if used.any() else length  # else there is nothing to learn from
 
 
-def mistakes(model: Product, allowed: np.ndarray, shown: Trajectories) -> np.ndarray:
+def mistakes(model: Product, allowed: np.ndarray, demonstrations: Trajectories) -> np.ndarray:
     """The demonstrated steps ``bool[N, T]`` that a mask ``bool[S, Q, A]`` does not allow."""
-    state, action = np.asarray(shown.state), np.asarray(shown.action)
-    found: np.ndarray = np.asarray(shown.mask) & ~allowed[state, memory_along(model, state), action]
-    return found
+    state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
+    wrong: np.ndarray = (
+        np.asarray(demonstrations.mask) & ~allowed[state, memory_along(model, state), action]
+    )
+    return wrong
 
 
 def _losing(
-    model: Product, best: Solution, allowed: np.ndarray, shown: Trajectories
+    model: Product, best: Solution, allowed: np.ndarray, demonstrations: Trajectories
 ) -> tuple[np.ndarray, tuple[float, float] | None]:
     """The steps that are not allowed, and the maximal probability before and after the first."""
-    lost = mistakes(model, allowed, shown)
+    lost = mistakes(model, allowed, demonstrations)
     if not lost.any():
         return lost, None
-    state, action = np.asarray(shown.state), np.asarray(shown.action)
+    state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
     memory = memory_along(model, state)
     first = tuple(np.argwhere(lost)[0])
     s, q, a = state[first], memory[first], action[first]
@@ -155,55 +159,57 @@ def check_formula(automaton: Automaton) -> str | None:
 
 
 def left_out(
-    model: Product, guarantee: Guarantee, shown: Trajectories
+    model: Product, guarantee: Guarantee, demonstrations: Trajectories
 ) -> list[tuple[int, int, int]]:
     """World state, memory state and action of the steps that are left out, each once."""
-    state, action = np.asarray(shown.state), np.asarray(shown.action)
-    marked = guarantee.forbidden | guarantee.unused(shown)
+    state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
+    marked = guarantee.forbidden | guarantee.unused(demonstrations)
     if not marked.any():
         return []
     steps = np.stack([state, memory_along(model, state), action], -1)[marked]
     return [(s, q, a) for s, q, a in np.unique(steps, axis=0).tolist()]
 
 
-def kept(
+def guarantee_entry(
     guarantee: Guarantee,
     attempt: Attempt | None,
     model: Product,
     world: World,
-    shown: Trajectories,
+    demonstrations: Trajectories,
     solution: Solution,
 ) -> Record:
     """The guarantee and how it was attained, for ``result.json``."""
-    found: Record = {"asked": guarantee.requested, "over": guarantee.over}
+    record: Record = {"asked": guarantee.requested, "over": guarantee.over}
     if guarantee.requested == "best" and guarantee.actions is not None:
-        found["loss"] = guarantee.actions.loss
+        record["loss"] = guarantee.actions.loss
     if attempt is not None:
-        found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
-        state, action = np.asarray(shown.state), np.asarray(shown.action)
+        record |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
+        state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
         taken = attempt.policy[state, memory_along(model, state), action] > 0
-        found["never"] = int((np.asarray(shown.mask) & ~guarantee.unused(shown) & ~taken).sum())
-    if unused := int(guarantee.unused(shown).sum()):
-        found["unused"] = {"steps": unused, "of": int(np.sum(shown.length))}
-    left = guarantee.forbidden & ~guarantee.unused(shown)
-    if left.any():
-        n, t = np.argwhere(left)[0]
+        record["never"] = int(
+            (np.asarray(demonstrations.mask) & ~guarantee.unused(demonstrations) & ~taken).sum()
+        )
+    if unused := int(guarantee.unused(demonstrations).sum()):
+        record["unused"] = {"steps": unused, "of": int(np.sum(demonstrations.length))}
+    excluded = guarantee.forbidden & ~guarantee.unused(demonstrations)
+    if excluded.any():
+        n, t = np.argwhere(excluded)[0]
         before, after = guarantee.cost or (None, None)
-        found["left_out"] = {
-            "steps": int(left.sum()),
-            "of": int(np.sum(shown.length)),
+        record["left_out"] = {
+            "steps": int(excluded.sum()),
+            "of": int(np.sum(demonstrations.length)),
             "demonstration": int(n) + 1,
             "step": int(t) + 1,
             "from": before,
             "to": after,
-            **world.where(int(np.asarray(shown.state)[n, t])),
+            **world.where(int(np.asarray(demonstrations.state)[n, t])),
         }
     if guarantee.requested == "none":
         missing = at_starts(model, np.subtract(guarantee.best.value, solution.value), "mean")[0]
         if missing > 1e-3:  # the guarantee of the remedy
             sure = optimal_actions(model, guarantee.best).attained
-            found["remedy"] = at_starts(model, sure.lower, "mean")[0]
-    return found
+            record["remedy"] = at_starts(model, sure.lower, "mean")[0]
+    return record
 
 
 # --- a probability ---------------------------------------------------------------------------
@@ -258,12 +264,14 @@ class Search(Generic[Learned]):
             return first
         more = self.constrained() if is_weighable(self.model) else []
         tried = [first, *(self._attempt(learned, weight) for learned, weight in more)]
-        found = [one for one in tried if one.attained >= requested]
+        candidates = [one for one in tried if one.attained >= requested]
         quickest = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
         # A learned policy that delays satisfaction leaves no share for other actions.
         for sure in (policy, quickest.astype(float)):
-            found += [self._mixed(one, sure, inside) for one in tried if one.attained < requested]
-        likeliest = sorted(found, key=lambda one: one.neg_log_likelihood)[:_KEPT]
+            candidates += [
+                self._mixed(one, sure, inside) for one in tried if one.attained < requested
+            ]
+        likeliest = sorted(candidates, key=lambda one: one.neg_log_likelihood)[:_COMPARED]
         return min(likeliest, key=lambda one: self._loss(self.within_steps(one.policy)))
 
     def _loss(self, policy: np.ndarray) -> float:
@@ -277,7 +285,12 @@ class Search(Generic[Learned]):
     def _mixed(self, below: Attempt, sure: np.ndarray, inside: Learned) -> Attempt:
         """The mixture with the least share of a policy of optimal actions."""
         requested, over = float(self.guarantee.requested), self.guarantee.over
-        found = probable_mixture(self.model, below.policy, sure, requested, over)
+        mixture = probable_mixture(self.model, below.policy, sure, requested, over)
         return Attempt(
-            found.policy, self._loss(found.policy), found.attained, None, found.share, inside
+            mixture.policy,
+            self._loss(mixture.policy),
+            mixture.attained,
+            None,
+            mixture.share,
+            inside,
         )

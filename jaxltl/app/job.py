@@ -27,10 +27,10 @@ from jaxltl.core.models.protocols import PyTree
 Hparams = TypeVar("Hparams")
 
 
-def settings(kind: Callable[..., Hparams], given: Result) -> Hparams:
+def settings(kind: Callable[..., Hparams], values: Result) -> Hparams:
     """A learner's Hparams with the given keys that it has; ``method`` names the learner."""
     names = inspect.signature(kind).parameters.keys() - {"method"}
-    return kind(**{name: value for name, value in given.items() if name in names})
+    return kind(**{name: value for name, value in values.items() if name in names})
 
 
 def run_seeds(
@@ -50,7 +50,7 @@ def run_seeds(
         make = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
         states = make(np.arange(training.num_seeds), np.int32(training.seed), problem, hparams)
     report = training.report
-    found = run_in_chunks(
+    chunks = run_in_chunks(
         algorithm.step,
         states,
         problem,
@@ -65,8 +65,8 @@ def run_seeds(
         ),
     )
     if mesh is not None:  # later work is done in each process
-        found = found._replace(state=jax.tree.map(jnp.asarray, on_host(found.state)))
-    return found, {"step": found.step, **vars(found.metrics)}
+        chunks = chunks._replace(state=jax.tree.map(jnp.asarray, on_host(chunks.state)))
+    return chunks, {"step": chunks.step, **vars(chunks.metrics)}
 
 
 @functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
@@ -160,8 +160,8 @@ def learning_picture(
     history: Mapping[str, np.ndarray], caption: str, show: Sequence[str]
 ) -> Picture:
     """The picture of some learning curves."""
-    shown = {k: history[k].T for k in show if k in history}
-    drawn = drawing("curves", shown, steps=history["step"])
+    series = {k: history[k].T for k in show if k in history}
+    drawn = drawing("curves", series, steps=history["step"])
     return Picture("learning.svg", "Learning", drawn, caption, "learning")
 
 

@@ -28,7 +28,7 @@ from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demon
 from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import World, load_world
 from jaxltl.algos.mlirl.constrained import Point, constrained_points
-from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, kept
+from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, guarantee_entry
 from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, step_bound
 from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
@@ -109,8 +109,8 @@ def _train(
     table, model = setup.task.learner, setup.model
     options = Options(until=Partial(_ends, table.tolerance), keep="before")
     steps = num_steps or table.steps
-    found, history = run_seeds(mlirl, problem, hparams, training, num_steps=steps, options=options)
-    states = jax.device_get(dataclasses.replace(found.state, key=None))
+    chunks, history = run_seeds(mlirl, problem, hparams, training, num_steps=steps, options=options)
+    states = jax.device_get(dataclasses.replace(chunks.state, key=None))
     weights = states.parameters
     lanes = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(len(weights))]
     each = [jax.device_get(_policy_and_likelihood(one, problem, hparams)) for one in lanes]
@@ -146,7 +146,7 @@ def _ends(
 def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Attempt | None]:
     """Learning under the guarantee: all seeds, the kept one, and how a probability is attained."""
     guarantee, problem = setup.guarantee, setup.problem
-    hparams = settings(mlirl.Hparams, setup.task.learner.given())
+    hparams = settings(mlirl.Hparams, setup.task.learner.specified())
     if isinstance(guarantee.requested, str):
         learned = _train(setup, problem, hparams, training)
         return learned, _least_loss(learned), None
@@ -171,13 +171,13 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
     training.stage("searching")
     if policy is None:
         policy = np.asarray(actions.policy if actions else free.policy[0])
-    found = search.at_least(free, policy, inside or free)
-    kept = dataclasses.replace(
-        found.learned,
-        policy=found.policy[None],
-        neg_log_likelihood=np.array([found.neg_log_likelihood]),
+    attempt = search.at_least(free, policy, inside or free)
+    learned_policy = dataclasses.replace(
+        attempt.learned,
+        policy=attempt.policy[None],
+        neg_log_likelihood=np.array([attempt.neg_log_likelihood]),
     )
-    return kept, 0, found
+    return learned_policy, 0, attempt
 
 
 def _constrained(
@@ -203,8 +203,8 @@ def _constrained(
     # The likelihood has several maxima: from the free weights, and from the initial ones.
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), 0)
     starts = [free.weights[0], np.asarray(mlirl.init(key, problem, hparams).parameters)]
-    most = max(_STATE_STEPS // setup.model.num_states, int(free.num_steps[0]) // 2)
-    points = constrained_points(evaluate, starts, required, min(most, _EVALUATIONS))
+    max_evaluations = max(_STATE_STEPS // setup.model.num_states, int(free.num_steps[0]) // 2)
+    points = constrained_points(evaluate, starts, required, min(max_evaluations, _EVALUATIONS))
     enough = [point for point in points if point.probability > required]
     # Mixed with optimal actions, each step that is not optimal keeps a share of its probability.
     allowed = np.asarray(guarantee.actions.allowed) if guarantee.actions else False
@@ -212,8 +212,8 @@ def _constrained(
     top = max(required, max((point.probability for point in points), default=0))
 
     def mixed_loss(point: Point) -> float:
-        left = max(top + _GAP - point.probability, _GAP)
-        return point.loss if enough else point.loss + lost * np.log(left)
+        share = max(top + _GAP - point.probability, _GAP)
+        return point.loss if enough else point.loss + lost * np.log(share)
 
     if not points:
         return []
@@ -315,16 +315,20 @@ class Setup:
     @functools.cached_property
     def features(self) -> mlirl.Features:
         """The features of the reward, in the world or in the product (chapter 2)."""
-        table, model, shown = self.task.learner, self.model, self.used
+        table, model, demonstrations = self.task.learner, self.model, self.used
         avoid = table.avoid or ()
         if table.in_world:
             return mlirl.world_features(
-                model.mdp, shown, goal=table.goal or (), progress=table.progress_labels, avoid=avoid
+                model.mdp,
+                demonstrations,
+                goal=table.goal or (),
+                progress=table.progress_labels,
+                avoid=avoid,
             )
         # Without a guarantee, those of the dissertation's Table 1 alone.
         best = None if self.guarantee.requested == "none" else self.guarantee.best
         return mlirl.task_features(
-            model, shown, avoid=avoid, progress=table.progress_states, best=best
+            model, demonstrations, avoid=avoid, progress=table.progress_states, best=best
         )
 
     @functools.cached_property
@@ -361,17 +365,17 @@ def prepare(task: MlirlFile, seed: int) -> Setup:
     best = optimal_satisfaction(model)
     table = task.demonstrations
     if table.file is not None:
-        shown, dropped = load_demonstrations(task, world), 0
+        demonstrations, dropped = load_demonstrations(task, world), 0
     else:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        shown, dropped = synthetic_demonstrations(task.path, table, model, key, best)
+        demonstrations, dropped = synthetic_demonstrations(task.path, table, model, key, best)
     with errors_in(f"{task.path}: [task] "):
-        guarantee = ask(model, world, shown, best, task.guarantee, task.over)
+        guarantee = ask(model, world, demonstrations, best, task.guarantee, task.over)
         actions = guarantee.actions or optimal_actions(model, best)
         bound = step_bound(
             model, actions, guarantee.requested, task.over, task.steps, task.steps_factor
         )
-    setup = Setup(task, world, model, shown, dropped, guarantee, bound, trivial)
+    setup = Setup(task, world, model, demonstrations, dropped, guarantee, bound, trivial)
     with errors_in(f"{task.path}: [learner] "):
         _ = setup.problem  # raises its errors before learning
     return setup
@@ -448,7 +452,7 @@ def summary(outcome: Outcome) -> Record:
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
-        "guarantee": kept(
+        "guarantee": guarantee_entry(
             setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution
         ),
         "trivial": setup.trivial,
@@ -490,11 +494,11 @@ def _within_steps(setup: Setup, learned: Learned, chosen: int) -> tuple[Learned,
     counts = np.asarray(setup.problem.counts)
     if setup.task.learner.in_world:
         counts = np.zeros_like(before)
-    kept = bound.keep(model, before)
-    steps = about_steps(model, bound, before, kept, counts)
-    if kept.share:
+    mixture = bound.keep(model, before)
+    steps = about_steps(model, bound, before, mixture, counts)
+    if mixture.share:
         policy, loss = learned.policy.copy(), learned.neg_log_likelihood.copy()
-        policy[chosen], loss[chosen] = kept.policy, neg_log_likelihood(kept.policy, counts)
+        policy[chosen], loss[chosen] = mixture.policy, neg_log_likelihood(mixture.policy, counts)
         learned = dataclasses.replace(learned, policy=policy, neg_log_likelihood=loss)
     return learned, steps
 

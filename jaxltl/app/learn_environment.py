@@ -134,30 +134,34 @@ def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | No
 
 def _reward(task: EnvironmentFile, automaton: Automaton) -> Record:
     """The options of the reward, shaped by default where that changes no optimal policy."""
-    given = {key: value for key, value in task.task.given().items() if key != "formula"}
-    shaping = given.pop("shaping", "auto")
+    reward_options = {
+        key: value for key, value in task.task.specified().items() if key != "formula"
+    }
+    shaping = reward_options.pop("shaping", "auto")
     own = (
         getattr(task.settings, "discount", 1.0) or 1.0
     )  # the learner's; shaping takes it into account
     if shaping == "auto":
         shaping = "none"
-        options = {key: value for key, value in given.items() if key != "ending"}
+        options = {key: value for key, value in reward_options.items() if key != "ending"}
         plain = make_task_reward(automaton, verdicts(automaton), **options)
         # Others compare rewards of whole episodes, which keep the potential where they are cut off.
         if task.learner.method == "ppo" and is_discounted(plain.discount, verdicts(automaton), own):
             shaping = "distance"
             if plain.name in ("reach", "keep"):  # with shaping the default would be less than 1
-                given.setdefault("discount", 1.0)
+                reward_options.setdefault("discount", 1.0)
     if shaping == "none":
-        return given
-    return {**given, "shaping": shaping, "learner_discount": own}
+        return reward_options
+    return {**reward_options, "shaping": shaping, "learner_discount": own}
 
 
 def describe(setup: Setup) -> str:
     """Sizes of the environment, of learning and of the evaluation, as text."""
-    task, made = setup.task, setup.environment
-    actions = made.actions
-    shapes = jax.eval_shape(lambda key: made.observe(made.reset(key)), jax.random.key(0))
+    task, environment = setup.task, setup.environment
+    actions = environment.actions
+    shapes = jax.eval_shape(
+        lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
+    )
     seen = sum(x.size for x in jax.tree.leaves(shapes))
     does = (
         f"{actions.num} actions"
@@ -167,7 +171,7 @@ def describe(setup: Setup) -> str:
     steps = task.learner.steps
     return (
         f"{task.world.function}: {does}, {many(seen, 'number')} observed, "
-        f"{many(len(made.propositions), 'label')}; {many(len(setup.automaton.delta), 'automaton state')} "
+        f"{many(len(environment.propositions), 'label')}; {many(len(setup.automaton.delta), 'automaton state')} "
         f"({setup.automaton.acceptance}); {task.learner.method} with "
         f"{setup.method.description}: {many(steps, 'step')} of at most "
         f"{setup.method.transitions:,} simulated steps, {steps * setup.method.transitions:,} in "
@@ -187,12 +191,12 @@ def learn(setup: Setup, training: Training) -> Outcome:
     """Learns with N seeds, selects the best by separate episodes, and evaluates all of them."""
     method, seed, num_seeds = setup.method, training.seed, training.num_seeds
     parts = method.algorithm, method.problem, method.hparams
-    found, history = run_seeds(*parts, training, num_steps=setup.task.learner.steps)
+    chunks, history = run_seeds(*parts, training, num_steps=setup.task.learner.steps)
     # A single cost of a search is a curve like others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
     # Distinct from all keys of the learner.
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2), 3)
-    states = [jax.tree.map(lambda x, i=i: x[i], found.state) for i in range(num_seeds)]
+    states = [jax.tree.map(lambda x, i=i: x[i], chunks.state) for i in range(num_seeds)]
     agents = [_acting(setup, state) for state in states]
     chosen = 0
     if num_seeds > 1:
@@ -207,12 +211,12 @@ def learn(setup: Setup, training: Training) -> Outcome:
     ]
     training.stage("drawing")
     run = partial(jax.jit(run_episode, static_argnames="num_steps"), num_steps=setup.num_steps)
-    shown = [
+    episodes = [
         jax.device_get(run(jax.random.fold_in(keys[2], i), setup.environment, agents[chosen]))
         for i in range(_DRAWN)
     ]
     proof = _proven(setup, states[chosen], training.stage)
-    return Outcome(setup, found.state, history, chosen, each, shown, seed, proof)
+    return Outcome(setup, chunks.state, history, chosen, each, episodes, seed, proof)
 
 
 def _proven(setup: Setup, state: PyTree, say: Report) -> proofs.Proof | str | None:
@@ -229,15 +233,15 @@ def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> proofs.Proof
     """The certificate of an agent that was learned in dynamics, and a run if it is refuted."""
     assert setup.dynamics is not None
     table = setup.task.proof
-    options: ProofOptions = {**table.given(), "report": say}  # type: ignore[typeddict-item]
+    options: ProofOptions = {**table.specified(), "report": say}  # type: ignore[typeddict-item]
     policy = state_policy(agent, setup.environment)
-    found = certify_policy(setup.dynamics, policy, formula, **options)
-    if found.initial_bounds[1] >= (table.threshold or 1 - (table.tolerance or 1e-3)):
-        return proofs.Proof(found)
+    certificate = certify_policy(setup.dynamics, policy, formula, **options)
+    if certificate.initial_bounds[1] >= (table.threshold or 1 - (table.tolerance or 1e-3)):
+        return proofs.Proof(certificate)
     say("searching a run that violates the formula")
     key, steps = jax.random.key(0), setup.num_steps
-    run = counterexample(setup.dynamics, policy, formula, key, found, steps)
-    return proofs.Proof(found, run)
+    run = counterexample(setup.dynamics, policy, formula, key, certificate, steps)
+    return proofs.Proof(certificate, run)
 
 
 def _acting(setup: Setup, state: PyTree) -> Agent:
@@ -266,14 +270,14 @@ def _unshaped(environment: Environment) -> Environment:
     )
 
 
-def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
+def _merit(setup: Setup, evaluation: Evaluation) -> tuple[float, float, float]:
     """Lexicographic criterion of seeds: verdicts, then accepting visits or length."""
-    success, violation, visits = found.success, found.violation, found.visits
+    success, violation, visits = evaluation.success, evaluation.violation, evaluation.visits
     assert success is not None and violation is not None and visits is not None
     if setup.automaton.is_safety:  # an undecided episode does not violate it
         return -violation.mean, success.mean, 0.0
     if setup.automaton.is_cosafe:
-        return success.mean, -violation.mean, -found.length.mean
+        return success.mean, -violation.mean, -evaluation.length.mean
     return success.mean - violation.mean, visits.mean, 0.0
 
 
@@ -283,7 +287,11 @@ def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
 def summary(outcome: Outcome) -> Record:
     """The result as a JSON object."""
     setup, history = outcome.setup, outcome.history
-    task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
+    task, environment, evaluation = (
+        setup.task,
+        setup.environment,
+        outcome.evaluations[outcome.chosen],
+    )
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
     status = history["status"][:, outcome.chosen]
     return plain(
@@ -292,23 +300,23 @@ def summary(outcome: Outcome) -> Record:
             "environment": {
                 "name": task.world.function,
                 "arguments": task.world.arguments,
-                "propositions": list(made.propositions),
-                "horizon": made.horizon,
-                "actions": made.actions.num
-                if isinstance(made.actions, Finite)
-                else list(made.actions.shape),
+                "propositions": list(environment.propositions),
+                "horizon": environment.horizon,
+                "actions": environment.actions.num
+                if isinstance(environment.actions, Finite)
+                else list(environment.actions.shape),
             },
             "num_memory": len(setup.automaton.delta),
             "acceptance": setup.automaton.acceptance,
             "trivial": setup.trivial,
             "policy": {"made_of": setup.method.description, "acts": setup.acts},
-            "evaluation": _as_numbers(kept),
+            "evaluation": _as_numbers(evaluation),
             "training": {
                 "steps": task.learner.steps,
                 "transitions": _transitions(outcome),
                 "troubled_rows": int((status > Status.COMPLETED).sum()),
                 "last": last,
-                "hyperparameters": task.settings.given(),
+                "hyperparameters": task.settings.specified(),
             },
             "seeds": {
                 "first": outcome.seed,
@@ -325,15 +333,15 @@ def summary(outcome: Outcome) -> Record:
 def _transitions(outcome: Outcome) -> int:
     """Simulated steps of a seed: the learner's count, or an upper bound."""
     counted = outcome.history.get("transitions")
-    most = outcome.setup.task.learner.steps * outcome.setup.method.transitions
-    return int(counted[-1, 0]) if counted is not None else most
+    upper = outcome.setup.task.learner.steps * outcome.setup.method.transitions
+    return int(counted[-1, 0]) if counted is not None else upper
 
 
-def _as_numbers(found: Evaluation) -> Record:
+def _as_numbers(evaluation: Evaluation) -> Record:
     return {
-        **{k: vars(x) if isinstance(x, Estimate) else x for k, x in vars(found).items()},
-        "status": found.status.name,
-        "estimates": [n for n in ESTIMATES if getattr(found, n) is not None],
+        **{k: vars(x) if isinstance(x, Estimate) else x for k, x in vars(evaluation).items()},
+        "status": evaluation.status.name,
+        "estimates": [n for n in ESTIMATES if getattr(evaluation, n) is not None],
     }
 
 
@@ -350,13 +358,13 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """Pictures of learning curves and episodes."""
-    found = [learning_picture(outcome.history, _caption(outcome), _drawn(outcome))]
+    drawings = [learning_picture(outcome.history, _caption(outcome), _drawn(outcome))]
     drawn = _pictured(outcome)
-    found = found if drawn is None else [drawn, *found]
+    drawings = drawings if drawn is None else [drawn, *drawings]
     dynamics, proof = outcome.setup.dynamics, outcome.proof
     if dynamics is None or not isinstance(proof, proofs.Proof):
-        return found
-    return [proofs.picture(proof, dynamics, outcome.episodes), *found]
+        return drawings
+    return [proofs.picture(proof, dynamics, outcome.episodes), *drawings]
 
 
 def live(outcome: Outcome) -> list[Curves]:
@@ -416,8 +424,8 @@ def save(out: Path, outcome: Outcome) -> None:
 
 def _parts(method: Method, state: PyTree) -> list[tuple[str, PyTree]]:
     """Names and arrays of a state that determine a policy."""
-    kept = {name: getattr(state, name) for name in method.kept}
-    leaves, _ = jax.tree_util.tree_flatten_with_path(kept)
+    fields = {name: getattr(state, name) for name in method.policy_fields}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(fields)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves]
 
 
@@ -459,17 +467,17 @@ def load_policy(
         lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
     )
     for name, x in _parts(method, state):
-        found = arrays.get(name)
-        if found is None or found.shape != x.shape:
-            is_ = "missing" if found is None else f"of shape {list(found.shape)}"
+        array = arrays.get(name)
+        if array is None or array.shape != x.shape:
+            is_ = "missing" if array is None else f"of shape {list(array.shape)}"
             raise ValueError(
                 f"{policy_file}: {name} is {is_}, and the policy of {task.path} has one of "
                 f"{list(x.shape)}; give the file that was learned from this task, in this "
                 "environment."
             )
-    kept = {name: getattr(state, name) for name in method.kept}
+    fields = {name: getattr(state, name) for name in method.policy_fields}
     leaves = [jnp.asarray(arrays[name], x.dtype) for name, x in _parts(method, state)]
-    state = replace(state, **jax.tree.unflatten(jax.tree.structure(kept), leaves))
+    state = replace(state, **jax.tree.unflatten(jax.tree.structure(fields), leaves))
     return setup, _acting(setup, state)
 
 

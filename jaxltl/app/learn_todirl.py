@@ -88,17 +88,17 @@ _EXPERT_DISCOUNT = 0.99  # largest default
 def prepare(task: TodirlFile, seed: int) -> Setup:
     """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
     judge, memory = load_automata(task)
-    shown = task.demonstrations
-    require_cosafe(task.path, shown, judge)
+    table = task.demonstrations
+    require_cosafe(task.path, table, judge)
     with errors_in(f"{task.path}: [task] "):
         trivial = check_formula(judge)
     scenes, others = load_scenes(task, judge)
-    found = load_demonstrations(task, scenes) if shown.files is not None else []
+    demonstrations = load_demonstrations(task, scenes) if table.files is not None else []
     worlds = _stack(task, [*scenes, *others], judge, memory)
-    soft = judge.is_cosafe and (shown.discount is not None or bool(found))
+    soft = judge.is_cosafe and (table.discount is not None or bool(demonstrations))
     expert, bests = _experts(task, worlds.scenes, judge, soft=soft)
     dropped = 0
-    if not found:
+    if not demonstrations:
         key = jax.random.fold_in(jax.random.key(seed), 0)
         for w, scene in enumerate(scenes):
             # Without padding and the learner's memory: tasks that differ only in these have the
@@ -106,18 +106,18 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
             model = product(scene.mdp, judge, label_on=task.label_on)
             own = jax.random.fold_in(key, w)
             if soft:
-                found.append(
+                demonstrations.append(
                     temporal_gridworld.demonstrations(
                         own,
                         model,
                         expert[w, : scene.mdp.num_states],
-                        shown.synthetic or 0,
-                        shown.length or LENGTH,
+                        table.synthetic or 0,
+                        table.length or LENGTH,
                     )
                 )
             else:
-                runs, lost = synthetic_demonstrations(task.path, shown, model, own, bests[w])
-                found, dropped = [*found, runs], dropped + lost
+                runs, lost = synthetic_demonstrations(task.path, table, model, own, bests[w])
+                demonstrations, dropped = [*demonstrations, runs], dropped + lost
     if memory is not judge:
         expert = np.tile(
             expert, (1, 1, len(memory.delta), 1)
@@ -130,7 +130,7 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
         len(scenes),
         jnp.asarray(expert),
         soft,
-        found,
+        demonstrations,
         dropped,
         requested="best" if task.guarantee == 1 else task.guarantee,
         trivial=trivial,
@@ -149,7 +149,7 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
 
 def _until_mistakes(setup: Setup) -> Setup:
     """Demonstrations until the formula is lost or, for "best", a mistake has left the best probability."""
-    shown, unused = list[Trajectories](), 0
+    shortened, unused = list[Trajectories](), 0
     for w, each in enumerate(setup.demonstrations):
         mdp = setup.worlds.scenes[w].mdp
         model = product(mdp, setup.judge, label_on=setup.task.label_on)
@@ -158,8 +158,8 @@ def _until_mistakes(setup: Setup) -> Setup:
             mistake = mistakes(model, np.asarray(setup.sure[w].allowed)[: mdp.num_states], each)
         used = used_steps(model, optimal_satisfaction(model), mistake, each)
         unused += int(np.sum(each.length)) - int(used.sum())
-        shown.append(replace(each, length=to_jax(used.astype(np.int32))))
-    return replace(setup, demonstrations=shown, unused=unused)
+        shortened.append(replace(each, length=to_jax(used.astype(np.int32))))
+    return replace(setup, demonstrations=shortened, unused=unused)
 
 
 def _narrowed(setup: Setup) -> Setup:
@@ -170,8 +170,8 @@ def _narrowed(setup: Setup) -> Setup:
         with errors_in(f"{task.path}: demonstrations in {worlds.scenes[w].name}: "):
             size = worlds.scenes[w].mdp.num_states
             model = product(worlds.scenes[w].mdp, setup.judge, label_on=task.label_on)
-            kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
-        count += int(np.asarray(trajectories.mask).sum() - kept.sum())
+            allowed_mask = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
+        count += int(np.asarray(trajectories.mask).sum() - allowed_mask.sum())
     worlds = replace(worlds, model=restrict_stacked_actions(worlds.model, allowed))
     return replace(setup, worlds=worlds, left_out=count)
 
@@ -181,12 +181,12 @@ def _experts(
 ) -> tuple[np.ndarray, list[Solution]]:
     """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft-optimal."""
     if soft:
-        shown = task.demonstrations
-        discount = shown.discount
+        table = task.demonstrations
+        discount = table.discount
         if discount is None:
             discount = min(task.learner.discount, _EXPERT_DISCOUNT)
         models = stack_products([s.mdp for s in scenes], judge, label_on=task.label_on)
-        return np.asarray(_expert(models, discount, shown.rewards())), []
+        return np.asarray(_expert(models, discount, table.rewards())), []
     bests = [optimal_satisfaction(product(s.mdp, judge, label_on=task.label_on)) for s in scenes]
     size = max(scene.mdp.num_states for scene in scenes)
     # Actions in padding states never matter.
@@ -218,8 +218,8 @@ def _observations(scenes: list[Scene], model: Product) -> jax.Array:
 
 def describe(setup: Setup) -> str:
     """Numbers of worlds, memory states and demonstrations, as text."""
-    pairs = sum(int(np.sum(shown.length)) for shown in setup.demonstrations)
-    number = sum(len(shown.length) for shown in setup.demonstrations)
+    pairs = sum(int(np.sum(trajectories.length)) for trajectories in setup.demonstrations)
+    number = sum(len(trajectories.length) for trajectories in setup.demonstrations)
     tests = len(setup.worlds.scenes) - setup.num_training
     return (
         f"{setup.num_training} training and {tests} test worlds, "
@@ -246,7 +246,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
         horizon=table.horizon,
         allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
-    hparams = settings(todirl.Hparams, table.given())
+    hparams = settings(todirl.Hparams, table.specified())
     if setup.is_probability and any(
         is_weighable(part_of(setup.worlds.model, w)) for w in range(setup.num_training)
     ):
@@ -267,7 +267,7 @@ def _train(
     setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, training: Training
 ) -> Learned:
     """Reward networks of N seeds."""
-    found, history = run_seeds(
+    chunks, history = run_seeds(
         todirl,
         problem,
         hparams,
@@ -275,14 +275,16 @@ def _train(
         num_steps=setup.task.learner.steps,
         options=Options(until=learner.has_stopped),
     )
-    states, best = found.state, found.state.best
+    states, best = chunks.state, chunks.state.best
     score = np.asarray(best.neg_log_likelihood)
-    kept = np.minimum(np.asarray(best.step), len(history["held_out"]) - 1)
+    best_step = np.minimum(np.asarray(best.step), len(history["held_out"]) - 1)
     return Learned(
         parameters=best.parameters,
         held_out=score
         if hparams.mu is None
-        else np.where(np.isfinite(score), history["held_out"][kept, np.arange(len(kept))], score),
+        else np.where(
+            np.isfinite(score), history["held_out"][best_step, np.arange(len(best_step))], score
+        ),
         best_step=np.asarray(best.step),
         stopped=np.asarray(states.stopped),
         num_steps=int(np.max(states.step)),
@@ -311,8 +313,8 @@ def _weighed(
         return _plans(setup, problem.network, parameters, replace(hparams, mu=None), count)[:2]
 
     counts = np.asarray(problem.counts + problem.held_out)
-    found = likeliest(setup, counts, free, None if hparams.mu is None else train, plans)
-    return replace(found.learned, weight=found.weight)
+    attempt = likeliest(setup, counts, free, None if hparams.mu is None else train, plans)
+    return replace(attempt.learned, weight=attempt.weight)
 
 
 def _judge(
@@ -324,7 +326,7 @@ def _judge(
 ) -> Judged:
     worlds = setup.worlds
     performances, policies, codes = [], [], []
-    kept = dict[str, np.ndarray]()  # of the chosen seed
+    details = dict[str, np.ndarray]()  # of the chosen seed
     for i in range(len(learned.held_out)):
         parameters = part_of(learned.parameters, i)
         if setup.is_probability:
@@ -334,7 +336,9 @@ def _judge(
             held = hold(setup, free, inside)
             policy = jnp.asarray(np.stack([one.policy for one in held]))
             if i == chosen:
-                kept |= {k: np.array([getattr(x, k) for x in held]) for k in ("share", "attained")}
+                details |= {
+                    k: np.array([getattr(x, k) for x in held]) for k in ("share", "attained")
+                }
         else:
             policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
         if setup.bounds is not None:
@@ -343,7 +347,7 @@ def _judge(
             if i == chosen:
                 times = [one.steps[:3] for one in steps if one.steps is not None]
                 shares = [one.share for one in steps]
-                kept |= {"steps": np.array(times), "quick_share": np.array(shares)}
+                details |= {"steps": np.array(times), "quick_share": np.array(shares)}
         lifted = policy if setup.memory is setup.judge else lift_memory_policy(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
@@ -354,7 +358,7 @@ def _judge(
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
     horizon = hparams.horizon
     return Judged(
-        **kept,
+        **details,
         policy=np.asarray(policies[chosen]),
         status=np.asarray(codes[chosen]),
         performance={
@@ -362,7 +366,7 @@ def _judge(
             "expert": _probability(judged, expert, horizon),
             "random": _probability(judged, blind.astype(expert.dtype), horizon),
         },
-        seeds=np.stack([np.asarray(found.mean) for found in performances]),
+        seeds=np.stack([np.asarray(performance.mean) for performance in performances]),
     )
 
 
@@ -371,7 +375,7 @@ def _plans(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])
-    found, codes = [], np.zeros(count, np.int32)
+    plans, codes = [], np.zeros(count, np.int32)
     for mask in (np.asarray(jax.vmap(lambda model: model.available)(worlds.model)), masks):
         each = []
         for w in range(count):
@@ -382,8 +386,8 @@ def _plans(
             )
             each.append(np.asarray(policy)[0])
             codes[w] = max(codes[w], int(status[0]))
-        found.append(np.stack(each))
-    return found[0], found[1], codes
+        plans.append(np.stack(each))
+    return plans[0], plans[1], codes
 
 
 @partial(jax.jit, static_argnames=("network",))
@@ -396,8 +400,8 @@ def _plan(
 ) -> tuple[jax.Array, jax.Array]:
     """Policies ``float[W, S, Q, A]``, with a horizon ``[W, T, S, Q, A]``, and statuses."""
 
-    def one(given: tuple[Product, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        solution = todirl.plan(network, parameters, *given, hparams)
+    def one(world: tuple[Product, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        solution = todirl.plan(network, parameters, *world, hparams)
         return solution.policy, solution.status
 
     return lax.map(one, (model, observation), batch_size=_BATCH)
@@ -423,16 +427,16 @@ def _probability(judged: Product, policy: jax.Array, horizon: int | None) -> Per
 
 @jax.jit
 def _within_each(judged: Product, policy: jax.Array) -> Performance:
-    return lax.map(lambda given: _within(*given), (judged, policy), batch_size=_BATCH)
+    return lax.map(lambda pair: _within(*pair), (judged, policy), batch_size=_BATCH)
 
 
 def _within(model: Product, policy: jax.Array) -> Performance:
     """Probability of satisfaction (for safety, of no violation) in T steps, of ``[T, S, Q, A]``."""
     done = model.final.astype(model.dtype)
-    kept = jnp.minimum if model.automaton.is_safety else jnp.maximum
+    limit = jnp.minimum if model.automaton.is_safety else jnp.maximum
 
     def backup(value: jax.Array, policy: jax.Array) -> tuple[jax.Array, None]:
-        return kept(done, action_mean(policy, expectation(model, value))), None
+        return limit(done, action_mean(policy, expectation(model, value))), None
 
     value, _ = lax.scan(backup, done, policy, reverse=True)
     value = jnp.take_along_axis(value, model.initial_memory[:, None], axis=1)[:, 0]

@@ -74,17 +74,17 @@ def _anchor(
     )
     if isinstance(requested, str) or over != "mean" or not model.automaton.is_cosafe:
         raise ValueError(f"{text}; ask for at least so many.")
-    found = meeting(model, requested, steps, quickest)
-    if found.policy is None:
+    front_point = meeting(model, requested, steps, quickest)
+    if front_point.policy is None:
         raise ValueError(
-            f"{text}, and in {steps:g} steps no policy has more than {max(found.most, 0):.6g}; ask "
+            f"{text}, and in {steps:g} steps no policy has more than {max(front_point.most, 0):.6g}; ask "
             "for more steps or a smaller probability."
         )
-    return found.policy
+    return front_point.policy
 
 
 def about_steps(
-    model: Product, bound: StepBound, before: np.ndarray, kept: Mixture, counts: np.ndarray
+    model: Product, bound: StepBound, before: np.ndarray, mixture: Mixture, counts: np.ndarray
 ) -> Record:
     """The steps of a policy, its trade-off with the likelihood, and the front of the task.
 
@@ -93,8 +93,8 @@ def about_steps(
       counts: ``float[S, Q, A]``, of demonstrated pairs.
     """
     clock = StepAnalysis(model)
-    learned = kept.steps or clock.steps(kept.policy)
-    found: Record = {
+    learned = mixture.steps or clock.steps(mixture.policy)
+    record: Record = {
         "until": "the formula is decided" if model.automaton.is_cosafe else "acceptance",
         "learned": learned.value,
         "learned_bounds": [learned.lower, learned.upper],
@@ -103,12 +103,12 @@ def about_steps(
         "least": bound.quickest.least,
         "limit": bound.limit,
         "factor": bound.factor if np.isfinite(bound.limit) else None,
-        "share": kept.share,
+        "share": mixture.share,
         "status": learned.status.name,
     }
-    shares = [0.0] if np.isinf(bound.limit) else sorted({*_SHARES.tolist(), kept.share})
+    shares = [0.0] if np.isinf(bound.limit) else sorted({*_SHARES.tolist(), mixture.share})
     mixed = [(x, (1 - x) * before + x * bound.anchor) for x in shares]
-    found["likelihood"] = [
+    record["likelihood"] = [
         {
             "share": share,
             "steps": enclosure(*clock.steps(policy)[:3]),
@@ -117,8 +117,8 @@ def about_steps(
         for share, policy in mixed
     ]
     if model.automaton.is_cosafe:
-        found["front"] = front(model, bound.quickest)
-    return found
+        record["front"] = front(model, bound.quickest)
+    return record
 
 
 def front(model: Product, quickest: Quickest | None = None) -> list[Record]:

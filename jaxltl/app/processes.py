@@ -27,7 +27,7 @@ from jaxltl.app.wording import Record
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
-Found = TypeVar("Found")
+Value = TypeVar("Value")
 
 LOST = 3  # exit status if another process has ended
 WAIT = 60.0  # seconds
@@ -67,14 +67,16 @@ class Launch:
 
 def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ) -> Launch:
     """Launch of this process by its options, else by a launcher's environment."""
-    given = [x for x in ("coordinator", "process", "processes") if getattr(options, x) is not None]
+    options_of_launch = [
+        x for x in ("coordinator", "process", "processes") if getattr(options, x) is not None
+    ]
     if options.mesh is None:
-        if given:
-            raise ValueError(f"--{given[0]} needs --mesh; give that too.")
+        if options_of_launch:
+            raise ValueError(f"--{options_of_launch[0]} needs --mesh; give that too.")
         return Launch()
     launcher, detected = _detect(environment)
     alone = options.processes == 1 and not options.process
-    if alone or (not given and (detected is None or detected.processes == 1)):
+    if alone or (not options_of_launch and (detected is None or detected.processes == 1)):
         return Launch()
     processes, process = options.processes, options.process
     if detected is not None:
@@ -149,25 +151,25 @@ class ProcessGroup:
         every = np.asarray(process_allgather(padded))
         return [row[:n].tobytes().decode() for row, n in zip(every, sizes.tolist(), strict=True)]
 
-    def together(self, work: Callable[[], Found]) -> Found:
+    def together(self, work: Callable[[], Value]) -> Value:
         """The result of work that each process does; an error of any of them ends all."""
         if self.processes == 1:
             return work()
-        message, found = "", None
+        message, result = "", None
         try:
-            found = work()
+            result = work()
         except (ValueError, OSError) as error:
             message = str(error) or type(error).__name__
         every = self.exchanged(message)
         if not any(every):
-            return found  # type: ignore[return-value]
+            return result  # type: ignore[return-value]
         if any(every[: self.process]) or not message:
             raise SystemExit(2)
         raise ValueError(message if len(set(every)) == 1 else f"process {self.process}: {message}")
 
-    def agree(self, given: Mapping[str, object]) -> None:
+    def agree(self, values: Mapping[str, object]) -> None:
         """Checks that all processes have the same values by name."""
-        every = [json.loads(x) for x in self.exchanged(json.dumps(dict(given), default=str))]
+        every = [json.loads(x) for x in self.exchanged(json.dumps(dict(values), default=str))]
         for process, other in enumerate(every):
             for name in {**every[0], **other}:
                 one, two = (x.get(name, "nothing") for x in (every[0], other))
@@ -177,12 +179,12 @@ class ProcessGroup:
                         "processes with the same arguments, files and versions."
                     )
 
-    def sees(self, what: str, here: bool) -> bool:
+    def sees(self, name: str, here: bool) -> bool:
         """True if a file is present, which must be the same in all processes."""
         every = self.exchanged(str(here))
         if len(set(every)) > 1:
             raise self._error(
-                f"process {every.index('False')} does not see {what}; give --out a directory that "
+                f"process {every.index('False')} does not see {name}; give --out a directory that "
                 "all processes share."
             )
         return here

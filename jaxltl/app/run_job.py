@@ -219,8 +219,8 @@ class _Run(Generic[T, S, O]):
             with ExitStack() as held:
                 return self._result(task, held)
         except KeyboardInterrupt:
-            kept = "; the same command goes on from the last checkpoint"
-            self.console.say(f"interrupted{kept if self.checkpoint.exists() else ''}")
+            hint = "; the same command goes on from the last checkpoint"
+            self.console.say(f"interrupted{hint if self.checkpoint.exists() else ''}")
             raise SystemExit(130) from None
 
     def _result(self, task: T, held: ExitStack) -> Result | None:
@@ -236,7 +236,7 @@ class _Run(Generic[T, S, O]):
         if group.sees(str(self.checkpoint), self.checkpoint.exists()):
             say(f"going on from {self.checkpoint}")
         group.sees(str(self.out), (self.out / "task.toml").exists())
-        with _progress_bar(task.learner.steps, shown=group.is_first) as bar:
+        with _progress_bar(task.learner.steps, visible=group.is_first) as bar:
             early = job.task_pictures(setup) if group.is_first else []
             pictures = [(p, self._begun(p)) for p in early]
 
@@ -282,9 +282,9 @@ class _Run(Generic[T, S, O]):
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
         result = {**job.summary(outcome), **took(seconds), "fingerprint": self.mark}
         job.save(self.out, outcome)
-        shown = [(picture, drawn()) for picture, drawn in pictures]
+        images = [(picture, drawn()) for picture, drawn in pictures]
         parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-        write_results(self.out / "task.toml", job.report, result, parts, shown)
+        write_results(self.out / "task.toml", job.report, result, parts, images)
         return result
 
 
@@ -329,16 +329,16 @@ def spread(num_seeds: int, num_devices: int) -> str:
         return "one seed is learned on one device" + (
             "" if num_devices == 1 else ", and the others are idle; --seeds N uses them"
         )
-    most = -(-num_seeds // num_devices)
-    used = -(-num_seeds // most)
+    seeds_per_device = -(-num_seeds // num_devices)
+    used = -(-num_seeds // seeds_per_device)
     enough = f"{used} devices are" if used > 1 else "one device is"
     idle = f"; {enough} enough for that" if used < num_devices else ""
     noun = "devices" if num_devices > 1 else "device"
-    return f"{num_seeds} seeds on {num_devices} {noun}, at most {most} on each{idle}"
+    return f"{num_seeds} seeds on {num_devices} {noun}, at most {seeds_per_device} on each{idle}"
 
 
 @contextlib.contextmanager
-def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
+def _progress_bar(total: int, *, visible: bool) -> Iterator[tqdm[Any]]:
     """A progress bar that refreshes its clock each second, also while the work blocks.
 
     Where standard error is no terminal, each stage has a line, and another one each ten seconds.
@@ -360,7 +360,7 @@ def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
     terminal, done = sys.stderr.isatty(), threading.Event()
     file = None if terminal else io.StringIO()
     with (tqdm if terminal else Lines)(
-        total=total, unit="step", desc="compiling", disable=not shown, leave=False, file=file
+        total=total, unit="step", desc="compiling", disable=not visible, leave=False, file=file
     ) as bar:
 
         def tick() -> None:

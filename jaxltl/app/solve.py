@@ -32,7 +32,7 @@ from jaxltl.core.values.properties.solve_property import Answer, PropertyStrateg
 from jaxltl.app.wording import Record
 from jaxltl.io.templates import render
 
-Found = Answer | Achievable | ConstrainedOptimum | Pareto
+AnyAnswer = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
 _PROGRESS_SECONDS = 5.0
@@ -55,7 +55,7 @@ class Result:
     """The answer to a property."""
 
     query: Query  # the property
-    answer: Found | None  # its answer, or None
+    answer: AnyAnswer | None  # its answer, or None
     seconds: float  # wall time
     error: str | None = None  # why there is no answer, or None
     fault: int = SOLVED  # NOT_CONVERGED for the solver, INVALID for the property
@@ -76,16 +76,16 @@ class Result:
 
 def parse_queries(arguments: Sequence[str], definitions: Definitions | None = None) -> list[Query]:
     """Parses arguments: properties, or names of property files; errors are kept by property."""
-    found = []
+    queries = []
     for argument in arguments:
         place, text = "", argument
         if argument.lower().endswith(PROPERTY_FILES):
             place, text = f"{argument}: ", _text_of(Path(argument))
         try:
-            found += [Query(p.text, p) for p in parse_properties(text, definitions)]
+            queries += [Query(p.text, p) for p in parse_properties(text, definitions)]
         except ValueError as error:
-            found.append(Query(argument, error=f"{place}{error}"))
-    return found
+            queries.append(Query(argument, error=f"{place}{error}"))
+    return queries
 
 
 def _text_of(path: Path) -> str:
@@ -127,10 +127,10 @@ def _read_source(
         if constants is not None:
             raise ValueError(f"--const goes with programs in the PRISM language; {path} is none.")
         return None, None
-    given, syntax = constants_of(constants), read_syntax(path)
+    values, syntax = constants_of(constants), read_syntax(path)
     declared = {c.name for c in syntax.constants}
-    program = resolve(syntax, {k: v for k, v in given.items() if k in declared})
-    rest = {k: constant_value(k, v) for k, v in given.items() if k not in declared}
+    program = resolve(syntax, {k: v for k, v in values.items() if k in declared})
+    rest = {k: constant_value(k, v) for k, v in values.items() if k not in declared}
     texts = [_text_of(Path(x)) if x.lower().endswith(PROPERTY_FILES) else x for x in arguments]
     for name in rest:
         if not any(re.search(rf"\bconst\b[^;=]*\b{name}\b", text) for text in texts):
@@ -175,11 +175,11 @@ class _Progress:
     def __init__(self) -> None:
         self.last = time.monotonic()
 
-    def __call__(self, found: int, expanded: int, answer: Answer | None = None) -> None:
+    def __call__(self, states: int, expanded: int, answer: Answer | None = None) -> None:
         if time.monotonic() - self.last > _PROGRESS_SECONDS:
             self.last = time.monotonic()
             ends = answer and f": {answer.lower.min():.6g} to {answer.upper.max():.6g}"
-            text = f"{found} states found, {expanded} expanded{ends or ''}"
+            text = f"{states} states found, {expanded} expanded{ends or ''}"
             print(text, file=sys.stderr, flush=True)
 
 
@@ -193,7 +193,7 @@ def solve(
     """Yields the result of each property; of a program, some states are explored for each."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
-    def answer(prop: Property) -> Found:
+    def answer(prop: Property) -> AnyAnswer:
         if not isinstance(model, Program):
             return solve_property(model, prop, tolerance=tolerance, relative=relative)
         from jaxltl.core.programs.build import MAX_STATES
@@ -213,17 +213,17 @@ def solve(
 
 def answers(
     queries: Sequence[Query],
-    answer: Callable[[Property], Found],
+    answer: Callable[[Property], AnyAnswer],
     is_fatal: Callable[[Exception], bool] = lambda error: False,
 ) -> Iterator[Result]:
     """Yields the result of each property in order; errors of one do not end the others."""
     for one in queries:
         begin = time.perf_counter()
-        found: Found | None = None
+        result: AnyAnswer | None = None
         error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
-                found = answer(one.parsed)
+                result = answer(one.parsed)
             except Exception as failure:
                 if is_fatal(failure):
                     raise
@@ -232,7 +232,7 @@ def answers(
                 if not isinstance(failure, ValueError | NotConverged):
                     traceback.print_exc()  # a bug must not lose the other answers
                     error = f"{type(failure).__name__}: {error}"
-        yield Result(one, found, time.perf_counter() - begin, error, fault)
+        yield Result(one, result, time.perf_counter() - begin, error, fault)
 
 
 # --- output -----------------------------------------------------------------------------------
@@ -252,38 +252,38 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
 
 def result_entry(result: Result) -> Record:
     """Answer to a property, as a JSON object."""
-    found = result.answer
+    answer = result.answer
     none = dict.fromkeys(("value", "lower", "upper"))
     entry: Record = {"property": result.query.text, **none, "status": result.status}
     if result.query.parsed is not None and result.query.parsed.name is not None:
         entry["name"] = result.query.parsed.name
-    if isinstance(found, Answer):
+    if isinstance(answer, Answer):
         entry |= {
-            "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
-            **{key: _over_states(getattr(found, key).tolist()) for key in ("lower", "upper")},
-            "method": found.method,
+            "value": _over_states(answer.value.tolist() if answer.holds is None else answer.holds),
+            **{key: _over_states(getattr(answer, key).tolist()) for key in ("lower", "upper")},
+            "method": answer.method,
         }
-        if found.states.size > 1:
-            entry["states"] = found.states.tolist()
-    elif found is not None:
-        entry |= _several_entry(found)
+        if answer.states.size > 1:
+            entry["states"] = answer.states.tolist()
+    elif answer is not None:
+        entry |= _several_entry(answer)
     if result.error is not None:
         entry["error"] = result.error
     return entry | {"seconds": result.seconds}
 
 
-def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> Record:
+def _several_entry(answer: Achievable | ConstrainedOptimum | Pareto) -> Record:
     """A multi-objective answer: achievability, optimum, or points of the Pareto curve."""
-    if isinstance(found, Pareto):
-        return {"value": found.points.tolist(), "gap": _number(float(found.gap))}
+    if isinstance(answer, Pareto):
+        return {"value": answer.points.tolist(), "gap": _number(float(answer.gap))}
     entry: Record = {}
-    if found.nearest is not None:
-        near = {key: getattr(found.nearest, key).tolist() for key in ("lower", "upper", "gap")}
-        entry["nearest"] = {key: _over_states(values) for key, values in near.items()}
-    if isinstance(found, Achievable):
-        return entry | {"value": found.holds}
-    numbers = {key: _number(getattr(found, key)) for key in ("value", "lower", "upper")}
-    return entry | numbers | {"achievable": found.holds}
+    if answer.nearest is not None:
+        bounds = {key: getattr(answer.nearest, key).tolist() for key in ("lower", "upper", "gap")}
+        entry["nearest"] = {key: _over_states(values) for key, values in bounds.items()}
+    if isinstance(answer, Achievable):
+        return entry | {"value": answer.holds}
+    numbers = {key: _number(getattr(answer, key)) for key in ("value", "lower", "upper")}
+    return entry | numbers | {"achievable": answer.holds}
 
 
 def _over_states(values: list[Any]) -> Any:
@@ -300,7 +300,7 @@ def _number(x: object) -> Any:
 
 def text(result: Result) -> str:
     """Answer to a property, as text."""
-    lines = render("jaxltl.app.reports", "solve.txt", result=result, found=result.answer)
+    lines = render("jaxltl.app.reports", "solve.txt", result=result, answer=result.answer)
     return lines.rstrip("\n")
 
 
@@ -309,19 +309,19 @@ def text(result: Result) -> str:
 
 def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path) -> bytes:
     """The optimal strategies as JSON; see docs/solve.md."""
-    found = [
+    entries = [
         {"property": r.query.text, **_strategy(model, r.answer.strategy)}
         for r in results
         if isinstance(r.answer, Answer)
         and r.answer.strategy is not None
         and (isinstance(model, IntervalMDP) or not model.is_chain)
     ]
-    table = {"model": source.name, "states": model.num_states, "strategies": found}
+    table = {"model": source.name, "states": model.num_states, "strategies": entries}
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Record:
-    model = given.nominal if isinstance(given, IntervalMDP) else given
+def _strategy(solved: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Record:
+    model = solved.nominal if isinstance(solved, IntervalMDP) else solved
     host = model.host
     row = np.asarray(strategy.row)
     choice = (row - host.row_start[host.state[row]]).tolist()
@@ -331,12 +331,12 @@ def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Rec
         entry["kind"] = f"first choice, then by the {strategy.by} left"
     if names is not None:
         entry["action"] = names(row)
-    found = strategy.memory
-    if found is None:
+    memory = strategy.memory
+    if memory is None:
         if strategy.nature is not None:
             entry["nature"] = _nature(host, host.successor, strategy.nature)
         return entry
-    product, start = found.product, found.product.start
+    product, start = memory.product, memory.product.start
     if strategy.nature is not None:
         entry["letter_of"] = "the state that is left"
         entry["nature"] = _nature(
@@ -347,12 +347,12 @@ def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Rec
         "initial": np.stack([product.base_state[start], product.memory[start]], 1).tolist(),
         "letters": [
             sorted(
-                p for p, holds in zip(found.automaton.propositions, letter, strict=True) if holds
+                p for p, holds in zip(memory.automaton.propositions, letter, strict=True) if holds
             )
-            for letter in found.automaton.letters
+            for letter in memory.automaton.letters
         ],
-        "letter": found.letter.tolist(),
-        "update": found.automaton.delta.tolist(),
+        "letter": memory.letter.tolist(),
+        "update": memory.automaton.delta.tolist(),
         "state": product.base_state.tolist(),
         "memory": product.memory.tolist(),
         **{k: v for k, v in entry.items() if k != "kind"},
@@ -366,11 +366,11 @@ def _nature(
     names, mass = list(map(str, successor.tolist())), probability.tolist()
     starts = host.entry_start.tolist()
     rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]} for a, b in pairwise(starts)]
-    found = [rows[a:b] for a, b in pairwise(host.row_start.tolist())]
+    choices = [rows[a:b] for a, b in pairwise(host.row_start.tolist())]
     return (
-        found
+        choices
         if still is None
-        else [[] if stands else x for x, stands in zip(found, still.tolist(), strict=True)]
+        else [[] if stands else x for x, stands in zip(choices, still.tolist(), strict=True)]
     )
 
 

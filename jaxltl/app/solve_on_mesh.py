@@ -58,12 +58,12 @@ def read(
     named = {name for x in formulas if isinstance(x, Formula) for name in x.propositions}
     if path.suffix == ".umb" and not named & set(BUILT_IN):
         model = group.together(lambda: read_sharded(path, mesh))
-        given = {"file": group.together(lambda: _digest(path))}
+        mark = {"file": group.together(lambda: _digest(path))}
     else:
         whole = group.together(lambda: load(path))
         model = group.together(lambda: on_mesh(whole, group))
-        given = files.fingerprint(model=whole)
-    return model, given, _entry(model, time.perf_counter() - begin)
+        mark = files.fingerprint(model=whole)
+    return model, mark, _entry(model, time.perf_counter() - begin)
 
 
 def _digest(path: Path) -> str:
@@ -130,19 +130,21 @@ class MeshSolver:
         path = None
         if self.directory is not None:
             path = self.directory / f"solve-{_digest_text(mark)[:12]}.npz"
-        bounds, part, made = first_bounds(model, question), 0, 0
+        bounds, part, num_steps = first_bounds(model, question), 0, 0
         if path is not None and group.sees(str(path), path.exists()):
-            bounds, part, made = _restored(path, mark, model, bounds)
+            bounds, part, num_steps = _restored(path, mark, model, bounds)
         chunk = steps_between(model)
         while True:
-            found = question.advance(bounds, question.tolerance(self.tolerance, FINER[part]), chunk)
-            bounds, steps = (found.lower, found.upper), int(np.asarray(found.num_steps))
-            made += steps
-            if question.goes_on and steps >= chunk and made < MAX_STEPS:
+            solution = question.advance(
+                bounds, question.tolerance(self.tolerance, FINER[part]), chunk
+            )
+            bounds, steps = (solution.lower, solution.upper), int(np.asarray(solution.num_steps))
+            num_steps += steps
+            if question.goes_on and steps >= chunk and num_steps < MAX_STEPS:
                 if path is not None:
-                    files.save(path, _state(model, bounds, part, made), mark)
+                    files.save(path, _state(model, bounds, part, num_steps), mark)
                 continue
-            answer = question.answer(found, self.tolerance)
+            answer = question.answer(solution, self.tolerance)
             if question.is_answered(answer, FINER[part]):
                 break
             part += 1
@@ -160,32 +162,32 @@ def _digest_text(mark: Mapping[str, str]) -> str:
     return hashlib.sha256(repr(sorted(mark.items())).encode()).hexdigest()
 
 
-def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> Record:
+def _state(model: ShardedMDP, bounds: Bounds, part: int, num_steps: int) -> Record:
     return {
         "bounds": bounds,
         "devices": np.int32(model.num_devices),
         "part": np.int32(part),
-        "made": np.int32(made),
+        "made": np.int32(num_steps),
     }
 
 
 def _restored(
-    path: Path, given: Mapping[str, str], model: ShardedMDP, bounds: Bounds
+    path: Path, mark: Mapping[str, str], model: ShardedMDP, bounds: Bounds
 ) -> tuple[Bounds, int, int]:
     """Bounds from a checkpoint, which may be of another number of devices."""
     empty = jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), bounds)
-    found = files.load(path, _state(model, empty, 0, 0), given)
-    devices = int(found["devices"])
+    state = files.load(path, _state(model, empty, 0, 0), mark)
+    devices = int(state["devices"])
     if devices == model.num_devices:
-        found = files.load(path, _state(model, bounds, 0, 0), given)
+        state = files.load(path, _state(model, bounds, 0, 0), mark)
     else:
         count, size = model.num_given, -(-model.num_given // devices)
         begins = np.arange(devices + 1) * count // devices
         each = np.concatenate(
             [np.arange(b - a) + i * size for i, (a, b) in enumerate(pairwise(begins))]
         )
-        found["bounds"] = tuple(
+        state["bounds"] = tuple(
             to_mesh(model, np.asarray(x)[each], fill)
-            for x, fill in zip(found["bounds"], (0, 1), strict=True)
+            for x, fill in zip(state["bounds"], (0, 1), strict=True)
         )
-    return found["bounds"], int(found["part"]), int(found["made"])
+    return state["bounds"], int(state["part"]), int(state["made"])

@@ -143,8 +143,8 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
     start = np.arange(world.game.num_states) * width + first
     origin, num_own = np.arange(game.num_states), game.num_states
     if file.task.chance == "adversarial":
-        game, found = adversarial_chance(game)
-        objective, origin = objective_at(objective, found), np.asarray(found)
+        game, base_state = adversarial_chance(game)
+        objective, origin = objective_at(objective, base_state), np.asarray(base_state)
     memories = 1 if len(game.state_shape) == 1 else width
     everywhere = np.zeros(game.num_states)
     everywhere[start] = 1 / start.size
@@ -249,12 +249,12 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
     )
 
 
-def demand(found: Synthesis) -> None:
+def demand(synthesis: Synthesis) -> None:
     """Raises ValueError if the file demands a strategy and the task is unrealizable."""
-    if found.file.strategy and found.strategy is None:
-        where = found.world.describe(int(found.starts[0]))
+    if synthesis.file.strategy and synthesis.strategy is None:
+        where = synthesis.world.describe(int(synthesis.starts[0]))
         raise ValueError(
-            f"{found.file.path}: [strategy] demands a strategy, but the task is unrealizable: the "
+            f"{synthesis.file.path}: [strategy] demands a strategy, but the task is unrealizable: the "
             f"environment wins from every initial state, for example: {where}. Weaken the task, "
             "assume something of the environment, or leave [strategy] out."
         )

@@ -205,12 +205,12 @@ def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:
         text = "\n".join(line for _, line in rows)
         axes.text(x, y, text, ha="center", va="center", linespacing=1.15, **style)
         return
-    left = x - (drawing.text_width(rows) - drawing.MARK_WIDTH) / 2
+    begin = x - (drawing.text_width(rows) - drawing.MARK_WIDTH) / 2
     for i, (mark, line) in enumerate(rows):
         row = y + drawing.MARKED_HEIGHT * ((len(rows) - 1) / 2 - i)
-        axes.text(left, row, line, ha="left", va="center_baseline", **style)
+        axes.text(begin, row, line, ha="left", va="center_baseline", **style)
         if mark:
-            _mark(axes, (left - drawing.MARK_WIDTH / 2 - 0.02, row), mark)
+            _mark(axes, (begin - drawing.MARK_WIDTH / 2 - 0.02, row), mark)
 
 
 def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:

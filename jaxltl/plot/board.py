@@ -198,7 +198,7 @@ def require_directions(
 
 def as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
     """Actions of a policy, or a mask of them, as ``bool[S, A]``."""
-    given = np.asarray(policy)
-    if given.dtype.kind in "iu":
-        return np.asarray(given[:, None] == np.arange(num_actions))
-    return given.astype(bool)
+    actions = np.asarray(policy)
+    if actions.dtype.kind in "iu":
+        return np.asarray(actions[:, None] == np.arange(num_actions))
+    return actions.astype(bool)

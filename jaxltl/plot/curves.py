@@ -49,11 +49,15 @@ def curves(
       >>> len(curves(of_two_seeds).axes)
       2
     """
-    shown = _shown("curves", metrics, show)
-    series = {k: np.atleast_2d(v).reshape(-1, np.shape(v)[-1]) for k, v in shown.items() if v.ndim}
+    chosen_metrics = _shown("curves", metrics, show)
+    series = {
+        k: np.atleast_2d(v).reshape(-1, np.shape(v)[-1])
+        for k, v in chosen_metrics.items()
+        if v.ndim
+    }
     if not series:
         raise ValueError(
-            f"curves: {', '.join(shown)} are single numbers; give a run's history, [T] or [N, T]."
+            f"curves: {', '.join(chosen_metrics)} are single numbers; give a run's history, [T] or [N, T]."
         )
     chosen = list(series)
     figure = blank(3.1 * len(chosen) + 0.2, 2.5)
@@ -65,7 +69,7 @@ def curves(
 
 
 def _shown(
-    what: str, metrics: Mapping[str, ArrayLike] | object, show: Sequence[str] | None
+    function: str, metrics: Mapping[str, ArrayLike] | object, show: Sequence[str] | None
 ) -> dict[str, NDArray[np.float64]]:
     """The chosen metrics by name, without those that are NaN everywhere."""
     if not isinstance(metrics, Mapping):
@@ -74,10 +78,10 @@ def _shown(
             for name in getattr(type(metrics), "__dataclass_fields__", {})
         }
     every = {k: np.asarray(v, float) for k, v in metrics.items()}
-    found = {k: every[k] for k in (show or every) if k in every and np.isfinite(every[k]).any()}
-    if not found:
-        raise ValueError(f"{what}: nothing to show among {', '.join(every) or 'no figures'}.")
-    return found
+    chosen = {k: every[k] for k in (show or every) if k in every and np.isfinite(every[k]).any()}
+    if not chosen:
+        raise ValueError(f"{function}: nothing to show among {', '.join(every) or 'no figures'}.")
+    return chosen
 
 
 def _curve(
@@ -120,9 +124,9 @@ def bands(
     figure, panels = _rows_of_panels(rows, "bands", (3.6, 1.9), [label] * len(columns))
     names = list(dict.fromkeys(n for row in rows.values() for cell in row.values() for n in cell))
     for (row, column), axes in panels.items():
-        for name, (x, mean, spread) in rows[row][column].items():
+        for name, (x, mean, half_width) in rows[row][column].items():
             color = SERIES[names.index(name) % len(SERIES)]
-            place, middle, width = (np.asarray(v, float) for v in (x, mean, spread))
+            place, middle, width = (np.asarray(v, float) for v in (x, mean, half_width))
             axes.fill_between(place, middle - width, middle + width, color=color, alpha=0.15, lw=0)
             axes.plot(place, middle, color=color, lw=1.4, label=name)
         if limits and column in limits.get(row, {}):
@@ -164,17 +168,17 @@ def sweep(
             f"sweep: {count} settings; show at most {len(SERIES)} at a time, whose colours differ."
         )
     panels = {}
-    for name, found in series.items():
-        if found.ndim != 3 or len(found) != count:
+    for name, values in series.items():
+        if values.ndim != 3 or len(values) != count:
             raise ValueError(
-                f"sweep: {name} has shape {list(found.shape)}; give [{count}, N, T]: settings, "
+                f"sweep: {name} has shape {list(values.shape)}; give [{count}, N, T]: settings, "
                 "seeds, steps."
             )
-        place = np.arange(1, found.shape[2] + 1) if steps is None else steps
-        held = np.ma.masked_invalid(found)
-        mean, spread = (x.filled(np.nan) for x in (held.mean(axis=1), held.std(axis=1)))
+        place = np.arange(1, values.shape[2] + 1) if steps is None else steps
+        held = np.ma.masked_invalid(values)
+        mean, deviation = (x.filled(np.nan) for x in (held.mean(axis=1), held.std(axis=1)))
         panels[name.replace("_", " ")] = {
-            str(setting): (place, mean[i], spread[i]) for i, setting in enumerate(settings)
+            str(setting): (place, mean[i], deviation[i]) for i, setting in enumerate(settings)
         }
     return bands({"": panels})
 

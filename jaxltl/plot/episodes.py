@@ -55,7 +55,7 @@ class Scene(NamedTuple):
     discs: list[tuple[float, float, float, str]]  # (x, y, radius, name) of round objects
     track: NDArray[np.float64]  # float[T + 1, 2], where the agent was
     heading: NDArray[np.float64] | None  # float[T + 1], where it looked, radians, or None
-    shown: list[str]  # the propositions that held, for each of the T + 1 worlds
+    labels: list[str]  # the propositions that held, for each of the T + 1 worlds
     joined: bool  # whether opposite sides are
 
 
@@ -125,12 +125,12 @@ def scene_of(environment: Environment, episode: Episode) -> Scene:
         )
     world, count = _place_of(episode.world), int(valid.sum()) + 1
     label = np.asarray(episode.label)[:count]
-    shown = [
+    labels = [
         ", ".join(name for name, holds in zip(environment.propositions, row, strict=True) if holds)
         for row in label
     ]
     if not isinstance(world, LetterState | FlatState | ZoneState):
-        return _free(np.asarray(world, float)[:count], shown)
+        return _free(np.asarray(world, float)[:count], labels)
     numbers: Any = environment.labels
     while isinstance(numbers.args[0], Partial):  # wrappers of a limit or a task
         numbers = numbers.args[0]
@@ -143,11 +143,11 @@ def scene_of(environment: Environment, episode: Episode) -> Scene:
             (c % cells, c // cells, names[x]) for c, x in enumerate(letter) if x < len(names)
         ]
         track = np.stack([place % cells, place // cells], axis=1) + 0.5
-        return Scene(cells, cells, letters, [], track, None, shown, True)
+        return Scene(cells, cells, letters, [], track, None, labels, True)
     track = np.asarray(world.place, float)[:count]
     if isinstance(world, FlatState):
         discs = _named(numbers, environment.propositions)
-        return _upright(float(numbers.extent), discs, track, None, shown)
+        return _upright(float(numbers.extent), discs, track, None, labels)
     zone, radius = np.asarray(world.zone, float)[0], float(numbers.radius)
     zones = [
         (x, y, radius, name)
@@ -155,7 +155,7 @@ def scene_of(environment: Environment, episode: Episode) -> Scene:
         for x, y in places
     ]
     heading = np.asarray(world.heading, float)[:count]
-    return _upright(float(numbers.extent), zones, track, heading, shown)
+    return _upright(float(numbers.extent), zones, track, heading, labels)
 
 
 def _place_of(world: object) -> Any:
@@ -177,18 +177,18 @@ def _place_of(world: object) -> Any:
     return world
 
 
-def _free(track: NDArray[np.float64], shown: list[str]) -> Scene:
+def _free(track: NDArray[np.float64], labels: list[str]) -> Scene:
     """Scene of a world without known regions: marks where propositions become true."""
-    least, most = track.min(axis=0), track.max(axis=0)
-    side = 1.16 * max(float((most - least).max()), 1e-6)
-    corner = (least + most) / 2 - side / 2
+    least, upper = track.min(axis=0), track.max(axis=0)
+    side = 1.16 * max(float((upper - least).max()), 1e-6)
+    corner = (least + upper) / 2 - side / 2
     places = np.stack([track[:, 0] - corner[0], side - (track[:, 1] - corner[1])], axis=1)
     marks, before = [], ""
-    for (x, y), now in zip(places.tolist(), shown, strict=True):
+    for (x, y), now in zip(places.tolist(), labels, strict=True):
         if now and now != before:
             marks.append((x, y, 0.03 * side, now))
         before = now
-    return Scene(side, 0, [], marks, places, None, shown, False)
+    return Scene(side, 0, [], marks, places, None, labels, False)
 
 
 def _named(discs: Discs, names: tuple[str, ...]) -> list[tuple[float, float, float, str]]:
@@ -198,12 +198,12 @@ def _named(discs: Discs, names: tuple[str, ...]) -> list[tuple[float, float, flo
 
 
 def _upright(
-    extent: float, discs: list[Any], track: NDArray[np.float64], heading: Any, shown: list[str]
+    extent: float, discs: list[Any], track: NDArray[np.float64], heading: Any, labels: list[str]
 ) -> Scene:
     """Converts from a centred square with y up to image coordinates."""
     turned = [(x + extent, extent - y, r, name) for x, y, r, name in discs]
     places = np.stack([track[:, 0] + extent, extent - track[:, 1]], axis=1)
-    return Scene(2 * extent, 0, [], turned, places, heading, shown, False)
+    return Scene(2 * extent, 0, [], turned, places, heading, labels, False)
 
 
 def tint(name: str, number: int) -> str:
@@ -216,13 +216,13 @@ def tint(name: str, number: int) -> str:
 
 def _met(scene: Scene) -> str:
     """Propositions in the order in which they became true; the last ones if there are many."""
-    before, found = "", []
-    for now in scene.shown:
+    before, labels = "", []
+    for now in scene.labels:
         if now and now != before:
-            found.append(now)
+            labels.append(now)
         before = now
-    text = " → ".join(found[-8:])
-    return ("… → " if len(found) > 8 else "") + (text or "nothing held")
+    text = " → ".join(labels[-8:])
+    return ("… → " if len(labels) > 8 else "") + (text or "nothing held")
 
 
 def _spread(scene: Scene) -> NDArray[np.float64]:
@@ -278,7 +278,7 @@ def play_episode(environment: Environment, episode: Episode, *, title: str | Non
     zoom = _PIXELS / scene.size
     frames: dict[str, Any] = {
         "place": (scene.track * zoom).round(1).tolist(),
-        "shown": scene.shown,
+        "labels": scene.labels,
         "wait": 260 if scene.cells else 40,
     }
     if scene.heading is not None:

@@ -184,8 +184,8 @@ def game_moves(
         regions = np.broadcast_to(regions, (len(panels), *regions.shape))
     titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
     rows, columns = world.cells.shape
-    most = 3 if columns * cell_size((rows, columns)) > 1.5 else 4
-    figure, every = rows_of_maps((rows, columns), len(panels), min(len(panels), most))
+    max_columns = 3 if columns * cell_size((rows, columns)) > 1.5 else 4
+    figure, every = rows_of_maps((rows, columns), len(panels), min(len(panels), max_columns))
     for m, axes in enumerate(every):
         mask = _of_turns(panels[m], world, "allowed")[environment]
         wins = mask.any(-1)
@@ -250,7 +250,7 @@ def _small_multiples(
     every = figure.subplots(down, across, squeeze=False).ravel()
     maps = {place: every[spot] for place, spot in zip(chosen, spots, strict=True)}
     for axes in every:
-        if all(axes is not shown for shown in maps.values()):
+        if all(axes is not drawn for drawn in maps.values()):
             axes.axis("off")
     if environment is not None:
         for place, axes in maps.items():
@@ -262,9 +262,9 @@ def _small_multiples(
 def _shade(
     axes: Axes, world: Board, values: NDArray[np.float64], limits: tuple[float, float]
 ) -> AxesImage:
-    shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
-    shown[tuple(world.places.T)] = values
-    image = shade_cells(axes, shown, limits)
+    colors: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
+    colors[tuple(world.places.T)] = values
+    image = shade_cells(axes, colors, limits)
     frame_cells(axes, world)
     return image
 
@@ -303,8 +303,8 @@ def compare(
     series = {name: np.asarray(value, float) for name, value in values.items()}
     sizes = {len(value) for value in series.values()}
     if len(sizes) != 1 or 0 in sizes:
-        found = ", ".join(f"{name}: {len(value)}" for name, value in series.items())
-        raise ValueError(f"compare needs values of the same states; it has {found or 'none'}.")
+        lengths = ", ".join(f"{name}: {len(value)}" for name, value in series.items())
+        raise ValueError(f"compare needs values of the same states; it has {lengths or 'none'}.")
     count = sizes.pop()
     names = [""] * count if groups is None else list(groups)
     if len(names) != count:

@@ -70,7 +70,7 @@ class Box(NamedTuple):
         """``bool[B]`` for boxes ``float[B, 2, 2]``."""
         return np.all((np.abs(others[:, 0] - self.center) - others[:, 1]) < self.half, axis=1)
 
-    def near(self, centers: Points, distance: float) -> int:
+    def num_within(self, centers: Points, distance: float) -> int:
         gap = np.maximum(np.abs(centers - self.center) - self.half, 0)
         return int(np.sum(np.hypot(gap[:, 0], gap[:, 1]) < distance))
 
@@ -105,8 +105,8 @@ def arrange(
         # The self-loop of a sink has no information, and its label takes space.
         if texts[key] == (("", "⊤"),):
             continue
-        near = [line for k, line in wishes.items() if key[0] in k[:2]]
-        curve, box = _best_loop(position, key[0], texts[key], placed + near, boxes)
+        lines = [line for k, line in wishes.items() if key[0] in k[:2]]
+        curve, box = _best_loop(position, key[0], texts[key], placed + lines, boxes)
         placed.append(_along(curve))
         boxes.append(box)
         edges.append(Edge(key, curve))
@@ -150,8 +150,8 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
             check=True,
             timeout=60,
         )
-        found = [line.split()[1:4] for line in done.stdout.splitlines() if line.startswith("node ")]
-        places = {int(name): (float(x), float(y)) for name, x, y in found}
+        nodes = [line.split()[1:4] for line in done.stdout.splitlines() if line.startswith("node ")]
+        places = {int(name): (float(x), float(y)) for name, x, y in nodes}
         return np.array([places[q] for q in range(count)])
     except (OSError, subprocess.SubprocessError, ValueError, KeyError):
         return None
@@ -207,8 +207,8 @@ def _positions(
     if sinks.size:
         lowest = min((position[~doomed, 1]).min(initial=0), 0) - 1.35 * _ROW
         middle = column[~doomed].mean() if (~doomed).any() and last > 0 else 0.0
-        spread = 1.6 * (np.arange(sinks.size) - (sinks.size - 1) / 2)
-        position[sinks] = np.stack([middle + spread, np.full(sinks.size, lowest)], axis=1)
+        offset = 1.6 * (np.arange(sinks.size) - (sinks.size - 1) / 2)
+        position[sinks] = np.stack([middle + offset, np.full(sinks.size, lowest)], axis=1)
     return position
 
 
@@ -247,8 +247,8 @@ def _ordered(delta: NDArray[np.integer], layers: list[NDArray[np.int64]]) -> lis
             }
 
             def mean(q: int, place: dict[int, float] = place) -> float:
-                near = [place[t] for t in np.flatnonzero(linked[q]).tolist() if t in place]
-                return sum(near) / len(near) if near else 0.0
+                neighbours = [place[t] for t in np.flatnonzero(linked[q]).tolist() if t in place]
+                return sum(neighbours) / len(neighbours) if neighbours else 0.0
 
             order[i].sort(key=mean)
     return order
@@ -285,9 +285,9 @@ def _best_curve(
 
     def cost(bend: float) -> float:
         inside = _along(_curve(position[source], position[target], bend))[6:-6]
-        near, close = _reachable(inside, 0.1, drawn, boxes)
+        points, close = _reachable(inside, 0.1, drawn, boxes)
         gap = np.min(_distances(inside, others), initial=np.inf)
-        hits = np.sum(_distances(inside, near).min(axis=1, initial=np.inf) < 0.07)
+        hits = np.sum(_distances(inside, points).min(axis=1, initial=np.inf) < 0.07)
         hits += 4 * sum(Box(*box).holds(inside) for box in close)
         return 60 * max(0, RADIUS + 0.14 - gap) + 0.25 * hits + 3 * abs(bend) + 0.01 * (bend < 0)
 
@@ -314,7 +314,7 @@ def _best_loop(
     half = label_size(rows) / 2
     drawn, others = np.concatenate(placed), np.delete(position, q, axis=0)
     reach = 4 * RADIUS + 2 * float(half.sum())
-    drawn, near = _reachable(position[[q]], reach, drawn, boxes)
+    drawn, close_boxes = _reachable(position[[q]], reach, drawn, boxes)
 
     def candidate(angle: float) -> tuple[Points, Box]:
         def rim(turn: float, reach: float) -> Points:
@@ -342,7 +342,7 @@ def _best_loop(
         return (
             2 * np.sum(_distances(points, drawn).min(axis=1, initial=np.inf) < 0.08)
             + 60 * np.sum(_distances(points, others) < RADIUS + 0.08)
-            + _label_cost(box, others, drawn, near)
+            + _label_cost(box, others, drawn, close_boxes)
             + 3 * np.sum(beside)
             + (0.0 if np.isclose(angle, np.pi / 2) else 1.0)
         )
@@ -356,7 +356,7 @@ def _best_label(
     half = label_size(rows) / 2
     own = _along(edge.curve)
     drawn = np.concatenate([p for p in placed if not np.array_equal(p, own)])
-    drawn, near = _reachable(own, 2 * float(half.sum()) + 0.3, drawn, boxes)
+    drawn, close_boxes = _reachable(own, 2 * float(half.sum()) + 0.3, drawn, boxes)
     best, least = None, np.inf
     for i in range(9, 52, 2):
         along = own[i + 1] - own[i - 1]
@@ -364,7 +364,7 @@ def _best_label(
         clear = np.abs(normal) @ half + 0.05
         for shift in (0.0, clear, -clear, clear + 0.1, -clear - 0.1):
             box = Box(own[i] + shift * normal, half)
-            cost = _label_cost(box, position, drawn, near) + abs(i - 30) * 0.05
+            cost = _label_cost(box, position, drawn, close_boxes) + abs(i - 30) * 0.05
             # A label hides the line under it, so a position next to the line is better.
             cost += 6.0 if shift == 0 else 2.0 * box.holds(own) + 2.0 * (abs(shift) > clear)
             if cost < least:
@@ -379,15 +379,15 @@ def _reachable(
     """Of points and boxes, all that come so near to some points, for speed, and perhaps more."""
     low, high = around.min(axis=0) - reach, around.max(axis=0) + reach
     region = Box((low + high) / 2, (high - low) / 2)
-    near = np.all(np.abs(drawn - region.center) < region.half, axis=1)
+    inside = np.all(np.abs(drawn - region.center) < region.half, axis=1)
     stacked = np.array(boxes).reshape(-1, 2, 2)
-    return drawn[near], stacked[region.overlapped(stacked)]
+    return drawn[inside], stacked[region.overlapped(stacked)]
 
 
 def _label_cost(box: Box, nodes: Points, drawn: Points, boxes: Points) -> float:
     grown = Box(box.center, box.half + 0.03)
     clashes = int(box.overlapped(boxes).sum())
-    return 60 * box.near(nodes, RADIUS + 0.04) + 40 * clashes + 2.0 * grown.holds(drawn)
+    return 60 * box.num_within(nodes, RADIUS + 0.04) + 40 * clashes + 2.0 * grown.holds(drawn)
 
 
 def _distances(points: Points, others: Points) -> NDArray[np.float64]:

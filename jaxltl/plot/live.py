@@ -228,8 +228,8 @@ def _layer(
     ground: _Ground, values: ArrayLike | None, policy: ArrayLike | None, actions: Sequence[str]
 ) -> tuple[list[tuple[int, str]], dict[str, list[str]]]:
     """Colours of the values of states, and the arrows of a policy by tone."""
-    shown = np.zeros(0) if values is None else np.asarray(values, float)
-    colors = {s: to_hex(SCALE(shown[s])) for s in np.flatnonzero(np.isfinite(shown)).tolist()}
+    numbers = np.zeros(0) if values is None else np.asarray(values, float)
+    colors = {s: to_hex(SCALE(numbers[s])) for s in np.flatnonzero(np.isfinite(numbers)).tolist()}
     heads: dict[str, list[str]] = {}
     chances = np.zeros((0, 0)) if policy is None else np.asarray(policy, float)
     for state, action in np.argwhere(chances > 0.04).tolist():
@@ -261,18 +261,18 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
       >>> live_curve("loss", [[4.0, 5.0], [2.0, 3.0]], [1, 2]).startswith("<svg")
       True
     """
-    wide, high, left, below = 320.0, 180.0, 64.0, 26.0
-    shown = np.where(np.isfinite(values), values, np.nan)
-    kept = np.isfinite(shown).any(axis=1)
-    shown, x = shown[kept], np.asarray(steps, float)[kept]
-    least, most = float(np.nanmin(shown)), float(np.nanmax(shown))
-    logs = least > 0 and most > 100 * least
-    scaled = np.log10(shown) if logs else shown
+    wide, high, margin, below = 320.0, 180.0, 64.0, 26.0
+    rows = np.where(np.isfinite(values), values, np.nan)
+    finite = np.isfinite(rows).any(axis=1)
+    rows, x = rows[finite], np.asarray(steps, float)[finite]
+    least, upper = float(np.nanmin(rows)), float(np.nanmax(rows))
+    logs = least > 0 and upper > 100 * least
+    scaled = np.log10(rows) if logs else rows
     low, high_value = float(np.nanmin(scaled)), float(np.nanmax(scaled))
     span = (high_value - low) or 1.0
 
     def across(step: NDArray[np.float64]) -> NDArray[np.float64]:
-        return left + (step - x[0]) / max(x[-1] - x[0], 1) * (wide - left - 10)
+        return margin + (step - x[0]) / max(x[-1] - x[0], 1) * (wide - margin - 10)
 
     def down(value: NDArray[np.float64]) -> NDArray[np.float64]:
         return 10 + (1 - (value - low) / span) * (high - below - 20)
@@ -285,7 +285,7 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
     for value in (low, (low + high_value) / 2, high_value):
         real = 10**value if logs else value
         text = f"{real:.4g}" if abs(real) >= 1000 else f"{real:.3g}"
-        ticks.append((left - 6, f"{float(down(np.array(value))):.1f}", "end", text))
+        ticks.append((margin - 6, f"{float(down(np.array(value))):.1f}", "end", text))
     for step, anchor, text in ((x[0], "start", ""), (x[-1], "end", "step ")):
         ticks.append((f"{float(across(step)):.1f}", high - 9, anchor, f"{text}{step:g}"))
     return _svg(
@@ -296,7 +296,7 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
         kind="plot",
         band=edge if scaled.shape[1] > 1 else [],
         curve=path(np.nanmedian(scaled, axis=1)),
-        axis=f"M{left} 6V{high - below}H{wide - 6}",
+        axis=f"M{margin} 6V{high - below}H{wide - 6}",
         ticks=ticks,
     )
 

@@ -102,10 +102,10 @@ def grid(
     for axes in all_axes[count:]:
         axes.axis("off")
     for m, axes in enumerate(all_axes[:count]):
-        shown = None if panels is None else panels[m]
-        image = _cells(axes, kinds, shown, limits, wall, arrows is None)
+        panel = None if panels is None else panels[m]
+        image = _cells(axes, kinds, panel, limits, wall, arrows is None)
         if arrows is not None:
-            draw_arrows(axes, kinds.shape, arrows[m], shown, limits, actions)
+            draw_arrows(axes, kinds.shape, arrows[m], panel, limits, actions)
         head(axes, titles[m])
         keep_out_of_layout(axes)
     if panels is not None:
@@ -132,10 +132,10 @@ def _panels(
                 f"[{size}] or [panels, {size}]."
             )
     if policy is not None:
-        given = np.asarray(policy)
-        if given.dtype.kind in "iu":
-            given = np.eye(num_actions)[given]
-        arrows = given[None] if given.ndim == 2 else given
+        chances = np.asarray(policy)
+        if chances.dtype.kind in "iu":
+            chances = np.eye(num_actions)[chances]
+        arrows = chances[None] if chances.ndim == 2 else chances
         if arrows.shape[1:] != (size, num_actions):
             raise ValueError(
                 f"policy has shape {np.shape(policy)}; the map has {size} cells and there are "
@@ -157,13 +157,13 @@ def _cells(
     rows, columns = kinds.shape
     special = kind_colors(kinds, wall)
     marks = _cell_texts(kinds, special)
-    shown: NDArray[np.float64] = np.full(kinds.shape, np.nan)
+    numbers_of_cells: NDArray[np.float64] = np.full(kinds.shape, np.nan)
     if values is not None:
-        shown = values.reshape(kinds.shape)
-    image = shade_cells(axes, shown, limits)
+        numbers_of_cells = values.reshape(kinds.shape)
+    image = shade_cells(axes, numbers_of_cells, limits)
     tiny = max(rows, columns) > TINY
     for (r, c), kind in np.ndenumerate(kinds):
-        blank = np.isnan(shown[r, c]) or kind == wall
+        blank = np.isnan(numbers_of_cells[r, c]) or kind == wall
         if kind == wall:
             axes.add_patch(Rectangle((c, r), 1, 1, facecolor=WALL, lw=0))
             continue
@@ -175,8 +175,8 @@ def _cells(
         if kind in special:
             _name_cell(axes, (c, r), marks[str(kind)], color, blank=bool(blank), tiny=tiny)
         if numbers and not blank and not tiny:
-            tone = PAPER if shown[r, c] < sum(limits) / 2 else INK
-            value = float(shown[r, c])  # to three digits, without a leading zero
+            tone = PAPER if numbers_of_cells[r, c] < sum(limits) / 2 else INK
+            value = float(numbers_of_cells[r, c])  # to three digits, without a leading zero
             text = f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
             write(axes, (c + 0.5, r + 0.58), text, 7, tone)
     rule_cells(axes, rows, columns, FAINT)

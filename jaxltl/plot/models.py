@@ -83,15 +83,15 @@ def solution(
       >>> import jaxltl as jl
       >>> coin = jl.make_sparse(
       ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], label={"heads": [1]})
-      >>> found = jl.reachability_probability(coin, coin.states_with_label("heads"))
-      >>> len(solution(found).axes), len(solution(found, coin).axes)
+      >>> answer = jl.reachability_probability(coin, coin.states_with_label("heads"))
+      >>> len(solution(answer).axes), len(solution(answer, coin).axes)
       (1, 1)
     """
     if model is None:
         return _strip(solution)
     is_product = hasattr(model, "automaton")
     world = model.mdp if is_product else model
-    values, given = np.asarray(solution.value), np.asarray(solution.policy)
+    values, policy = np.asarray(solution.value), np.asarray(solution.policy)
     if values.shape != tuple(model.state_shape):
         raise ValueError(
             f"solution: its value has shape {values.shape}, the model's states "
@@ -101,7 +101,7 @@ def solution(
     if cells is None:
         if is_product:
             raise ValueError("solution: the product's world has no map; read the values.")
-        return _graph(world, None, values, given if given.dtype.kind in "iu" else None)
+        return _graph(world, None, values, policy if policy.dtype.kind in "iu" else None)
     inside = (cells != _WALL).ravel()
     # One panel for each memory state.
     panels = values.reshape(len(values), -1)
@@ -116,7 +116,7 @@ def solution(
             textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
             for q in chosen
         ]
-    chances = np.eye(len(STEPS))[given] if given.dtype.kind in "iu" else given.astype(float)
+    chances = np.eye(len(STEPS))[policy] if policy.dtype.kind in "iu" else policy.astype(float)
     arrows = None
     if chances.shape[values.ndim :] == (len(STEPS),):
         by_memory = chances.reshape(*panels.shape, len(STEPS))
@@ -136,21 +136,23 @@ def _limits(values: np.ndarray) -> tuple[float, float] | None:
     return (0.0, 1.0) if values.size and values.min() >= 0 and values.max() <= 1 else None
 
 
-def _strip(found: Solution) -> Figure:
+def _strip(solution: Solution) -> Figure:
     """Values of all states in ascending order, one line per lane."""
-    value, low, high = (np.asarray(x, float) for x in (found.value, found.lower, found.upper))
-    lanes = int(np.prod(np.shape(found.status)))
+    value, low, high = (
+        np.asarray(x, float) for x in (solution.value, solution.lower, solution.upper)
+    )
+    lanes = int(np.prod(np.shape(solution.status)))
     figure = blank(4.6, 1.7)
     axes = figure.subplots()
     plain_axes(axes)
-    for mine, least, most in zip(
+    for mine, least, upper in zip(
         *(x.reshape(lanes, -1)[:8] for x in (value, low, high)), strict=True
     ):
         order = np.argsort(mine, kind="stable")
-        kept = order[np.linspace(0, order.size - 1, min(order.size, 1000)).astype(int)]
-        edges = np.linspace(0, order.size, len(kept) + 1)
+        chosen = order[np.linspace(0, order.size - 1, min(order.size, 1000)).astype(int)]
+        edges = np.linspace(0, order.size, len(chosen) + 1)
         below, above, middle = (
-            np.where(np.isfinite(x[kept]), x[kept], np.nan) for x in (least, most, mine)
+            np.where(np.isfinite(x[chosen]), x[chosen], np.nan) for x in (least, upper, mine)
         )
         axes.stairs(above, edges, baseline=below, fill=True, color=ACCENT, alpha=0.25)
         axes.stairs(middle, edges, baseline=None, color=ACCENT, lw=1.4)
@@ -214,8 +216,8 @@ def _likeliest(world: PyTree) -> NDArray[np.int64]:
     if _is_dense(world):
         return np.argmax(np.asarray(world.transition), axis=-1)
     first = np.argmax(np.asarray(world.probability), axis=-1)[..., None]
-    found = np.take_along_axis(np.asarray(world.successor), first, axis=-1)[..., 0]
-    return np.asarray(found, np.int64)
+    successor = np.take_along_axis(np.asarray(world.successor), first, axis=-1)[..., 0]
+    return np.asarray(successor, np.int64)
 
 
 def board_of_robots(game: PyTree) -> Board | None:

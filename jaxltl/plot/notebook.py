@@ -29,10 +29,10 @@ def svg(draw: Callable[..., Figure], *arguments: object, text: str, **options: o
     """A figure as an inline SVG with a text alternative."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of signs that the font lacks, which stay boxes
-        found = to_bytes(draw(*arguments, **options), "svg").decode()
+        drawn = to_bytes(draw(*arguments, **options), "svg").decode()
     label = html.escape(" ".join(text.split()))
     head = f'<svg role="img" aria-label="{label}" style="max-width:100%;height:auto"'
-    opening, rest = found[found.index("<svg") + 4 :].split(">", 1)
+    opening, rest = drawn[drawn.index("<svg") + 4 :].split(">", 1)
     return f"{head}{opening}><title>{label}</title>{rest}"
 
 

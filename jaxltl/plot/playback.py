@@ -101,15 +101,15 @@ def playback(
         )
     sizes = [re.findall(r'viewBox="\S+ \S+ (\S+) (\S+)"', pane)[0] for pane in panes]
     wide, high = np.array(sizes, float).T
-    left, high_of_all = _GAP + np.cumsum([0.0, *wide + _GAP]), high.max() + 2 * _GAP
+    begins, high_of_all = _GAP + np.cumsum([0.0, *wide + _GAP]), high.max() + 2 * _GAP
     return render(
         "jaxltl.plot",
         "playback.svg",
         panes=[
             pane.replace("<svg ", f'<svg x="{x:.0f}" y="{(high_of_all - h) / 2:.0f}" ', 1)
-            for pane, x, h in zip(panes, left, high, strict=False)
+            for pane, x, h in zip(panes, begins, high, strict=False)
         ],
-        wide=left[-1],
+        wide=begins[-1],
         high=high_of_all,
         label=label or f"A run of {len(run) - 1} steps on a map",
         animations=[(n, p, _timed(f, wait), f[-1], how) for n, p, f, how in animations],
@@ -120,19 +120,19 @@ def playback(
     )
 
 
-def _whole(name: str, given: ArrayLike | None, count: int, what: str) -> list[int]:
-    found = np.asarray(() if given is None else given)
-    if found.ndim != 1 or not found.size or found.dtype.kind not in "iu":
+def _whole(name: str, values: ArrayLike | None, count: int, noun: str) -> list[int]:
+    array = np.asarray(() if values is None else values)
+    if array.ndim != 1 or not array.size or array.dtype.kind not in "iu":
         raise ValueError(
-            f"{name} has shape {found.shape} and type {found.dtype}; give int[T], "
+            f"{name} has shape {array.shape} and type {array.dtype}; give int[T], "
             "one number for each step, at least one."
         )
-    if found.min() < 0 or found.max() >= count:
+    if array.min() < 0 or array.max() >= count:
         raise ValueError(
-            f"{name} has numbers from {found.min()} to {found.max()}; there are "
-            f"{count} {what}, so give 0 to {count - 1}."
+            f"{name} has numbers from {array.min()} to {array.max()}; there are "
+            f"{count} {noun}, so give 0 to {count - 1}."
         )
-    return [int(x) for x in found]
+    return [int(x) for x in array]
 
 
 def _plain(text: str) -> str:
@@ -143,9 +143,9 @@ def _plain(text: str) -> str:
 def _timed(frames: Sequence[str], wait: float) -> str:
     """Keyframes of an attribute: one per change, and a pause at the end."""
     total = (len(frames) - 1) * wait + _REST
-    kept = [
+    keyframes = [
         f"{100 * t * wait / total:.2f}%{{{now}}}"
         for t, now in enumerate(frames)
         if t in (0, len(frames) - 1) or not frames[t - 1] == now == frames[t + 1]
     ]
-    return f"{''.join(kept)}100%{{{frames[-1]}}}"
+    return f"{''.join(keyframes)}100%{{{frames[-1]}}}"

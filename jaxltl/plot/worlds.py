@@ -129,19 +129,19 @@ def _of_memory(
     """An array over states, or states and memory, as panels ``[M, S, ...]``."""
     if array is None:
         return None
-    given = np.asarray(array, float)
-    if given.shape == (size, *rest):
-        return np.repeat(given[None], len(chosen), axis=0)
-    if given.ndim != 2 + len(rest) or (given.shape[0], *given.shape[2:]) != (size, *rest):
+    values = np.asarray(array, float)
+    if values.shape == (size, *rest):
+        return np.repeat(values[None], len(chosen), axis=0)
+    if values.ndim != 2 + len(rest) or (values.shape[0], *values.shape[2:]) != (size, *rest):
         wanted = ", ".join(map(str, rest))
         raise ValueError(
-            f"{name} has shape {given.shape}; the world has {size} cells, so pass "
+            f"{name} has shape {values.shape}; the world has {size} cells, so pass "
             f"({size}, {wanted}) or ({size}, memory{', ' if rest else ''}{wanted})."
         )
     for q in chosen:
-        if not 0 <= q < given.shape[1]:
-            raise ValueError(f"memory {q} does not exist; {name} has 0 to {given.shape[1] - 1}.")
-    return np.moveaxis(given[:, list(chosen)], 1, 0)
+        if not 0 <= q < values.shape[1]:
+            raise ValueError(f"memory {q} does not exist; {name} has 0 to {values.shape[1] - 1}.")
+    return np.moveaxis(values[:, list(chosen)], 1, 0)
 
 
 def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:

@@ -194,7 +194,7 @@ def weighed(outcome, weights_of_task):
     """What the same seed learns with given weights of the task."""
     setup = outcome.setup
     problem = setup.problem
-    hparams = job.settings(job.mlirl.Hparams, setup.task.learner.given())
+    hparams = job.settings(job.mlirl.Hparams, setup.task.learner.specified())
     for mu in weights_of_task:
         yield job._train(setup, problem, replace(hparams, mu=float(mu)), Training(0, 1))
 

@@ -55,7 +55,7 @@ def test_letters_across_a_side():
     run = episode(world, jnp.int32(0))  # up: from the first row to the last one
     scene = scene_of(world, run)
     assert scene.track.tolist() == [[1.5, 0.5], [1.5, 2.5], [1.5, 1.5], [1.5, 0.5], [1.5, 2.5]]
-    assert scene.shown == ["", "c", "", "", "c"] and scene.joined
+    assert scene.labels == ["", "c", "", "", "c"] and scene.joined
     assert sorted(scene.letters) == [(0, 0, "a"), (1, 2, "c"), (2, 0, "b")]
     lines = _segments(scene._replace(cells=0))
     assert [x.round(9).tolist() for x in lines] == [
@@ -66,7 +66,7 @@ def test_letters_across_a_side():
     ]
     assert draw_episode(world, run).axes[0].get_title(loc="left") == "c → c"
     page = play_episode(world, run, title="<up>")
-    assert "<h1>&lt;up&gt;</h1>" in page and frames(page)["shown"] == scene.shown
+    assert "<h1>&lt;up&gt;</h1>" in page and frames(page)["labels"] == scene.labels
     steps = [a["data-step"] for tag, a in Tags(page).found if tag == "polyline"]
     assert steps == ["1", "1", "2", "3", "4", "4"]
 

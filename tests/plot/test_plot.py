@@ -83,7 +83,7 @@ def test_labels_stand_clear_of_states_and_each_other(formula):
     if len(table.delta) <= 5:  # in a dense graph a label may touch its neighbour
         for i, box in enumerate(boxes):
             assert not box.overlapped(np.array(boxes[:i]).reshape(-1, 2, 2)).any()
-    assert sum(box.near(graph.position, drawing.RADIUS) for box in boxes) == 0
+    assert sum(box.num_within(graph.position, drawing.RADIUS) for box in boxes) == 0
     for box in boxes:
         assert (box.center - box.half >= 0).all()
         assert (box.center + box.half <= graph.size).all()

@@ -41,13 +41,13 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
         data = json.loads(read_bytes(path, "the demonstrations"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: this is not JSON: {error}") from None
-    shown = data.get("demonstrations") if isinstance(data, dict) else None
-    if not isinstance(shown, list) or not shown:
+    demonstrations = data.get("demonstrations") if isinstance(data, dict) else None
+    if not isinstance(demonstrations, list) or not demonstrations:
         raise ValueError(
             f'{path}: expected {{"demonstrations": [...]}} with at least one demonstration.'
         )
     sequences = []
-    for number, one in enumerate(shown, start=1):
+    for number, one in enumerate(demonstrations, start=1):
         with errors_in(f"{path}: demonstration {number}"):
             sequences.append(_read_demonstration(one, world))
     return make_trajectories(world.mdp, sequences)
@@ -56,10 +56,10 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
 def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
     keys = set(one) if isinstance(one, dict) else set()
     if keys not in ({"cells", "actions"}, {"states", "actions"}):
-        found = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
+        content = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
         raise ValueError(
             f': expected {{"cells": [[row, column], ...], "actions": [...]}}, or "states" in place '
-            f'of "cells"; {found}.'
+            f'of "cells"; {content}.'
         )
     kind = "cells" if "cells" in keys else "states"
     places, names = one[kind], one["actions"]
@@ -97,11 +97,11 @@ def _check_steps(states: list[int], actions: list[int], world: World) -> None:
 def _each_step(
     read: Callable[[object, World], int], values: list[object], world: World
 ) -> list[int]:
-    found = []
+    numbers = []
     for step, value in enumerate(values, start=1):
         with errors_in(f", step {step}: "):
-            found.append(read(value, world))
-    return found
+            numbers.append(read(value, world))
+    return numbers
 
 
 def _is_int(value: object) -> TypeGuard[int]:
@@ -184,17 +184,17 @@ def synthetic_demonstrations(
     )
     runs = project_trajectories(model, runs)
     states, actions, lengths = (np.asarray(x) for x in (runs.state, runs.action, runs.length))
-    kept = [
+    satisfying = [
         list(zip(x[: min(n, length)].tolist(), u[: min(n, length)].tolist(), strict=True))
         for x, u, n in zip(states, actions, lengths, strict=True)
         if (0 < n <= length if ends else n > length)
     ]
-    if not kept:
+    if not satisfying:
         raise ValueError(
             f"{path}: [demonstrations] none of {number} synthetic rollouts satisfies the formula "
             f"within {length} steps; raise length or discount, or check that it can be satisfied."
         )
-    return make_trajectories(model.mdp, kept), number - len(kept)
+    return make_trajectories(model.mdp, satisfying), number - len(satisfying)
 
 
 def _demonstrator(path: Path, table: SyntheticTable, model: Product, best: Solution) -> jax.Array:

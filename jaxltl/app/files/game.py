@@ -78,7 +78,7 @@ class GameTable(Table):
                 "a model; on a map give system_start and environment_start",
             )
             return
-        of_map = (key for key in self.given() if key not in ("model", "initial", "constants"))
+        of_map = (key for key in self.specified() if key not in ("model", "initial", "constants"))
         self.refuse(of_map, "a map; a model has it in its arrays")
 
 
@@ -194,7 +194,7 @@ def load_game(file: GameFile) -> World:
             return _from_model(file.path.parent / table.model, table)
         assert table.map is not None
         text, wall = read_map(file.path, table.map), table.wall or "#"
-        options = {key: value for key, value in table.given().items() if key != "map"}
+        options = {key: value for key, value in table.specified().items() if key != "map"}
         for key in ("system_start", "environment_start"):
             if isinstance(options.get(key), tuple):
                 options[key] = _cell(options[key], key, parse_map(text), wall)
@@ -203,24 +203,24 @@ def load_game(file: GameFile) -> World:
 
 
 def _from_model(path: Path, table: GameTable) -> World:
-    found = read_padded(path, ("system",), table.constants)
-    if "system" not in found.more:
+    loaded = read_padded(path, ("system",), table.constants)
+    if "system" not in loaded.more:
         raise ValueError(
             f"{str(path)!r} is no game: it lacks the array system: for each state True where the "
             "system moves and False where the environment does."
         )
-    mdp = initial_where(found.mdp, table.initial, path)
+    mdp = initial_where(loaded.mdp, table.initial, path)
     with errors_in(f"{str(path)!r}: "):
-        game = make_game(mdp, found.more["system"])
-    return World(game, found.actions, objective=found.objective)
+        game = make_game(mdp, loaded.more["system"])
+    return World(game, loaded.actions, objective=loaded.objective)
 
 
-def _cell(given: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
-    (row, column), (rows, columns) = given, cells.shape
+def _cell(cell: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
+    (row, column), (rows, columns) = cell, cells.shape
     if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(f"{key} = {list(given)} is {off_map(cells.shape)}")
+        raise ValueError(f"{key} = {list(cell)} is {off_map(cells.shape)}")
     if cells[row - 1, column - 1] == wall:
-        raise ValueError(f"{key} = {list(given)} is a wall of the map; start in another cell.")
+        raise ValueError(f"{key} = {list(cell)} is a wall of the map; start in another cell.")
     return row - 1, column - 1
 
 

@@ -51,7 +51,7 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
             )
     del raw
     model = read_model(path, constants=constants)
-    found: dict[str, np.ndarray] = {}
+    arrays_of_game: dict[str, np.ndarray] = {}
     objective = None
     if isinstance(model, IntervalMDP):
         raise ValueError(
@@ -64,13 +64,13 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
                 f"{name!r} holds a game of two players, expected a model of one; games are for "
                 "jaxltl synthesize."
             )
-        found["system"] = np.asarray(model.system)
+        arrays_of_game["system"] = np.asarray(model.system)
         if "priority" in model.mdp.valuation:
             objective = objective_of(model)
         model = model.mdp
     with errors_in(f"{name!r}: "):
         mdp, names, _ = padded(model)
-    return ReadModel(mdp, names, found, objective)
+    return ReadModel(mdp, names, arrays_of_game, objective)
 
 
 def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
@@ -90,5 +90,5 @@ def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
     return mdp, _numbered(kind, mdp.num_actions), row_actions(model)
 
 
-def _numbered(what: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{what} {i}" for i in range(count))
+def _numbered(noun: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{noun} {i}" for i in range(count))

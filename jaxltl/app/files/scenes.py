@@ -82,10 +82,11 @@ def _read_scene(task: TodirlFile, table: str, number: int, entry: str | dict[str
 
 
 def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
-    found = read_world(_with_settings(text, world))
+    colored = read_world(_with_settings(text, world))
     if _gives_kinds(world):
         own = {
-            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n} for kind, row in found.kinds
+            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n}
+            for kind, row in colored.kinds
         }
         counts = {**_objects(world), **_obstacles(world)}
         if own != {k: {c: n for c, n in row.items() if n} for k, row in counts.items()}:
@@ -93,18 +94,18 @@ def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> Scen
                 f"the map says {', '.join(own)} by lines of its own, which differ from [world] "
                 "objects and obstacles; remove one of the two."
             )
-    return _of_world(name, found, radius)
+    return _of_world(name, colored, radius)
 
 
 def _with_settings(text: str, world: WorldTable) -> str:
     """The text of a coloured world, followed by the settings of the task file that it lacks."""
     own = {line.partition(":")[0].strip() for line in text.splitlines() if ":" in line}
-    given = world.given()
-    lines = [f"{key}: {given[key]}" for key in ("margin", "slip") if key in given]
+    values = world.specified()
+    lines = [f"{key}: {values[key]}" for key in ("margin", "slip") if key in values]
     if _gives_kinds(world) and own <= {"margin", "slip"}:
         for name, counts in {**_objects(world), **_obstacles(world)}.items():
-            shown = ", ".join(f"{n} {color}" for color, n in counts.items())
-            lines.append(f"{name}: {shown}")
+            listed = ", ".join(f"{n} {color}" for color, n in counts.items())
+            lines.append(f"{name}: {listed}")
     return "\n".join([text, *lines])
 
 
@@ -165,7 +166,7 @@ def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> 
             "there is one each; give [world] objects and obstacles, not lines in the maps."
         )
     label = np.asarray(first.mdp.label)
-    shown = [int(label[:, kinds.index(name)].sum()) for name in obstacles]
+    counts = [int(label[:, kinds.index(name)].sum()) for name in obstacles]
     slip = 0.0
     if first.mdp.num_successors > 1:
         slip = 1 - float(first.mdp.probability[0, 0, 0])
@@ -178,7 +179,7 @@ def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> 
             shape=table.shape or first.shape,
             objects=objects,
             obstacles=obstacles,
-            num_obstacles=(max(shown, default=0) if table.obstacles is None else table.obstacles),
+            num_obstacles=(max(counts, default=0) if table.obstacles is None else table.obstacles),
             min_distance=table.min_distance or 3,
             margin=colored.margin,
             slip=slip,
@@ -209,8 +210,8 @@ def load_automata(task: TodirlFile) -> tuple[Automaton, Automaton]:
 
 def _alphabet(task: TodirlFile) -> list[frozenset[str]]:
     if task.world.legend is not None:
-        shown = [frozenset(names) for names in task.world.legend.values()]
-        return list(dict.fromkeys([frozenset(), *shown]))
+        letters = [frozenset(names) for names in task.world.legend.values()]
+        return list(dict.fromkeys([frozenset(), *letters]))
     colored = _read_scene(task, "world", 0, task.world.maps[0]).colored
     assert colored is not None
     return [frozenset(), *(frozenset({name}) for name, _ in colored.kinds)]

@@ -115,20 +115,20 @@ def table(kind: type[Any]) -> Any:
 class Table:
     """A table of a file; ``__attrs_post_init__`` checks what concerns several of its keys."""
 
-    def given(self) -> dict[str, Any]:
+    def specified(self) -> dict[str, Any]:
         """The keys that have a value."""
         pairs = ((key_name(x), getattr(self, x.name)) for x in _fields(type(self)))
         return {name: value for name, value in pairs if value is not None}
 
     def refuse(self, keys: Iterable[str], owner: str) -> None:
         """Raises ValueError for the first of some keys that has a value."""
-        given = self.given()
-        if wrong := next((key for key in keys if key in given), None):
+        values = self.specified()
+        if wrong := next((key for key in keys if key in values), None):
             raise ValueError(f"{wrong} belongs to {owner}.")
 
     def require_one(self, keys: Iterable[str], expected: str) -> None:
         """Raises ValueError unless exactly one of some keys has a value."""
-        if len(self.given().keys() & set(keys)) != 1:
+        if len(self.specified().keys() & set(keys)) != 1:
             raise ValueError(f"must have either {expected}.")
 
 
@@ -148,18 +148,18 @@ class File(Table):
         """Checked content of a file, or of `raw`; ValueError names the key and the fix."""
         path = Path(path)
         data, content = read_toml(path, cls.KIND, raw)
-        found = convert(path, cls, data, raw=content)
+        file = convert(path, cls, data, raw=content)
         if raw is None:
-            _ = found.digest  # raises errors of the files that it names
-        return found
+            _ = file.digest  # raises errors of the files that it names
+        return file
 
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of the file and of the files that it names, in its directory."""
-        found = hashlib.sha256(self.raw)
+        sha256 = hashlib.sha256(self.raw)
         for name in self.named_files():
-            found.update(read_bytes(self.path.parent / name, f"{self.path} names a file that"))
-        return found.hexdigest()
+            sha256.update(read_bytes(self.path.parent / name, f"{self.path} names a file that"))
+        return sha256.hexdigest()
 
     def named_files(self) -> Sequence[str]:
         return ()
@@ -185,12 +185,12 @@ def read_bytes(path: Path, kind: str) -> bytes:
         raise ValueError(f"{kind} cannot be read: {str(path)!r}: {error.strerror}.") from None
 
 
-def read_map(path: Path, given: str | Mapping[str, str]) -> str:
+def read_map(path: Path, entry: str | Mapping[str, str]) -> str:
     """The text of a map in a task file, or in the file that it names."""
     return (
-        given
-        if isinstance(given, str)
-        else read_bytes(path.parent / given["file"], "the map").decode()
+        entry
+        if isinstance(entry, str)
+        else read_bytes(path.parent / entry["file"], "the map").decode()
     )
 
 
@@ -239,9 +239,9 @@ def _converted(value: Any, kind: Any) -> Any:
     """A value in the type of its key; a table's own keys are converted later."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        found = _converted(value, parts[0])
-        if all(x.holds(found) for x in parts[1:] if isinstance(x, Meta)):
-            return found
+        converted = _converted(value, parts[0])
+        if all(x.holds(converted) for x in parts[1:] if isinstance(x, Meta)):
+            return converted
     elif origin in (Union, UnionType):
         for part in parts:
             with contextlib.suppress(TypeError):

@@ -149,7 +149,7 @@ class OptimizerTable(LearnerTable):
 
     def hyperparameters(self) -> Record:
         """The keys that have a value, but the method."""
-        return {key: value for key, value in self.given().items() if key != "method"}
+        return {key: value for key, value in self.specified().items() if key != "method"}
 
 
 @table

@@ -282,7 +282,7 @@ class EnvironmentFile(FormulaFile):
                     f'[{other}] is for method = "{other}", and [learner] says "{method}": leave '
                     "one of them out."
                 )
-        if self.world.dynamics is None and self.proof.given():
+        if self.world.dynamics is None and self.proof.specified():
             raise ValueError(
                 f"[proof] is for dynamics, and [world] environment = {self.world.environment!r} "
                 "is simulated: leave [proof] out."

@@ -101,12 +101,12 @@ class GroundingFile(FormulaFile):
         return [] if isinstance(seen, str) else seen
 
     def __attrs_post_init__(self) -> None:
-        for key, found, count in (
+        for key, files, count in (
             ("[grounding] observations", self.tables, len(self.maps)),
             ("[demonstrations] files", self.demonstrations.files, len(self.world.maps)),
         ):
-            if found and len(found) != count:
-                raise ValueError(f"{key} has {len(found)} files for {count} maps.")
+            if files and len(files) != count:
+                raise ValueError(f"{key} has {len(files)} files for {count} maps.")
 
     def named_files(self) -> Sequence[str]:
         named = [*filter(None, map(map_file, self.maps)), *self.tables]

@@ -213,9 +213,11 @@ class MlirlFile(TaskFile):
             )
 
     def named_files(self) -> Sequence[str]:
-        world, shown = self.world, self.demonstrations
+        world, demonstrations = self.world, self.demonstrations
         named = [world.map["file"]] if isinstance(world.map, dict) else []
-        named += [x for x in (world.model, world.transitions, world.labels, shown.file) if x]
+        named += [
+            x for x in (world.model, world.transitions, world.labels, demonstrations.file) if x
+        ]
         if world.model is not None:  # PRISM keeps labels in another file
             beside = files_beside(self.path.parent / world.model)
             named += [str(x.absolute()) for x in beside]

@@ -107,7 +107,7 @@ class DemonstrationsTable(SyntheticTable):
 
     def rewards(self) -> dict[str, float]:
         """The rewards of the simulated expert that the file gives."""
-        return {key: value for key, value in self.given().items() if key in REWARDS}
+        return {key: value for key, value in self.specified().items() if key in REWARDS}
 
 
 @table

@@ -39,8 +39,8 @@ class World:
 
     def where(self, state: int) -> Record:
         """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
-        found = where(state, self.shape)
-        return found if self.logged is None else {**found, "name": self.logged.states[state]}
+        position = where(state, self.shape)
+        return position if self.logged is None else {**position, "name": self.logged.states[state]}
 
     def place(self, state: int) -> str:
         return place(self.where(state))
@@ -49,7 +49,7 @@ class World:
 def grid_options(table: GridTable) -> Record:
     """The arguments of :func:`~jaxltl.envs.gridworld.gridworld` that a table gives."""
     names = ("legend", "wall", "slip", "absorbing", "initial")
-    return {name: value for name, value in table.given().items() if name in names}
+    return {name: value for name, value in table.specified().items() if name in names}
 
 
 def load_world(path: Path, table: WorldTable) -> World:
@@ -65,9 +65,9 @@ def load_world(path: Path, table: WorldTable) -> World:
             from jaxltl.app.files.models import read_padded
 
             file = path.parent / table.model
-            found = read_padded(file, constants=table.constants)
+            loaded = read_padded(file, constants=table.constants)
             assert not isinstance(table.initial, list)
-            return World(initial_where(found.mdp, table.initial, file), None, found.actions)
+            return World(initial_where(loaded.mdp, table.initial, file), None, loaded.actions)
         assert table.map is not None
         text = read_map(path, table.map)
         return World(gridworld(text, **grid_options(table)), parse_map(text), ACTIONS)

@@ -67,7 +67,7 @@ class Outcome:
     """The posterior and its answers."""
 
     setup: Setup
-    found: grounding.Posterior
+    posterior: grounding.Posterior
     members: np.ndarray  # rows of the credible set
     table: list[grounding.Row]
     query: grounding.Query
@@ -89,10 +89,10 @@ def prepare(task: GroundingFile, seed: int) -> Setup:
         worlds = [World(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts]
     names, seen = _observations(task, worlds)
     count, hparams = len(task.world.maps), grounding.Hparams(discount=task.demonstrations.discount)
-    shown = _demonstrations(task, worlds[:count], seed)
+    demonstrations = _demonstrations(task, worlds[:count], seed)
     with errors_in(f"{path}: "):
         mdps = [world.mdp for world in worlds]
-        problem = grounding.make_problem(mdps[:count], seen[:count], shown, task.formula)
+        problem = grounding.make_problem(mdps[:count], seen[:count], demonstrations, task.formula)
         size = max(world.num_states for world in mdps)
         wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in seen])
         if task.grounding.clusters is None:
@@ -113,12 +113,12 @@ def _observations(
     task: GroundingFile, worlds: list[World]
 ) -> tuple[tuple[str, ...], list[np.ndarray]]:
     """Names of the columns, and observations ``float[S, O]`` of each world."""
-    given = task.grounding.observations
-    if given == "cells":
+    files = task.grounding.observations
+    if files == "cells":
         return worlds[0].mdp.propositions, [np.asarray(x.mdp.label, float) for x in worlds]
     names: tuple[str, ...] = ()
     seen = []
-    for name, world in zip(given, worlds, strict=True):
+    for name, world in zip(files, worlds, strict=True):
         path = task.path.parent / name
         head, *lines = read_bytes(path, "the observations").decode().splitlines()
         with errors_in(f"{path}: "):
@@ -135,12 +135,12 @@ def _observations(
 
 def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list[Trajectories]:
     """Demonstrations in each world, read or simulated with the hidden meanings."""
-    shown, found = task.demonstrations, []
-    if shown.files is not None:
-        files = [task.path.parent / name for name in shown.files]
+    table, trajectories = task.demonstrations, []
+    if table.files is not None:
+        files = [task.path.parent / name for name in table.files]
         return [read_demonstrations(x, world) for x, world in zip(files, worlds, strict=True)]
     with errors_in(f"{task.path}: "):
-        automaton, meaning = require_task(task.formula), shown.meaning or {}
+        automaton, meaning = require_task(task.formula), table.meaning or {}
         for symbol in automaton.propositions:
             if meaning.get(symbol) not in (known := worlds[0].mdp.propositions):
                 raise ValueError(
@@ -152,17 +152,17 @@ def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list
         labels = np.asarray(world.mdp.label)[:, columns]
         mdp = grounding.with_labels(world.mdp, labels, automaton.propositions)
         model = product(mdp, automaton)
-        policy = grounding.motive_policy(model, shown.scale, shown.discount)
+        policy = grounding.motive_policy(model, table.scale, table.discount)
         runs = rollout(
             model,
             policy,
             jax.random.fold_in(jax.random.key(seed), w),
-            num_trajectories=shown.synthetic or 0,
-            num_steps=shown.length or 200,
+            num_trajectories=table.synthetic or 0,
+            num_steps=table.length or 200,
             stop=model.final if automaton.is_cosafe else None,
         )
-        found.append(project_trajectories(model, runs))
-    return found
+        trajectories.append(project_trajectories(model, runs))
+    return trajectories
 
 
 def describe(setup: Setup) -> str:
@@ -180,37 +180,37 @@ def learn(setup: Setup, training: Training) -> Outcome:
     task, problem, hparams = setup.task, setup.problem, setup.hparams
     count, size = problem.observation.shape[:2]
     with errors_in(f"{task.path}: "):
-        found = grounding.posterior(
+        posterior = grounding.posterior(
             problem, hparams, meanings=setup.meaning[:, :count, :size], names=setup.names
         )
     training.stage("certifying")
-    members = grounding.credible_set(found, task.grounding.level)
+    members = grounding.credible_set(posterior, task.grounding.level)
     return Outcome(
         setup,
-        found,
+        posterior,
         members,
-        grounding.grounding_table(problem, hparams, found),
-        grounding.best_query(found),
-        [_answer(setup, found, members[:_MOST], w) for w in range(len(setup.worlds))],
+        grounding.grounding_table(problem, hparams, posterior),
+        grounding.best_query(posterior),
+        [_answer(setup, posterior, members[:_MOST], w) for w in range(len(setup.worlds))],
     )
 
 
-def labels_of(setup: Setup, found: grounding.Posterior, row: int, w: int) -> np.ndarray:
+def labels_of(setup: Setup, posterior: grounding.Posterior, row: int, w: int) -> np.ndarray:
     """``bool[S, P]``, the labels of a world by a row of the posterior."""
-    return setup.meaning[found.assignment[row], w, : setup.worlds[w].mdp.num_states].T
+    return setup.meaning[posterior.assignment[row], w, : setup.worlds[w].mdp.num_states].T
 
 
-def _answer(setup: Setup, found: grounding.Posterior, members: np.ndarray, w: int) -> Answer:
+def _answer(setup: Setup, posterior: grounding.Posterior, members: np.ndarray, w: int) -> Answer:
     mdp, automaton = setup.worlds[w].mdp, setup.task.formula
-    labels = [labels_of(setup, found, i, w) for i in members]
-    model = product(grounding.with_labels(mdp, labels[0], found.symbols), automaton)
+    labels = [labels_of(setup, posterior, i, w) for i in members]
+    model = product(grounding.with_labels(mdp, labels[0], posterior.symbols), automaton)
     inside = optimal_actions(model)
     policy = grounding.motive_policy(
-        with_allowed(model, inside.allowed), found.scale[0], setup.hparams.discount
+        with_allowed(model, inside.allowed), posterior.scale[0], setup.hparams.discount
     )
     robust = None
     if len(labels) > 1:
-        robust = grounding.robust_policy(mdp, labels, found.symbols, automaton)
+        robust = grounding.robust_policy(mdp, labels, posterior.symbols, automaton)
     return Answer(model, policy, satisfaction_probability(model, policy), inside.best, robust)
 
 
@@ -228,19 +228,19 @@ def _mean(answer: Answer, solution: Solution) -> Record:
 
 def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
     """The decisive steps of a symbol, with the numbers of maps and demonstrations from 1."""
-    found, problem = [], setup.problem
+    records, problem = [], setup.problem
     for n, t, gain in row.steps:
         w = int(problem.world[n])
         number = n - int(np.argmax(np.asarray(problem.world) == w)) + 1
         where = setup.worlds[w].where(int(problem.state[n, t]))
         place = {"map": w + 1, "demonstration": number, "step": t + 1, **where}
-        found.append({**place, "action": ACTIONS[int(problem.action[n, t])], "gain": gain})
-    return found
+        records.append({**place, "action": ACTIONS[int(problem.action[n, t])], "gain": gain})
+    return records
 
 
 def summary(outcome: Outcome) -> Record:
     """The results for ``result.json``."""
-    setup, found, query = outcome.setup, outcome.found, outcome.query
+    setup, posterior, query = outcome.setup, outcome.posterior, outcome.query
     task, problem, members = setup.task, setup.problem, outcome.members
     level, first = task.grounding.level, members[:_MOST].tolist()
     result = {
@@ -253,14 +253,16 @@ def summary(outcome: Outcome) -> Record:
         "num_demonstrated": len(problem.observation),
         "meanings": setup.names,
         "grounding": [{**x._asdict(), "steps": _steps(setup, x)} for x in outcome.table],
-        "groundings": [{"weight": found.weight[i], "meaning": found.meaning_of(i)} for i in first],
+        "groundings": [
+            {"weight": posterior.weight[i], "meaning": posterior.meaning_of(i)} for i in first
+        ],
         "credible_set": {
             "level": level,
             "number": len(members),
-            "robust_weight": found.weight[first].sum(),
+            "robust_weight": posterior.weight[first].sum(),
         },
-        "ambiguous": grounding.ambiguous_symbols(found, level),
-        "complete": found.complete,
+        "ambiguous": grounding.ambiguous_symbols(posterior, level),
+        "complete": posterior.complete,
         "query": {
             "map": query.world + 1,
             **setup.worlds[query.world].where(query.state),
@@ -298,11 +300,11 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """The grounding on each map: for each symbol the posterior probability of its label."""
-    setup, found = outcome.setup, outcome.found
-    heavy = np.flatnonzero(found.weight > 1e-9).tolist()
+    setup, posterior = outcome.setup, outcome.posterior
+    heavy = np.flatnonzero(posterior.weight > 1e-9).tolist()
     drawn = []
     for w, world in enumerate(setup.worlds):
-        weight = sum(found.weight[i] * labels_of(setup, found, i, w) for i in heavy)
+        weight = sum(posterior.weight[i] * labels_of(setup, posterior, i, w) for i in heavy)
         titles = [f"{row.symbol}: {row.meaning}" for row in outcome.table]
         picture = drawing("grid", world.cells, np.asarray(weight).T, titles=titles, label="weight")
         drawn.append(

@@ -61,8 +61,8 @@ def draw(picture: Drawing) -> bytes:
     # Import here: learning alone does not need matplotlib.
     from jaxltl import plot
 
-    found = getattr(plot, picture.function)(*picture.arguments, **picture.options)
-    return found.encode() if isinstance(found, str) else plot.to_bytes(found)
+    figure = getattr(plot, picture.function)(*picture.arguments, **picture.options)
+    return figure.encode() if isinstance(figure, str) else plot.to_bytes(figure)
 
 
 @contextlib.contextmanager

@@ -141,8 +141,8 @@ def curves(
     name: str, title: str, caption: str, history: Mapping[str, np.ndarray], show: Iterable[str]
 ) -> Curves:
     """The learning curves of some metrics, but of those without a finite value."""
-    shown = {k: history[k] for k in show if np.isfinite(history[k]).any()}
-    return Curves(name, title, caption, shown, history["step"])
+    metrics = {k: history[k] for k in show if np.isfinite(history[k]).any()}
+    return Curves(name, title, caption, metrics, history["step"])
 
 
 class _Dynamics:
@@ -165,11 +165,11 @@ class _Dynamics:
         return int(self.next_memory[there if self.on_entry else here, memory])
 
 
-def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
+def demonstrated_runs(model: Product, demonstrations: Trajectories) -> list[Run]:
     """The first demonstrations with their memory states, and a deterministic last successor."""
     world, runs = _Dynamics(model), []
-    states, actions = np.asarray(shown.state), np.asarray(shown.action)
-    lengths = np.asarray(shown.length)
+    states, actions = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
+    lengths = np.asarray(demonstrations.length)
     for number in np.flatnonzero(lengths > 0)[:MOST_RUNS].tolist():
         length = int(lengths[number])
         at, did = states[number, :length].tolist(), actions[number, :length].tolist()

@@ -176,18 +176,18 @@ def _layers(outcome: Any) -> dict[str, Layer]:
     starts = np.asarray(model.mdp.initial) > 0
     undecided = verdicts(model.automaton) == Verdict.UNDECIDED
     met = _reached(model)
-    shown = np.flatnonzero(undecided & met.any(axis=0)).tolist()
+    memories = np.flatnonzero(undecided & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
-    found = {
+    layers = {
         str(q): Layer(
             f"memory state {q}: {names[q]}",
             np.where(met[:, q], value[:, q], np.nan),
             np.where(met[:, q, None], policy[:, q], np.nan),
         )
-        for q in shown
+        for q in memories
     }
     at_start = np.where(starts, from_starts(model, value), np.nan)
-    return {**found, START: Layer("initial states", at_start, None)}
+    return {**layers, START: Layer("initial states", at_start, None)}
 
 
 def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
@@ -225,7 +225,7 @@ def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
 
 def _reached(model: Product) -> np.ndarray:
     """``bool[S, Q]``: product states that some policy can reach from an initial one."""
-    found = restrict(model)
+    restricted = restrict(model)
     met = np.zeros(model.state_shape, bool)
-    met[np.asarray(found.base_state), np.asarray(found.memory)] = True
+    met[np.asarray(restricted.base_state), np.asarray(restricted.memory)] = True
     return met

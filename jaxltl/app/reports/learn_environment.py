@@ -16,14 +16,14 @@ def _visits(result: Result) -> list[str]:
 
 def _values(result: Result) -> Record:
     """Sentences on learning, evaluation and proof, and rows of estimates."""
-    world, found = result["environment"], result["evaluation"]
+    world, evaluation = result["environment"], result["evaluation"]
     actions, drawn = world["actions"], result["policy"]["acts"] == "drawn"
     kind = f"{actions} actions" if isinstance(actions, int) else f"actions in a box {actions}"
     acts = "" if result["method"] == "cce" else f" ({'random' if drawn else 'likeliest'} actions)"
     names = (*_PROBABILITIES, *_visits(result))
     seeds = result["seeds"]
     return {
-        "tiles": [(name, *_numbers(name, found)) for name in (*names, "length")],
+        "tiles": [(name, *_numbers(name, evaluation)) for name in (*names, "length")],
         "bounds": proof.bounds(result.get("proof") or {}),
         "sentence": (
             f"{result['method']} in {world['name']}: {kind}, "
@@ -32,13 +32,13 @@ def _values(result: Result) -> Record:
             f"{many(result['seeds']['number'], 'seed')}; {result['policy']['made_of']}"
         ),
         "evaluation": (
-            f"{found['num_episodes']:,} fresh episodes of at most {found['num_steps']:,} steps of "
-            f"the kept policy{acts}; each interval holds with confidence {found['confidence']:g}."
+            f"{evaluation['num_episodes']:,} fresh episodes of at most {evaluation['num_steps']:,} steps of "
+            f"the kept policy{acts}; each interval holds with confidence {evaluation['confidence']:g}."
         ),
         "proof": proof.sentence(result["proof"]) if result.get("proof") else "",
         "estimates": [
-            (name.replace("_", " "), *_numbers(name, found), found[name]["method"])
-            for name in found["estimates"]
+            (name.replace("_", " "), *_numbers(name, evaluation), evaluation[name]["method"])
+            for name in evaluation["estimates"]
             if _visits(result) or "visits" not in name
         ],
         "seed_header": ("seed", *names),
@@ -52,9 +52,9 @@ def _values(result: Result) -> Record:
     }
 
 
-def _numbers(name: str, found: Result) -> tuple[str, str]:
+def _numbers(name: str, evaluation: Result) -> tuple[str, str]:
     """An estimate and its interval."""
-    value, *ends = (found[name][key] for key in ("mean", "lower", "upper"))
+    value, *ends = (evaluation[name][key] for key in ("mean", "lower", "upper"))
     if name in _PROBABILITIES:
         return probability(value), "[{:.4f}, {:.4f}]".format(*ends)
     return number(value), "[{}, {}]".format(*map(number, ends))

@@ -17,11 +17,11 @@ _WORLDS = ("map", "probability", "certified", "maximum", "robust policy, at leas
 
 
 def _sentence(result: Result) -> str:
-    shown = result["demonstrations"]
-    kind = "synthetic demonstration" if shown["synthetic"] else "demonstration"
+    demonstrations = result["demonstrations"]
+    kind = "synthetic demonstration" if demonstrations["synthetic"] else "demonstration"
     return (
         f"{many(len(result['grounding']), 'symbol')} of {many(len(result['meanings']), 'possible meaning')}, "
-        f"{many(shown['number'], kind)} ({many(shown['pairs'], 'step')}) in "
+        f"{many(demonstrations['number'], kind)} ({many(demonstrations['pairs'], 'step')}) in "
         f"{many(result['num_demonstrated'], 'map')}"
     )
 

@@ -64,14 +64,16 @@ def _number_of_worlds(about: Result) -> str:
 
 
 def _sentence(result: Result) -> str:
-    shown, tests = result["demonstrations"], result["test"]
-    kind = "synthetic demonstrations" if shown["synthetic"] else "demonstrations"
-    dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
+    demonstrations, tests = result["demonstrations"], result["test"]
+    kind = "synthetic demonstrations" if demonstrations["synthetic"] else "demonstrations"
+    dropped = (
+        f", {demonstrations['dropped']} unfinished dropped" if demonstrations["dropped"] else ""
+    )
     tested = f", tested in {tests['num_worlds']}" if tests else ""
     return (
         f"todirl in {many(result['training']['num_worlds'], 'world')}{tested}, "
-        f"{result['num_memory']} memory states, {sum(shown['number'])} {kind} "
-        f"({sum(shown['pairs'])} pairs{dropped})"
+        f"{result['num_memory']} memory states, {sum(demonstrations['number'])} {kind} "
+        f"({sum(demonstrations['pairs'])} pairs{dropped})"
     )
 
 
@@ -146,9 +148,9 @@ _FIGURES = ("per_pair", "held_out", "gradient_norm")
 def task_pictures(setup: Setup) -> list[Picture]:
     """Pictures of the automata of the formula and of the memory."""
     same = setup.memory is setup.judge
-    found = [automaton_picture(setup.judge, "training-1" if same else "")]
+    drawings = [automaton_picture(setup.judge, "training-1" if same else "")]
     if not same:
-        found.append(
+        drawings.append(
             Picture(
                 "memory.svg",
                 "Memory of the learner",
@@ -157,17 +159,17 @@ def task_pictures(setup: Setup) -> list[Picture]:
                 "training-1",
             )
         )
-    return found
+    return drawings
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """Pictures of learning curves and of policies in worlds."""
-    found = [learning_picture(outcome.learned.history, _caption_of_curves(outcome), _FIGURES)]
+    drawings = [learning_picture(outcome.learned.history, _caption_of_curves(outcome), _FIGURES)]
     if time := summary(outcome)["training"].get("expected_steps"):
-        found += steps.pictures({**time, "likelihood": []})
+        drawings += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
-        found += _draw(outcome, one)
-    return found
+        drawings += _draw(outcome, one)
+    return drawings
 
 
 def live(outcome: Outcome) -> list[Explorer | Curves]:
@@ -181,11 +183,11 @@ def live(outcome: Outcome) -> list[Explorer | Curves]:
 
 def _caption_of_curves(outcome: Outcome) -> str:
     scores = outcome.learned.held_out
-    kept = ". The parameters with the least held-out figure are kept"
+    choice = ". The parameters with the least held-out figure are kept"
     return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
         "if there are any, and the norm of the gradient, before each step"
-        f"{'' if np.isnan(scores).any() else kept}{over_seeds(len(scores))}"
+        f"{'' if np.isnan(scores).any() else choice}{over_seeds(len(scores))}"
     )
 
 
@@ -236,12 +238,14 @@ class _Drawn:
 def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
     setup, mean = outcome.setup, np.asarray(outcome.judged.performance["learned"].mean)
 
-    def drawn(w: int, kind: str, stem: str, arrows: bool, shown: Trajectories | None) -> _Drawn:
+    def drawn(
+        w: int, kind: str, stem: str, arrows: bool, demonstrations: Trajectories | None
+    ) -> _Drawn:
         title = f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
-        return _Drawn(outcome, w, stem, title, arrows, shown)
+        return _Drawn(outcome, w, stem, title, arrows, demonstrations)
 
-    for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
-        yield drawn(w, "Training world", f"training_{w + 1}", True, shown)
+    for w, demonstrations in enumerate(setup.demonstrations[:_PICTURES]):
+        yield drawn(w, "Training world", f"training_{w + 1}", True, demonstrations)
     # The test worlds of least, median and greatest satisfaction probability, each once.
     counted = counted_worlds(setup)
     if order := counted[np.argsort(mean[counted], kind="stable")].tolist():
@@ -258,7 +262,9 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
     starts = np.asarray(scene.mdp.initial) > 0
     layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
     model = part_of(setup.worlds.model, one.w)
-    shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
+    demonstrated = (
+        [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
+    )
     place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return Explorer(
         name=one.live,
@@ -267,7 +273,7 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
         size=scene.mdp.num_states,
         automaton=setup.memory,
         layers=layers,
-        runs=[*shown, *_runs(outcome, one)],
+        runs=[*demonstrated, *_runs(outcome, one)],
         place=place,
         actions=ACTIONS,
         label="satisfaction probability",
@@ -282,30 +288,30 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     names, moving = _memory_names(setup), one.moving
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
-    shown, titles = list(names), [short_name(name, width) for name in names.values()]
+    memories, titles = list(names), [short_name(name, width) for name in names.values()]
     if scene.colored is None:
         assert scene.cells is not None
         drawn = drawing(
             "grid",
             scene.cells,
-            np.broadcast_to(one.value, (len(shown), one.value.size)),
-            moving.transpose(1, 0, 2)[shown],
+            np.broadcast_to(one.value, (len(memories), one.value.size)),
+            moving.transpose(1, 0, 2)[memories],
             titles=titles,
             label="satisfaction probability",
             wall=setup.task.world.wall or "#",
         )
         caption += " Colours: the satisfaction probability from there as an initial state."
         return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
-    found: list[Picture] = []
+    drawings: list[Picture] = []
     if one.arrows:
         drawn = drawing(
-            "temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown, title=titles
+            "temporal_gridworld", part_of(scene.colored, ...), moving, memory=memories, title=titles
         )
-        found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
+        drawings.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
     if one.policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
-        found.append(
+        drawings.append(
             Picture(
                 f"{one.stem}_runs.svg",
                 f"Trajectories in {scene.name}" if one.arrows else one.title,
@@ -315,7 +321,7 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
                 one.live,
             )
         )
-    return found
+    return drawings
 
 
 def _memory_names(setup: Setup) -> dict[int, str]:
@@ -331,5 +337,5 @@ def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     if setup.memory is not setup.judge:
         policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge))
         count = len(setup.judge.delta)  # the formula's automaton state varies fastest
-    found = learned_runs(part_of(setup.worlds.judged, one.w), policy, outcome.seed)
-    return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]
+    rollouts = learned_runs(part_of(setup.worlds.judged, one.w), policy, outcome.seed)
+    return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in rollouts]

@@ -111,12 +111,12 @@ def render_text(template: str, **values: object) -> list[str]:
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    found = templates.environment("jaxltl.app.reports")
+    environment = templates.environment("jaxltl.app.reports")
     formats = (number, probability, certified, mean_deviation, rounded_down, place, many)
-    found.filters |= {function.__name__: function for function in formats}
+    environment.filters |= {function.__name__: function for function in formats}
     parts = (position, layer_table, run_rows, automaton_rows, curve_table)
-    found.globals |= {function.__name__: function for function in parts}
-    return found
+    environment.globals |= {function.__name__: function for function in parts}
+    return environment
 
 
 def _static(name: str) -> Markup:
@@ -165,16 +165,16 @@ def _verdict(verdict: int, goal: str) -> str:
 
 def _memory_texts(part: Explorer) -> dict[str, str]:
     """Meaning of each memory state, and of the layer of initial states."""
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     if part.automaton is None:
-        return found
+        return meanings
     names = part.automaton.state_names or ("",) * len(part.automaton.delta)
     for q, (name, verdict) in enumerate(zip(names, verdicts(part.automaton), strict=True)):
         texts = [_verdict(verdict, part.goal), name and f"remaining formula {name}"]
         if part.layers and str(q) not in part.layers and verdict == Verdict.UNDECIDED:
             texts[0] = "no values: no policy reaches this memory state"
-        found[str(q)] = f"Memory state {q}: " + "; ".join(text for text in texts if text)
-    return {**found, START: f"Initial states: {part.label} from there"}
+        meanings[str(q)] = f"Memory state {q}: " + "; ".join(text for text in texts if text)
+    return {**meanings, START: f"Initial states: {part.label} from there"}
 
 
 def position(part: Explorer, state: int) -> str:
@@ -234,10 +234,10 @@ def automaton_rows(automaton: Automaton, goal: str) -> list[Record]:
 def curve_table(part: Curves) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
     """Header and rows of the medians of metrics over seeds."""
     count = len(part.steps)
-    shown = sorted({int(t) for t in np.linspace(0, count - 1, min(count, _CURVE_ROWS))})
+    rows = sorted({int(t) for t in np.linspace(0, count - 1, min(count, _CURVE_ROWS))})
     header = ("step", *(name.replace("_", " ") for name in part.metrics))
-    medians = ((number(_median(x[t])) for x in part.metrics.values()) for t in shown)
-    return header, [(int(part.steps[t]), *row) for t, row in zip(shown, medians, strict=True)]
+    medians = ((number(_median(x[t])) for x in part.metrics.values()) for t in rows)
+    return header, [(int(part.steps[t]), *row) for t, row in zip(rows, medians, strict=True)]
 
 
 def _median(values: np.ndarray) -> float | None:

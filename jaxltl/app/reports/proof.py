@@ -28,11 +28,11 @@ class Proof:
     violation: Floats | None = None
 
 
-def entry(found: Proof | str) -> Record:
+def entry(result: Proof | str) -> Record:
     """A proof, or the reason for which there is none, as a JSON object."""
-    if isinstance(found, str):
-        return {"reason": found}
-    proof = found.certificate
+    if isinstance(result, str):
+        return {"reason": result}
+    proof = result.certificate
     lower, upper = proof.initial_bounds
     how = proof.how[proof.initial]
     return {
@@ -43,7 +43,7 @@ def entry(found: Proof | str) -> Record:
         "cells": proof.grid.num_cells,
         "initial_cells": int(proof.initial.sum()),
         "how": {text: int((how == key).sum()) for key, text in HOW.items()},
-        "counterexample": None if found.violation is None else found.violation.tolist(),
+        "counterexample": None if result.violation is None else result.violation.tolist(),
         "seconds": {name: round(x, 3) for name, x in proof.seconds.items()},
     }
 

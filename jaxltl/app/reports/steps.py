@@ -50,12 +50,12 @@ def lines(steps: Result | None) -> list[str]:
     """The numbers for the terminal."""
     if steps is None:
         return []
-    found = [
+    text = [
         "",
         heading(steps),
         *(f"  {title:25} {value:>9}   certified {bounds}" for title, value, bounds in rows(steps)),
     ]
-    return found + trade_off(steps)
+    return text + trade_off(steps)
 
 
 def trade_off(steps: Result) -> list[str]:

@@ -29,13 +29,13 @@ from jaxltl.envs.text_map import parse_map
 # --- results --------------------------------------------------------------------------------
 
 
-def summary(found: Synthesis, seconds: float) -> Record:
+def summary(synthesis: Synthesis, seconds: float) -> Record:
     """The results for ``result.json``."""
-    file, world = found.file, found.world
-    wins, starts = found.wins, found.starts
+    file, world = synthesis.file, synthesis.world
+    wins, starts = synthesis.wins, synthesis.starts
     won = int(wins[starts].sum())
     outcome = "realizable" if won == starts.size else "partly realizable" if won else "unrealizable"
-    automaton = found.nodes.automaton
+    automaton = synthesis.nodes.automaton
     result = {
         "game": file.name,
         "task": task_text(file.task),
@@ -48,21 +48,22 @@ def summary(found: Synthesis, seconds: float) -> Record:
             "states": int(wins.sum()),
             "initial_states": won,
             "num_initial_states": int(starts.size),
-            "lost_initial_states": [world.where(s) for s in found.lost_starts[:100]],
+            "lost_initial_states": [world.where(s) for s in synthesis.lost_starts[:100]],
         },
-        "verdict": found.verdict._asdict(),
-        "strategy": _about_strategy(found),
-        "expected_moves": found.moves and dict(zip(("drawn", "any"), found.moves, strict=True)),
-        "play": found.play
+        "verdict": synthesis.verdict._asdict(),
+        "strategy": _about_strategy(synthesis),
+        "expected_moves": synthesis.moves
+        and dict(zip(("drawn", "any"), synthesis.moves, strict=True)),
+        "play": synthesis.play
         and {
-            **vars(found.play),
+            **vars(synthesis.play),
             "steps": [
                 {
                     "mover": step.mover,
                     "move": step.action,
-                    **world.where(int(found.nodes.world_state[step.node])),
+                    **world.where(int(synthesis.nodes.world_state[step.node])),
                 }
-                for step in found.play.steps
+                for step in synthesis.play.steps
             ],
         },
         **took(seconds),
@@ -70,22 +71,26 @@ def summary(found: Synthesis, seconds: float) -> Record:
     return dict(plain(result))
 
 
-def _about_strategy(found: Synthesis) -> Record | None:
-    if found.strategy is None or found.restricted is None or found.strategy_verdict is None:
+def _about_strategy(synthesis: Synthesis) -> Record | None:
+    if (
+        synthesis.strategy is None
+        or synthesis.restricted is None
+        or synthesis.strategy_verdict is None
+    ):
         return None
-    game = found.restricted.model
+    game = synthesis.restricted.model
     system, available = np.asarray(game.system), np.asarray(game.available)
-    memory = found.strategy.game.state_shape
+    memory = synthesis.strategy.game.state_shape
     return {
-        "maximal": found.strategy.maximal,
-        "reason": found.strategy.reason,
+        "maximal": synthesis.strategy.maximal,
+        "reason": synthesis.strategy.reason,
         "num_memory": memory[1] if len(memory) > 1 else 1,
         "num_states": game.num_states,
         "num_system_states": int(system.sum()),
         "num_moves": int(available.sum()),
         "num_system_moves": int(available[system].sum()),
-        "confirmed": found.strategy_verdict.system,
-        "refuted_by": found.strategy_verdict.reason,
+        "confirmed": synthesis.strategy_verdict.system,
+        "refuted_by": synthesis.strategy_verdict.reason,
     }
 
 
@@ -96,19 +101,19 @@ def is_confirmed(result: Result) -> bool:
     return bool(claims["system"] and claims["environment"] and sound)
 
 
-def report_of(found: Synthesis) -> Report:
+def report_of(synthesis: Synthesis) -> Report:
     """The report of a synthesis, of its :func:`summary`."""
 
     def values(result: Result) -> Record:
         reason = f"permissive strategy, {(result['strategy'] or {}).get('reason')}"
         moves = (result["expected_moves"] or {}).values()
         return {
-            "found": found,
+            "synthesis": synthesis,
             "reason": textwrap.fill(reason, 96, subsequent_indent="  "),
             "moves": ["unbounded" if x is None else number(x) for x in moves],
             "verdict": verdict(result),
             "confirmed": is_confirmed(result),
-            "play": describe_play(found),
+            "play": describe_play(synthesis),
             "title": result["game"],
             "formula": result["task"],
             "file_title": "Game file",
@@ -130,20 +135,20 @@ def verdict(result: Result) -> str:
 # --- plays -----------------------------------------------------------------------------------
 
 
-def describe_play(found: Synthesis) -> list[str]:
+def describe_play(synthesis: Synthesis) -> list[str]:
     """A play that the environment wins, as lines of a table."""
-    play, world = found.play, found.world
+    play, world = synthesis.play, synthesis.world
     if play is None:
         return []
     rows = [["step", "mover", "move", *(world.where(0))]]
     for i, step in enumerate(play.steps):
-        where = world.where(int(found.nodes.world_state[step.node])).values()
+        where = world.where(int(synthesis.nodes.world_state[step.node])).values()
         cells = (f"{x['row']}, {x['column']}" if isinstance(x, dict) else str(x) for x in where)
         rows.append([str(i), step.mover, step.action, *cells])
-    return [f"  {line}" for line in (*aligned(rows), _ending(play, found))]
+    return [f"  {line}" for line in (*aligned(rows), _ending(play, synthesis))]
 
 
-def _ending(play: Play, found: Synthesis) -> str:
+def _ending(play: Play, synthesis: Synthesis) -> str:
     last = len(play.steps) - 1
     if play.failed:
         chance = ", after random moves against the system" if play.by_chance else ""
@@ -151,13 +156,13 @@ def _ending(play: Play, found: Synthesis) -> str:
     round_ = f"steps {play.repeats_from} to {last} repeat"
     if play.by_chance:
         return f"{round_} as long as random moves are against the system"
-    return f"{round_} for ever, and {_missed(play, found) or 'violate the objective'}"
+    return f"{round_} for ever, and {_missed(play, synthesis) or 'violate the objective'}"
 
 
-def _missed(play: Play, found: Synthesis) -> str:
+def _missed(play: Play, synthesis: Synthesis) -> str:
     """The guarantees that a repeated part of a play never satisfies."""
-    objective = found.winning.objective
-    guarantees = found.file.task.guarantees or ()
+    objective = synthesis.winning.objective
+    guarantees = synthesis.file.task.guarantees or ()
     if not isinstance(objective, GR1):
         return ""
     loop = [step.node for step in play.steps[play.repeats_from :]]
@@ -169,7 +174,7 @@ def _missed(play: Play, found: Synthesis) -> str:
 # --- files ----------------------------------------------------------------------------------
 
 
-def save(out: Path, found: Synthesis) -> None:
+def save(out: Path, synthesis: Synthesis) -> None:
     """Writes the strategies into a directory, atomically, as policies that `load_policy` reads.
 
     Besides the arrays of a policy of the world they have those of the solved game:
@@ -183,28 +188,28 @@ def save(out: Path, found: Synthesis) -> None:
     GR(1) ``[N, M]`` with ``assumptions [M, N]``, which advance its memory; and its game of N
     nodes, as above.
     """
-    nodes, winning = found.nodes, found.winning
-    if found.strategy is not None and found.restricted is not None:
-        arrays = _arrays(found, found.restricted.model, found.base)
-        arrays["mask"] = found.restricted.model.available
-        arrays["memory"] = found.restricted.memory
-        _write(out / "strategy.npz", "strategy", found, found.strategy, arrays)
-    if found.play is not None:
+    nodes, winning = synthesis.nodes, synthesis.winning
+    if synthesis.strategy is not None and synthesis.restricted is not None:
+        arrays = _arrays(synthesis, synthesis.restricted.model, synthesis.base)
+        arrays["mask"] = synthesis.restricted.model.available
+        arrays["memory"] = synthesis.restricted.memory
+        _write(out / "strategy.npz", "strategy", synthesis, synthesis.strategy, arrays)
+    if synthesis.play is not None:
         game = nodes.game
         lost = jnp.where(winning.region, 0, game.initial)
         game = replace(game, mdp=game.mdp.replace(initial=lost / lost.sum()))
-        arrays = _arrays(found, game, np.arange(game.num_states))
+        arrays = _arrays(synthesis, game, np.arange(game.num_states))
         arrays |= {"counter_action": winning.counter_action, "available": game.available}
         if isinstance(winning.objective, GR1):
             arrays["assumptions"] = winning.objective.assumptions
-        _write(out / "counter_strategy.npz", "counter-strategy", found, winning, arrays)
+        _write(out / "counter_strategy.npz", "counter-strategy", synthesis, winning, arrays)
 
 
 def _write(
-    path: Path, kind: str, found: Synthesis, strategy: Permissive | Winning, arrays: Record
+    path: Path, kind: str, synthesis: Synthesis, strategy: Permissive | Winning, arrays: Record
 ) -> None:
     """Writes a strategy as a finite-memory policy, or as its game alone where it is none."""
-    nodes, world = found.nodes, found.world
+    nodes, world = synthesis.nodes, synthesis.world
     player = "system" if isinstance(strategy, Permissive) else "environment"
     part = explored(strategy, player)
     memory, task = part.memory, None
@@ -223,7 +228,7 @@ def _write(
     save_policy(path, policy, {k: v for k, v in arrays.items() if k != "actions"})
 
 
-def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:
+def _arrays(synthesis: Synthesis, game: Game, node: np.ndarray) -> Record:
     return {
         "successor": game.mdp.successor,
         "probability": game.mdp.probability,
@@ -231,10 +236,10 @@ def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:
         "system": game.system,
         "label": game.label,
         "propositions": np.array(game.propositions, str),
-        "actions": np.array(found.world.actions),
-        "world_state": found.nodes.world_state[node],
-        "automaton_state": found.nodes.automaton_state[node],
-        "region": found.wins,
+        "actions": np.array(synthesis.world.actions),
+        "world_state": synthesis.nodes.world_state[node],
+        "automaton_state": synthesis.nodes.automaton_state[node],
+        "region": synthesis.wins,
     }
 
 
@@ -250,41 +255,41 @@ MOST_MAPS = 36  # of the environment's places
 MOST_PANELS = 6  # of a strategy's memory
 
 
-def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[Picture, bytes]]:
+def pictures(synthesis: Synthesis, environment: int | None = None) -> list[tuple[Picture, bytes]]:
     """Pictures: the automaton, and maps if the game has one."""
     # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
 
-    made = []
-    if found.nodes.automaton is not None and len(found.nodes.automaton.delta) <= 40:
+    figures = []
+    if synthesis.nodes.automaton is not None and len(synthesis.nodes.automaton.delta) <= 40:
         caption = "States are named by the remaining formula."
         picture = Picture("automaton.svg", "Automaton of the formula", None, caption, "play")
-        made.append((picture, plot.automaton(found.nodes.automaton)))
-    world = found.world
+        figures.append((picture, plot.automaton(synthesis.nodes.automaton)))
+    world = synthesis.world
     if world.text is not None and world.places is not None:
         count = len(world.places)
         few = None
         if count > MOST_MAPS:  # those with the most losing cells, in order
-            lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
+            lost = ~synthesis.wins.reshape(count, count, 2)[:, :, 1]
             few = sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
         caption = "A map for each place of the environment's robot."
-        region = plot.game_region(found.wins, world.text, environment=few, wall=world.wall)
-        made.append((Picture("region.svg", "Winning region", None, caption), region))
-        if found.strategy is not None:
+        region = plot.game_region(synthesis.wins, world.text, environment=few, wall=world.wall)
+        figures.append((Picture("region.svg", "Winning region", None, caption), region))
+        if synthesis.strategy is not None:
             caption = (
                 "The allowed moves, for one place of the environment's robot; the system wins with "
                 "any choice among them."
             )
             picture = Picture("moves.svg", "Permissive strategy", None, caption)
-            made.append((picture, _moves_picture(found, environment)))
-    return [(picture, plot.to_bytes(figure)) for picture, figure in made]
+            figures.append((picture, _moves_picture(synthesis, environment)))
+    return [(picture, plot.to_bytes(figure)) for picture, figure in figures]
 
 
-def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
+def place_of(synthesis: Synthesis, cell: tuple[int, int] | None) -> int | None:
     """The index of the place in a cell, which has row and column from 1."""
     if cell is None:
         return None
-    places = found.world.places
+    places = synthesis.world.places
     if places is None:
         raise ValueError(f"--environment {cell[0]} {cell[1]}: the game has no map.")
     here = np.flatnonzero((places == np.array(cell) - 1).all(axis=1))
@@ -297,14 +302,14 @@ def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
     return int(here[0])
 
 
-def _moves_picture(found: Synthesis, environment: int | None) -> Any:
+def _moves_picture(synthesis: Synthesis, environment: int | None) -> Any:
     from jaxltl import plot
 
-    world, nodes = found.world, found.nodes
-    strategy, restricted = found.strategy, found.restricted
+    world, nodes = synthesis.world, synthesis.nodes
+    strategy, restricted = synthesis.strategy, synthesis.restricted
     assert strategy is not None and restricted is not None and world.places is not None
     count, memory = len(world.places), np.asarray(restricted.memory)
-    state, automaton = nodes.world_state[found.base], nodes.automaton_state[found.base]
+    state, automaton = nodes.world_state[synthesis.base], nodes.automaton_state[synthesis.base]
     mine = np.asarray(restricted.model.system)
     can = np.asarray(world.game.available)
     place = state // (2 * count)
@@ -315,15 +320,15 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     pairs, size = np.unique(
         np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True
     )
-    shown = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
+    panels = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
     size_a = world.game.num_actions
     mask = np.asarray(strategy.allowed).reshape(
         nodes.game.num_states, -1, strategy.allowed.shape[-1]
     )
     region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
-    allowed = np.zeros((len(shown), world.game.num_states, size_a), bool)
-    wins = np.zeros((len(shown), world.game.num_states), bool)
-    for panel, (q, m) in enumerate(pairs[shown]):
+    allowed = np.zeros((len(panels), world.game.num_states, size_a), bool)
+    wins = np.zeros((len(panels), world.game.num_states), bool)
+    for panel, (q, m) in enumerate(pairs[panels]):
         node = np.flatnonzero((nodes.automaton_state == q) & np.asarray(nodes.game.system))
         allowed[panel, nodes.world_state[node]] = mask[node, m, :size_a]
         wins[panel, nodes.world_state[node]] = region[node, m]
@@ -334,18 +339,18 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
         region=wins,
         available=can,
         actions=world.actions,
-        titles=[_title(found, int(q), int(m), pairs) for q, m in pairs[shown]],
+        titles=[_title(synthesis, int(q), int(m), pairs) for q, m in pairs[panels]],
         wall=world.wall,
     )
 
 
-def _title(found: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
+def _title(synthesis: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
     """Title of a panel: its automaton state and memory state."""
     parts = []
     if len(set(pairs[:, 0])) > 1:
         parts.append(f"automaton in {q}")
     if len(set(pairs[:, 1])) > 1:
-        goals = found.file.task.guarantees or ()
+        goals = synthesis.file.task.guarantees or ()
         parts.append(f"towards {goals[m]}" if m < len(goals) else f"memory {m}")
     return ", ".join(parts)
 
@@ -357,27 +362,27 @@ _PLAY_STEPS = 40  # of a play of the strategy
 _PLAYERS = ("system", "environment")
 
 
-def write(found: Synthesis, out: Path, place: int | None, seconds: float) -> Result:
+def write(synthesis: Synthesis, out: Path, place: int | None, seconds: float) -> Result:
     """Writes the strategies, pictures, report and result of a synthesis to a directory."""
     for stale in ("result.json", *FILES):
         (out / stale).unlink(missing_ok=True)
-    save(out, found)
-    shown = pictures(found, place)
-    part = play_explorer(found)
+    save(out, synthesis)
+    drawings = pictures(synthesis, place)
+    part = play_explorer(synthesis)
     parts = [(part, {key: draw(each).decode() for key, each in part.drawings.items()})]
-    result = summary(found, seconds)
-    write_results(out / "game.toml", report_of(found), result, parts, shown)
+    result = summary(synthesis, seconds)
+    write_results(out / "game.toml", report_of(synthesis), result, parts, drawings)
     return result
 
 
-def play_explorer(found: Synthesis) -> Explorer:
+def play_explorer(synthesis: Synthesis) -> Explorer:
     """Plays on the map: one of the strategy, and one that the environment wins."""
-    world, nodes = found.world, found.nodes
+    world, nodes = synthesis.world, synthesis.nodes
     runs = []
-    if found.strategy is not None and found.restricted is not None:
-        runs.append(Run("the system follows its strategy", _strategy_play(found)))
-    if found.play is not None:
-        runs.append(Run("the environment wins", _counter_play(found, found.play)))
+    if synthesis.strategy is not None and synthesis.restricted is not None:
+        runs.append(Run("the system follows its strategy", _strategy_play(synthesis)))
+    if synthesis.play is not None:
+        runs.append(Run("the environment wins", _counter_play(synthesis, synthesis.play)))
     visited = {state for run in runs for state, _, _ in run.steps}
     place, cells, caption = None, {}, "Step by step."
     if world.text is not None and world.places is not None:
@@ -404,9 +409,9 @@ def play_explorer(found: Synthesis) -> Explorer:
     )
 
 
-def _counter_play(found: Synthesis, play: Play) -> list[tuple[int, int, int | None]]:
+def _counter_play(synthesis: Synthesis, play: Play) -> list[tuple[int, int, int | None]]:
     """The play that the environment wins; chance has no action."""
-    nodes, actions = found.nodes, found.world.actions
+    nodes, actions = synthesis.nodes, synthesis.world.actions
     moves: list[int | None] = [
         None
         if step.mover == "chance"
@@ -419,11 +424,11 @@ def _counter_play(found: Synthesis, play: Play) -> list[tuple[int, int, int | No
     ]
 
 
-def _strategy_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
+def _strategy_play(synthesis: Synthesis) -> list[tuple[int, int, int | None]]:
     """A play with random moves among those that the strategy allows."""
-    assert found.restricted is not None
-    game, nodes, rng = found.restricted.model, found.nodes, np.random.default_rng(0)
-    base, count = found.base, len(found.world.actions)
+    assert synthesis.restricted is not None
+    game, nodes, rng = synthesis.restricted.model, synthesis.nodes, np.random.default_rng(0)
+    base, count = synthesis.base, len(synthesis.world.actions)
     successor, chance = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability, float)
     allowed, system = np.asarray(game.available), np.asarray(game.system)
     initial = np.asarray(game.initial, float)
@@ -431,9 +436,9 @@ def _strategy_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
     steps: list[tuple[int, int, int | None]] = []
     for _ in range(_PLAY_STEPS):
         action = int(rng.choice(np.flatnonzero(allowed[here])))
-        shown = None if action >= count else action + count * (not system[here])
+        move = None if action >= count else action + count * (not system[here])
         node = base[here]
-        steps.append((int(nodes.world_state[node]), int(nodes.automaton_state[node]), shown))
+        steps.append((int(nodes.world_state[node]), int(nodes.automaton_state[node]), move))
         likely = chance[here, action]
         here = int(rng.choice(successor[here, action], p=likely / likely.sum()))
     return steps

@@ -67,7 +67,7 @@ def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
 
 def step_bounds(setup: Setup) -> list[StepBound] | None:
     """The bounds on the expected steps in all worlds; None for safety formulas."""
-    task, found = setup.task, []
+    task, bounds = setup.task, []
     for w, (scene, sure) in enumerate(zip(setup.worlds.scenes, setup.sure or (), strict=True)):
         with errors_in(f"{task.path}: [task] in the world {scene.name}: "):
             model = part_of(setup.worlds.model, w)
@@ -76,18 +76,20 @@ def step_bounds(setup: Setup) -> list[StepBound] | None:
             )
         if bound is None:
             return None
-        found.append(bound)
-    return found
+        bounds.append(bound)
+    return bounds
 
 
 def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> list[Mixture]:
     """The policies ``[W, S, Q, A]`` of all worlds with their expected steps within the bounds."""
-    found = []
+    mixtures = []
     for w, bound in enumerate(bounds):
         model = part_of(setup.worlds.model, w)
-        kept = bound.keep(model, policy[w])
-        found.append(kept._replace(steps=kept.steps or StepAnalysis(model).steps(kept.policy)))
-    return found
+        mixture = bound.keep(model, policy[w])
+        mixtures.append(
+            mixture._replace(steps=mixture.steps or StepAnalysis(model).steps(mixture.policy))
+        )
+    return mixtures
 
 
 def likeliest(
@@ -108,10 +110,10 @@ def likeliest(
         # The least certified probability over the training worlds, before mixing.
         return Attempt(held, loss, min(each), weight, 0.0, learned)
 
-    found = [judged(free, 0.0)]
-    if found[0].attained < float(setup.requested) and train is not None:
-        found += _bracket(lambda mu: judged(train(mu), mu), float(setup.requested))
-    return min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
+    attempts = [judged(free, 0.0)]
+    if attempts[0].attained < float(setup.requested) and train is not None:
+        attempts += _bracket(lambda mu: judged(train(mu), mu), float(setup.requested))
+    return min(attempts, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
 
 
 def _bracket(tried: Callable[[float], Attempt], requested: float) -> Iterator[Attempt]:

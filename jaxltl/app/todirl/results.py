@@ -143,7 +143,7 @@ def counted_worlds(setup: Setup) -> np.ndarray:
 def summary(outcome: Outcome) -> Record:
     """The result as a JSON object."""
     setup, task = outcome.setup, outcome.setup.task
-    pairs = [int(np.sum(shown.length)) for shown in setup.demonstrations]
+    pairs = [int(np.sum(trajectories.length)) for trajectories in setup.demonstrations]
     result = {
         **about(task),
         "memory": task.memory,
@@ -163,7 +163,7 @@ def summary(outcome: Outcome) -> Record:
         "expert": "soft" if setup.soft else "quickest",
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
-            "number": [len(shown.length) for shown in setup.demonstrations],
+            "number": [len(trajectories.length) for trajectories in setup.demonstrations],
             "pairs": pairs,
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
@@ -222,24 +222,24 @@ def _about_worlds(outcome: Outcome, part: slice) -> Record:
     models = part_of(setup.worlds.judged, part)
     infeasible = [int(infeasible_starts(part_of(models, w)).sum()) for w in range(len(names))]
     leave_out = setup.task.left_out if part.start else ()
-    found: Record = {"num_worlds": len(scenes)}
+    record: Record = {"num_worlds": len(scenes)}
     for who, performance in judged.performance.items():
         mean = summarize(models, part_of(performance, part), names=names, leave_out=leave_out)
-        found[who] = {
+        record[who] = {
             "mean": enclosure(mean.mean, mean.lower, mean.upper),
             "std": mean.std,
             "worst_world": {"name": mean.worst_world, "value": mean.worst},
             "worst_start": mean.worst_start,
             "uncertain": list(mean.uncertain),
         }
-        found["infeasible"], found["left_out"] = list(mean.infeasible), list(mean.left_out)
-        found["num_counted"] = mean.num_worlds
+        record["infeasible"], record["left_out"] = list(mean.infeasible), list(mean.left_out)
+        record["num_counted"] = mean.num_worlds
     if judged.steps is not None and judged.quick_share is not None:
         bounds, steps = (setup.bounds or [])[part], judged.steps[part]
         least = np.array([b.quickest.steps.upper for b in bounds])
         possible = np.isfinite(least) & (least > 0)
         w = int(np.argmax(np.where(possible, steps[:, 2], 0) / np.where(possible, least, 1)))
-        found["expected_steps"] = {
+        record["expected_steps"] = {
             "factor": bounds[w].factor,
             "mixed": int((judged.quick_share[part] > 0).sum()),
             "worst_world": names[w],
@@ -252,18 +252,18 @@ def _about_worlds(outcome: Outcome, part: slice) -> Record:
                 for name, each, bound in zip(names, steps, bounds, strict=True)
             ],
         }
-    found["solver"] = Status(int(judged.status[part].max())).name
+    record["solver"] = Status(int(judged.status[part].max())).name
     first = part.start or 0
-    found["worlds"] = [
+    record["worlds"] = [
         {**_about_world(scene, judged, first + w), "infeasible_starts": infeasible[w]}
         for w, scene in enumerate(scenes)
     ]
-    return found
+    return record
 
 
 def _about_world(scene: Scene, judged: Judged, w: int) -> Record:
     one = part_of(judged.performance["learned"], w)
-    found = {
+    record = {
         "name": scene.name,
         "mean": enclosure(one.mean, one.lower, one.upper),
         "minimum": {
@@ -276,5 +276,5 @@ def _about_world(scene: Scene, judged: Judged, w: int) -> Record:
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
     }
     if judged.share is not None and judged.attained is not None:
-        found |= {"share": judged.share[w], "attained": judged.attained[w]}
-    return found
+        record |= {"share": judged.share[w], "attained": judged.attained[w]}
+    return record

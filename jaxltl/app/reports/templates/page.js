@@ -89,8 +89,8 @@
 
     // Screen readers do not read a playing trajectory; its steps are in the table.
     function quiet(on) {
-      for (const told of [readout, one(".memory")]) {
-        told.setAttribute("aria-live", on ? "off" : "polite");
+      for (const region of [readout, one(".memory")]) {
+        region.setAttribute("aria-live", on ? "off" : "polite");
       }
     }
 
