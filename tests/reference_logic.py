@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import chain, combinations, product
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.table import Table, quotient
+from jaxltl.core.automata.table import ParityTable, quotient
 from jaxltl.core.logic.ltl import Formula
 
 Word = Sequence[frozenset[str]]
@@ -99,7 +99,7 @@ def residual_count(formula: Formula, letters: Word, stem: int, tail: int, cycle:
 
 def minimize(automaton: Automaton) -> Automaton:
     """The minimal automaton with the same priorities along every run."""
-    table = Table(automaton.delta, automaton.priority, int(automaton.initial))
+    table = ParityTable(automaton.delta, automaton.priority, int(automaton.initial))
     small, base = quotient(table)
     names = automaton.state_names
     return replace(

@@ -19,7 +19,7 @@ from jaxltl.app.files import (
     task_mlirl,
     task_todirl,
 )
-from jaxltl.app.files.schema import Count, Table, table
+from jaxltl.app.files.schema import Count, TomlTable, table
 from jaxltl.core.environments.task_environment import TaskOptions
 from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.robots import grid_game, places
@@ -99,7 +99,7 @@ def test_every_example_is_valid(kind):
         tries = [
             converted(kind, [key.name, *names.split()]) for names in COMPLETIONS.get(kind, ("",))
         ]
-        valid = [x for x in tries if isinstance(x, Table)]
+        valid = [x for x in tries if isinstance(x, TomlTable)]
         assert valid, (key.name, tries)
         assert valid[0].specified()[key.name] is not None
 
@@ -156,7 +156,7 @@ def test_pages_have_every_key_and_an_example_file():
 @pytest.mark.parametrize("text", ["Number of steps.", "", "Number of steps; default "])
 def test_a_key_without_a_stated_default_is_an_error(text):
     @table
-    class Training(Table):
+    class Training(TomlTable):
         steps: Key[Count | None, text] = None
 
     (key,) = site_files.keys_of(Training)
@@ -166,7 +166,7 @@ def test_a_key_without_a_stated_default_is_an_error(text):
 
 def test_the_example_of_a_type():
     @table
-    class Training(Table):
+    class Training(TomlTable):
         rate: Key[schema.Confidence, "Rate."]
         own: Key[Count, "Own.", "7"] = 3
         nothing: Key[str | None, "Nothing."] = None

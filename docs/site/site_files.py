@@ -8,7 +8,7 @@ import attrs
 
 from jaxltl.algos import cce, mlirl, ppo, todirl, trust_region
 from jaxltl.app.files import game, schema, task_environment, task_grounding, task_mlirl, task_todirl
-from jaxltl.app.files.schema import File, Table
+from jaxltl.app.files.schema import File, TomlTable
 
 
 class FilePage(NamedTuple):
@@ -61,7 +61,7 @@ PAGES = {
     ),
 }
 # Learners whose defaults hold for keys that a file leaves out.
-HPARAMS: dict[type[Table], Any] = {
+HPARAMS: dict[type[TomlTable], Any] = {
     task_mlirl.LearnerTable: mlirl.Hparams,
     task_todirl.LearnerTable: todirl.Hparams,
     task_environment.PpoTable: ppo.Hparams,
@@ -90,7 +90,7 @@ class KeyHelp(NamedTuple):
     example: str
 
 
-def keys_of(kind: type[Table]) -> list[KeyHelp]:
+def keys_of(kind: type[TomlTable]) -> list[KeyHelp]:
     """The keys of a table in the order of the schema; a required key has the default ``...``."""
     entries = []
     for field in schema._fields(kind):
@@ -121,7 +121,7 @@ def _example(kind: object, default: object) -> str:
     return ""
 
 
-def tables(file: type[File]) -> dict[str, tuple[type[Table], bool]]:
+def tables(file: type[File]) -> dict[str, tuple[type[TomlTable], bool]]:
     """Tables of a file by name, and whether each is required."""
     found = {}
     for field in schema._fields(file):
@@ -135,7 +135,7 @@ def file_keys(file: type[File]) -> list[KeyHelp]:
     return [key for key in keys_of(file) if key.name not in tables(file)]
 
 
-def table_keys(table: type[Table]) -> list[KeyHelp]:
+def table_keys(table: type[TomlTable]) -> list[KeyHelp]:
     """Keys of a table that a file may have."""
     keys = keys_of(table)
     return [key for key in keys if not key.requirement.startswith("left out")]
@@ -156,7 +156,7 @@ def toml(value: Any) -> str:
     return str(value)
 
 
-def entry(table: type[Table], key: KeyHelp) -> Entry:
+def entry(table: type[TomlTable], key: KeyHelp) -> Entry:
     """The row of a key; ValueError if its help states no default."""
     about, _, default = key.help.rstrip(".").partition("; default ")
     learner = HPARAMS.get(table)
@@ -209,7 +209,7 @@ def _marked(text: str) -> str:
     return re.sub(value, r"``\g<0>``", text)
 
 
-def _rows(table: type[Table], keys: list[KeyHelp]) -> list[str]:
+def _rows(table: type[TomlTable], keys: list[KeyHelp]) -> list[str]:
     lines = [".. list-table::", "   :header-rows: 1", "   :widths: 14 26 22 18 20", ""]
     rows = [("Key", "Meaning", "Value", "Default", "Example")]
     for key in keys:

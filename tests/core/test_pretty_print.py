@@ -177,7 +177,7 @@ def made():
             "keyless",
         ),
         jl.values.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4), "given"),
-        jl.environments.Table(
+        jl.environments.TabulatedEnvironment(
             coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9
         ),
         jl.ParametricMDP(coin, None, np.zeros(2), np.ones(2), np.ones(2) / 2, ("p", "q")),
@@ -242,7 +242,7 @@ FACTS = {
     "OptimalActions": "CONVERGED, with 240 of 240 true, loses at most 1e-07",
     "OptimalityGap": "2 beginnings, mean gap in [0, 0.05], gap at most 0.1, evidence 'keyless'",
     "DataGuarantee": "at least 0.9, no policy beyond 0.99, confidence 0.95, 15 samples, Interval",
-    "Table": "SparseMDP(3 states, 1 beginning, truncated [True, True, True], at most 9 steps",
+    "TabulatedEnvironment": "SparseMDP(3 states, 1 beginning, truncated [True, True, True], at most 9 steps",
     "Objective": "Objective(formula='F a', threshold=0.5, direction='max')",
     "Property": 'Property(P>=0.5 [ F "a" ])',
     "ModelPart": "2 states, 2 choices, 2 transitions, rewards cost",

@@ -20,7 +20,7 @@ from jaxltl.app.files.schema import (
     File,
     Legend,
     Map,
-    Table,
+    TomlTable,
     Text,
     Unit,
     off_map,
@@ -45,7 +45,7 @@ Formulas = Annotated[list[str], Meta('a list of Boolean formulas, such as ["a", 
 
 
 @table
-class GameTable(Table):
+class GameTable(TomlTable):
     """``[game]``: two robots on a map, or a model file."""
 
     map: TomlKey[Map | None, "Rows of a text map, or the file that has them; default none."] = None
@@ -83,7 +83,7 @@ class GameTable(Table):
 
 
 @table
-class TaskTable(Table):
+class TaskTable(TomlTable):
     """``[task]``: the objective of the system."""
 
     formula: TomlKey[Text | None, "Temporal-logic formula; default none.", '"G !collision"'] = None
@@ -125,7 +125,7 @@ class TaskTable(Table):
 
 
 @table
-class StrategyTable(Table):
+class StrategyTable(TomlTable):
     """``[strategy]``: how a permissive strategy is computed."""
 
     method: TomlKey[

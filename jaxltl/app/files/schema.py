@@ -1,6 +1,6 @@
 """Schemas of TOML files, and errors that name the file, table, key, value and fix.
 
-A table is a :class:`Table`: each key has a type with a title that states the requirement on
+A table is a :class:`TomlTable`: each key has a type with a title that states the requirement on
 values, one line of help and a default. ``None`` stands for a key that a file leaves out; then the
 help ends in "; default" and what holds without the key. A second text is an example, in TOML.
 """
@@ -37,7 +37,7 @@ import attrs
 
 from jaxltl.core.validation import errors_in
 
-_Table = TypeVar("_Table", bound="Table")
+_Table = TypeVar("_Table", bound="TomlTable")
 LARGEST_INT = 2**31 - 1  # int32 of compiled loops
 
 
@@ -107,12 +107,12 @@ def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attri
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(attrs.field,))
 def table(kind: type[Any]) -> Any:
-    """Class decorator of a :class:`Table`: a frozen attrs class with keyword arguments."""
+    """Class decorator of a :class:`TomlTable`: a frozen attrs class with keyword arguments."""
     return attrs.frozen(kw_only=True, slots=False, field_transformer=_resolve)(kind)
 
 
 @table
-class Table:
+class TomlTable:
     """A table of a file; ``__attrs_post_init__`` checks what concerns several of its keys."""
 
     def specified(self) -> dict[str, Any]:
@@ -133,8 +133,8 @@ class Table:
 
 
 @table
-class File(Table):
-    """A checked file; a field that is a :class:`Table` is a table, others are keys."""
+class File(TomlTable):
+    """A checked file; a field that is a :class:`TomlTable` is a table, others are keys."""
 
     KIND: ClassVar[str] = "the task file"  # begins the error if it cannot be read
     path: Path = Path()
@@ -271,8 +271,8 @@ def _parts(kind: object) -> Iterator[Any]:
         yield from _parts(part)
 
 
-def _table_of(kind: object) -> type[Table] | None:
-    tables = (x for x in _parts(kind) if isinstance(x, type) and issubclass(x, Table))
+def _table_of(kind: object) -> type[TomlTable] | None:
+    tables = (x for x in _parts(kind) if isinstance(x, type) and issubclass(x, TomlTable))
     return next(tables, None)
 
 

@@ -13,7 +13,7 @@ from jaxltl.app.files.schema import (
     Legend,
     NonNegative,
     Propositions,
-    Table,
+    TomlTable,
     Text,
     Meta,
     Unit,
@@ -70,7 +70,7 @@ Optimizer = Annotated[
 
 
 @table
-class GridTable(Table):
+class GridTable(TomlTable):
     """Keys of ``[world]`` about text maps."""
 
     legend: TomlKey[
@@ -82,7 +82,7 @@ class GridTable(Table):
 
 
 @table
-class FormulaTable(Table):
+class FormulaTable(TomlTable):
     """``[task]``: the formula."""
 
     formula: TomlKey[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
@@ -116,7 +116,7 @@ class TaskTable(FormulaTable):
 
 
 @table
-class SyntheticTable(Table):
+class SyntheticTable(TomlTable):
     """Keys of ``[demonstrations]`` about simulated demonstrations."""
 
     synthetic: TomlKey[Count | None, "Number of simulated demonstrations; default none."] = None
@@ -128,7 +128,7 @@ class SyntheticTable(Table):
 
 
 @table
-class LearnerTable(Table):
+class LearnerTable(TomlTable):
     """``[learner]`` of any method."""
 
     method: TomlKey[str, "Learning algorithm."]

@@ -20,7 +20,7 @@ from jaxltl.app.files.schema import (
     Count,
     NonNegative,
     Number,
-    Table,
+    TomlTable,
     Text,
     Unit,
     Widths,
@@ -51,7 +51,7 @@ Score = Literal[
 
 
 @table
-class WorldTable(Table):
+class WorldTable(TomlTable):
     """``[world]``: the environment."""
 
     environment: TomlKey[
@@ -140,7 +140,7 @@ def hparams_table(hparams: type[Any], *omit: str) -> Any:
             kind: Any = TomlKey[_type_of(field) | None, ""]
             fields[field.name] = attrs.field(default=None, type=kind)
     return attrs.make_class(
-        "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
+        "HparamsTable", fields, bases=(TomlTable,), frozen=True, kw_only=True, slots=False
     )
 
 
@@ -224,7 +224,7 @@ _TABLES = {"ppo": PpoTable, "cce": CceTable, "cpo": CpoTable}
 
 
 @table
-class EvaluationTable(Table):
+class EvaluationTable(TomlTable):
     """``[evaluation]``: fresh episodes."""
 
     episodes: TomlKey[Count, "Number of episodes."] = 1000
@@ -242,7 +242,7 @@ class EvaluationTable(Table):
 
 
 @table
-class ProofTable(Table):
+class ProofTable(TomlTable):
     """``[proof]``: bounds of the learned policy's satisfaction probability, in worlds of dynamics."""
 
     cells: TomlKey[

@@ -12,7 +12,7 @@ from jaxltl.app.files.schema import (
     Discount,
     Meta,
     NonNegative,
-    Table,
+    TomlTable,
     Text,
     table,
 )
@@ -43,7 +43,7 @@ class WorldTable(GridTable):
 
 
 @table
-class GroundingTable(Table):
+class GroundingTable(TomlTable):
     """``[grounding]``: observations, and how their meaning is learned."""
 
     observations: TomlKey[
@@ -72,7 +72,7 @@ class DemonstrationsTable(SyntheticTable):
 
 
 @table
-class TestTable(Table):
+class TestTable(TomlTable):
     """``[test]``: further maps in which policies are certified."""
 
     maps: TomlKey[Maps, "Maps without demonstrations."]

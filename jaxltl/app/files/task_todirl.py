@@ -18,7 +18,7 @@ from jaxltl.app.files.schema import (
     Discount,
     Map,
     Number,
-    Table,
+    TomlTable,
     Text,
     Unit,
     WholeNumber,
@@ -150,7 +150,7 @@ class LearnerTable(OptimizerTable):
 
 
 @table
-class TestTable(Table):
+class TestTable(TomlTable):
     """``[test]``: worlds for the evaluation, which have no part in learning."""
 
     maps: TomlKey[Maps | None, "Test worlds; default none."] = None

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.table import (
-    Table,
+    ParityTable,
     components,
     distinct_columns,
     explore,
@@ -225,7 +225,7 @@ def to_parity(
         )
     columns, place = distinct_columns(delta, colors)
     delta, colors = delta[:, columns], colors[:, columns]
-    component = components(Table(delta, colors, initial))
+    component = components(ParityTable(delta, colors, initial))
     # Transitions with the same ends and colors are one to the trees.
     _, color = np.unique(colors, return_inverse=True)
     ends = np.arange(len(delta))[:, None] * len(delta) + delta

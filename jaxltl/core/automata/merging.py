@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.automata.products import EVEN, ODD, Word, loops, may, product, word_through
-from jaxltl.core.automata.table import Table, distinct_columns
+from jaxltl.core.automata.table import ParityTable, distinct_columns
 
 MAX_PAIRS = 3_000_000  # pair transitions up to which languages of states are compared
 FEW_PAIRS = 400_000  # up to which all pairs are compared at once
@@ -19,10 +19,10 @@ TURNS = 4  # of a cycle before its priorities are read, and while they are
 DIFFERENT = ((EVEN, ODD), (ODD, EVEN))
 
 
-def language_classes(table: Table) -> Integers | None:
+def language_classes(table: ParityTable) -> Integers | None:
     """The states grouped by language, int `[Q]`; None where that is too much work."""
     columns, _ = distinct_columns(*table[:2])
-    few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
+    few = ParityTable(table.delta[:, columns], table.priority[:, columns], table.initial)
     count, width = few.delta.shape
     classes = np.zeros(count, np.int64)
     for _ in range(MAX_ROUNDS):
@@ -38,7 +38,7 @@ def language_classes(table: Table) -> Integers | None:
     return None
 
 
-def _differing(table: Table, pairs: Integers) -> Booleans | None:
+def _differing(table: ParityTable, pairs: Integers) -> Booleans | None:
     """The pairs of states with different languages; None where that is too much work."""
     both = product([table, table], np.unique(pairs), MAX_PAIRS)
     if both is None:
@@ -46,7 +46,7 @@ def _differing(table: Table, pairs: Integers) -> Booleans | None:
     return may(both.edges, len(both.states), DIFFERENT)[both.number[pairs]]
 
 
-def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
+def merged(table: ParityTable, order: int, work: int) -> tuple[ParityTable, int]:
     """The table with states of one language merged, one after another, where the whole allows it.
 
     `work` limits the pair transitions of the products that decide; what is left is returned.
@@ -55,12 +55,12 @@ def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
     if same is None or (np.bincount(same) ** 2).sum() > MAX_CANDIDATES:
         return table, work
     columns, _ = distinct_columns(*table[:2])
-    few = Table(table.delta[:, columns], table.priority[:, columns], int(table.initial))
+    few = ParityTable(table.delta[:, columns], table.priority[:, columns], int(table.initial))
     target = np.arange(len(same))
     survivor, gone = _candidates(few, same, order)
     while len(survivor) and work > 0:
         trial = np.where(target == gone[0], survivor[0], target)
-        small = Table(trial[few.delta], few.priority, int(trial[few.initial]))
+        small = ParityTable(trial[few.delta], few.priority, int(trial[few.initial]))
         both = product([few, small], max_size=MAX_PAIRS)
         if both is None:
             break
@@ -76,10 +76,10 @@ def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
             fine[:WINDOW] = _agreeing(few, survivor[:WINDOW], gone[:WINDOW], word)
             fine[0] = False
         survivor, gone = survivor[fine], gone[fine]
-    return Table(target[table.delta], table.priority, int(target[table.initial])), work
+    return ParityTable(target[table.delta], table.priority, int(target[table.initial])), work
 
 
-def _candidates(table: Table, same: Integers, order: int) -> tuple[Integers, Integers]:
+def _candidates(table: ParityTable, same: Integers, order: int) -> tuple[Integers, Integers]:
     """The pairs of states of one language, those with similar transitions first if order is 1."""
     survivor, gone = np.nonzero((same[:, None] == same[None]) & ~np.eye(len(same), dtype=bool))
     alike = np.zeros(len(survivor), int)
@@ -89,7 +89,7 @@ def _candidates(table: Table, same: Integers, order: int) -> tuple[Integers, Int
     return survivor[ranks], gone[ranks]
 
 
-def _agreeing(table: Table, survivor: Integers, gone: Integers, word: Word) -> Booleans:
+def _agreeing(table: ParityTable, survivor: Integers, gone: Integers, word: Word) -> Booleans:
     """The merges, each alone, with which a word seems to have the verdict that it has without."""
     prefix, cycle = word
     letters = np.concatenate([prefix, np.tile(cycle, 2 * TURNS)])

@@ -17,7 +17,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
 from jaxltl.core.automata.merging import MERGE_WORK, language_classes, merged
 from jaxltl.core.automata.products import EVEN, ODD, states_that_may
-from jaxltl.core.automata.table import Table, components, distinct_columns, quotient
+from jaxltl.core.automata.table import ParityTable, components, distinct_columns, quotient
 
 ORDERS = (1, -1)  # similar states first, different ones first
 
@@ -28,7 +28,7 @@ def simplify(automaton: Automaton) -> Automaton:
     Co-safe or safety (then minimal), else Buchi where the language has a deterministic Buchi
     automaton, else parity. If every cycle's verdict is that of its component, it is minimal too.
     """
-    table = Table(automaton.delta, automaton.priority, int(automaton.initial))
+    table = ParityTable(automaton.delta, automaton.priority, int(automaton.initial))
     small, kind, base = reduce_table(table)
     names = automaton.state_names
     return replace(
@@ -41,12 +41,12 @@ def simplify(automaton: Automaton) -> Automaton:
     )
 
 
-def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integers]:
+def reduce_table(table: ParityTable, thorough: bool = True) -> tuple[ParityTable, str, Integers]:
     """The small table, its acceptance, and an old state of each new one; `thorough` is slow."""
     columns, inverse = distinct_columns(*table[:2])
-    few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
+    few = ParityTable(table.delta[:, columns], table.priority[:, columns], table.initial)
     every, work = np.arange(len(table.delta)), MERGE_WORK
-    best: tuple[Table, Integers] | None = None
+    best: tuple[ParityTable, Integers] | None = None
     for order in ORDERS if thorough else (None,):  # another order may merge more, if one merges any
         small, base, work = _reduced(few, every, order, work)
         if best is None or len(small.delta) < len(best[0].delta):
@@ -55,13 +55,13 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
             break
     assert best is not None
     few, base = best
-    wide = Table(few.delta[:, inverse], few.priority[:, inverse], few.initial)
+    wide = ParityTable(few.delta[:, inverse], few.priority[:, inverse], few.initial)
     return wide, _acceptance(few), base
 
 
 def _reduced(
-    few: Table, base: Integers, order: int | None, work: int
-) -> tuple[Table, Integers, int]:
+    few: ParityTable, base: Integers, order: int | None, work: int
+) -> tuple[ParityTable, Integers, int]:
     """The table after the steps that make it smaller, merging states in an order if one is given."""
     while True:
         for step in (quotient, _fewest_priorities, quotient):
@@ -83,7 +83,7 @@ def _reduced(
             return few, base, work
 
 
-def _acceptance(table: Table) -> str:
+def _acceptance(table: ParityTable) -> str:
     """The kind of a reduced table."""
     delta, priority = table.delta, table.priority
     if (priority == priority[:, :1]).all() and priority.max() <= 1:
@@ -98,22 +98,22 @@ def _acceptance(table: Table) -> str:
 # --- Steps that keep the language: the new table, and an old state of each new one -----------
 
 
-def _fewest_priorities(table: Table) -> tuple[Table, Integers]:
+def _fewest_priorities(table: ParityTable) -> tuple[ParityTable, Integers]:
     """The same automaton with the fewest priorities, transient transitions at 1."""
     condition = parity_condition(int(table.priority.max()) + 1)
     marks = np.left_shift(1, table.priority.astype(np.int64))
     delta, priority, initial, base = to_parity(table.delta, marks, table.initial, condition)
-    return Table(delta, priority, initial), base
+    return ParityTable(delta, priority, initial), base
 
 
-def _cycles(table: Table) -> tuple[Integers, Booleans, Integers]:
+def _cycles(table: ParityTable) -> tuple[Integers, Booleans, Integers]:
     """Components, the transitions `[Q, L]` that stay in theirs, and the components of these."""
     component = components(table)
     inside = component[table.delta] == component[:, None]
     return component, inside, component[np.nonzero(inside)[0]]
 
 
-def is_weak(table: Table) -> bool:
+def is_weak(table: ParityTable) -> bool:
     """True if no component has cycles of both verdicts; priorities must be the fewest."""
     component, inside, of = _cycles(table)
     low, high = np.full(len(component), table.priority.max() + 1), np.full(len(component), -1)
@@ -134,12 +134,12 @@ def _reach(delta: Integers) -> Booleans:
         reach = wider
 
 
-def _on_states(table: Table, priority: Integers) -> Table:
+def _on_states(table: ParityTable, priority: Integers) -> ParityTable:
     """The table with a priority for each state."""
     return table._replace(priority=np.repeat(priority[:, None], table.delta.shape[1], axis=1))
 
 
-def _weak_minimal(table: Table) -> tuple[Table, Integers]:
+def _weak_minimal(table: ParityTable) -> tuple[ParityTable, Integers]:
     """The minimal form of a weak automaton, priorities 0 and 1 on states."""
     component, inside, of = _cycles(table)
     level = np.zeros(len(component), int)
@@ -157,7 +157,7 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
         level = higher
 
 
-def _early(table: Table) -> Table:
+def _early(table: ParityTable) -> ParityTable:
     """A weak automaton with the earliest verdicts, if its language is co-safe or safe."""
     _, inside, _ = _cycles(table)
     good, bad = ((inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1))
@@ -168,7 +168,7 @@ def _early(table: Table) -> Table:
     return table
 
 
-def _move_down(table: Table) -> tuple[Table, Integers]:
+def _move_down(table: ParityTable) -> tuple[ParityTable, Integers]:
     """Replaces states by others of their language in the lowest component that has one."""
     same = language_classes(table)
     count = len(table.delta)
@@ -180,4 +180,4 @@ def _move_down(table: Table) -> tuple[Table, Integers]:
         members = np.flatnonzero(same == state)
         lowest = members[rank[members] == rank[members].min()]
         target[np.setdiff1d(members, lowest)] = lowest[0]
-    return quotient(Table(target[table.delta], table.priority, int(target[table.initial])))
+    return quotient(ParityTable(target[table.delta], table.priority, int(target[table.initial])))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.automata.table import Table
+from jaxltl.core.automata.table import ParityTable
 from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
 EVEN, ODD = 0, 1
@@ -43,7 +43,7 @@ class Product(NamedTuple):
 
 
 def product(
-    tables: Sequence[Table], starts: Integers | None = None, max_size: float = math.inf
+    tables: Sequence[ParityTable], starts: Integers | None = None, max_size: float = math.inf
 ) -> Product | None:
     """The product from the initial states, or some tuples; None beyond a number of transitions."""
     sizes = [len(table.delta) for table in tables]
@@ -118,7 +118,7 @@ def may(edges: Edges, num_nodes: int, wanted: Collection[Parities]) -> Booleans:
     return forward_reachable(edges.target, edges.source, sources)
 
 
-def states_that_may(table: Table, parity: int) -> Booleans:
+def states_that_may(table: ParityTable, parity: int) -> Booleans:
     """bool `[Q]`, from where some word has a least recurring priority of the given parity."""
     every = product([table], np.arange(len(table.delta)))
     assert every is not None

@@ -21,7 +21,7 @@ from jaxltl.core.automata.products import (
     states_that_may,
     word_through,
 )
-from jaxltl.core.automata.table import Table
+from jaxltl.core.automata.table import ParityTable
 from jaxltl.core.logic.ltl import Letter
 
 Lasso = tuple[list[frozenset[str]], list[frozenset[str]]]
@@ -116,9 +116,9 @@ def has_lasso(automata: Sequence[Automaton], wanted: Sequence[Parities]) -> bool
     return any(True for _ in loops(runs.edges, len(runs.states), wanted))
 
 
-def _table(automaton: Automaton) -> Table:
+def _table(automaton: Automaton) -> ParityTable:
     delta, priority = np.asarray(automaton.delta), np.asarray(automaton.priority)
-    return Table(delta, priority, int(automaton.initial))
+    return ParityTable(delta, priority, int(automaton.initial))
 
 
 def joint_runs(automata: Sequence[Automaton]) -> Product:

@@ -14,7 +14,7 @@ from jaxltl.core.sparse.graph.components import strong_components
 State = TypeVar("State", bound=Hashable)
 
 
-class Table(NamedTuple):
+class ParityTable(NamedTuple):
     """A parity automaton as bare arrays: `delta [Q, L]`, `priority [Q, L]`, an initial state."""
 
     delta: Integers
@@ -64,16 +64,16 @@ def distinct_columns(*tables: Integers) -> tuple[Integers, Integers]:
     return first, place.ravel()
 
 
-def reachable(table: Table) -> tuple[Table, Integers]:
+def reachable(table: ParityTable) -> tuple[ParityTable, Integers]:
     """The reachable part, renumbered breadth first, and the old numbers."""
     rows = table.delta.tolist()
     order = np.array(explore(table.initial, lambda q: ((end, 0) for end in rows[q]))[0])
     position = np.full(len(table.delta), -1)
     position[order] = np.arange(len(order))
-    return Table(position[table.delta[order]], table.priority[order], 0), order
+    return ParityTable(position[table.delta[order]], table.priority[order], 0), order
 
 
-def quotient(table: Table) -> tuple[Table, Integers]:
+def quotient(table: ParityTable) -> tuple[ParityTable, Integers]:
     """Reachable states, merged where every word reads the same priorities.
 
     The minimal table, numbered breadth first, and a state of each class.
@@ -83,7 +83,7 @@ def quotient(table: Table) -> tuple[Table, Integers]:
     _, output = np.unique(priority, axis=0, return_inverse=True)
     block = coarsest_partition(delta[:, columns], output.ravel())
     _, first = np.unique(block, return_index=True)
-    small, order = reachable(Table(block[delta[first]], priority[first], int(block[0])))
+    small, order = reachable(ParityTable(block[delta[first]], priority[first], int(block[0])))
     return small, old[first[order]]
 
 
@@ -123,7 +123,7 @@ def coarsest_partition(delta: Integers, output: Integers) -> Integers:
     return np.array(block_of)
 
 
-def components(table: Table) -> Integers:
+def components(table: ParityTable) -> Integers:
     """The strongly connected component of each state."""
     count, width = table.delta.shape
     return strong_components(np.repeat(np.arange(count), width), table.delta.ravel(), count)

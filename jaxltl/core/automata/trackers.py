@@ -24,7 +24,7 @@ from jaxltl.core.automata.emerson_lei import (
     to_parity,
     ZielonkaTree,
 )
-from jaxltl.core.automata.table import Table, explore
+from jaxltl.core.automata.table import ParityTable, explore
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.normal_form import Combination, Part, is_pure, limit_parts
@@ -181,7 +181,7 @@ def _condition(parts: Combination, number: dict[_Followed, int]) -> Condition:
     return (operator, *(_condition(part, number) for part in parts[1:]))
 
 
-def track_together(run: Trackers, max_states: int) -> Table:
+def track_together(run: Trackers, max_states: int) -> ParityTable:
     """A parity automaton of all trackers, whose product has an Emerson-Lei condition."""
     decided: dict[Condition, States] = {}
     every = (1 << len(run.start)) - 1
@@ -202,14 +202,14 @@ def track_together(run: Trackers, max_states: int) -> Table:
     delta, priority, initial, _ = to_parity(
         np.stack(rows), np.stack(marks), 0, run.condition, max_states
     )
-    return Table(delta, priority, initial)
+    return ParityTable(delta, priority, initial)
 
 
 # Of the trackers; the condition that remains; the leaf of its Zielonka tree.
 _Node: TypeAlias = tuple[States, Condition, int]
 
 
-def track_on_demand(run: Trackers, max_states: int) -> Table:
+def track_on_demand(run: Trackers, max_states: int) -> ParityTable:
     """A parity automaton of trackers.
 
     Trackers follow a formula only where the Zielonka tree of their condition needs its marks: a
@@ -253,4 +253,4 @@ def track_on_demand(run: Trackers, max_states: int) -> Table:
     delta, priority = (
         np.stack([row[place] for row, place in zip(rows, places, strict=True)]) for rows in tables
     )
-    return Table(delta, priority, 0)
+    return ParityTable(delta, priority, 0)

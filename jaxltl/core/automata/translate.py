@@ -22,7 +22,7 @@ from jaxltl.core.automata.automaton import Automaton, make_alphabet
 from jaxltl.core.automata.parity import is_weak, reduce_table
 from jaxltl.core.automata.products import EVEN, ODD
 from jaxltl.core.automata.runs import find_lasso, live_states, universal_states
-from jaxltl.core.automata.table import Table, explore, quotient, reachable
+from jaxltl.core.automata.table import ParityTable, explore, quotient, reachable
 from jaxltl.core.automata.trackers import Alphabet, Trackers, track_on_demand, track_together
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import (
@@ -127,13 +127,15 @@ def _progression_automaton(
     decided = _forced(delta, np.array(states) == (TRUE if acceptance == "cosafe" else FALSE))
     priority = 1 - (decided if acceptance == "cosafe" else ~decided)
     delta = delta[:, progression.class_of]
-    small, base = quotient(Table(delta, np.repeat(priority[:, None], delta.shape[1], axis=1), 0))
+    small, base = quotient(
+        ParityTable(delta, np.repeat(priority[:, None], delta.shape[1], axis=1), 0)
+    )
     automaton = _automaton(small, alphabet, propositions, acceptance)
     return replace(automaton, state_names=_names(automaton, progression, [states[q] for q in base]))
 
 
 def _automaton(
-    table: Table, alphabet: NDArray[np.bool_], propositions: tuple[str, ...], acceptance: str
+    table: ParityTable, alphabet: NDArray[np.bool_], propositions: tuple[str, ...], acceptance: str
 ) -> Automaton:
     return Automaton(
         delta=table.delta.astype(np.int32),
@@ -176,7 +178,7 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
     plain = simplify(formula)
     table, letter = _smallest(_combinations(plain), (alphabet, formula.propositions), max_states)
     small, kind, _ = reduce_table(table)
-    table, _ = reachable(Table(small.delta[:, letter], small.priority[:, letter], 0))
+    table, _ = reachable(ParityTable(small.delta[:, letter], small.priority[:, letter], 0))
     automaton = _automaton(table, alphabet, formula.propositions, kind)
     return replace(automaton, state_names=_residual_names(plain, automaton))
 
@@ -201,9 +203,9 @@ def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
 
 def _smallest(
     ways: list[tuple[Combination, int]], alphabet: Alphabet, max_states: int
-) -> tuple[Table, Integers]:
+) -> tuple[ParityTable, Integers]:
     """The smallest table of trackers over classes of letters, and the class of each letter."""
-    best: tuple[Table, Integers] | None = None
+    best: tuple[ParityTable, Integers] | None = None
     errors, spent = [], 0
     # The way that tracks least may explode where another does not, so all start with little.
     for work, (parts, cost) in product((MAX_NODES // 30, MAX_NODES // 5, MAX_NODES), ways):
@@ -234,12 +236,12 @@ def _smallest(
     return best
 
 
-def _is_enough(table: Table) -> bool:
+def _is_enough(table: ParityTable) -> bool:
     """True if a table is minimal, as a weak one is, or tiny, or takes too long to do again."""
     return is_weak(table) or _size(table)[0] <= GOOD_ENOUGH or table.delta.size > LARGE
 
 
-def _size(table: Table) -> tuple[int, int]:
+def _size(table: ParityTable) -> tuple[int, int]:
     """States, a rejecting sink apart, then priorities."""
     still = (table.delta == np.arange(len(table.delta))[:, None]).all(axis=1)
     sink = still & (table.priority % 2 == 1).all(axis=1)

@@ -34,7 +34,7 @@ from .sequence_task import (
     sequence_environment as sequence_environment,
     sequence_sampler as sequence_sampler,
 )
-from .tabulate import Table as Table, tabulate as tabulate
+from .tabulate import TabulatedEnvironment as TabulatedEnvironment, tabulate as tabulate
 from .task_environment import (
     TaskObservation as TaskObservation,
     TaskTables as TaskTables,

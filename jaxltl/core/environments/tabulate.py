@@ -35,7 +35,7 @@ _LIVE, _TERMINATED, _TRUNCATED = range(3)
 _EVIDENCE = ("keyless", "declared", "keys", "distinct")  # from the strongest to the weakest
 
 
-def _facts(value: Table) -> tuple[str, ...]:
+def _facts(value: TabulatedEnvironment) -> tuple[str, ...]:
     return (
         nested_repr(value.model, 92),
         count(value.start.shape[-1], "beginning"),
@@ -48,7 +48,7 @@ def _facts(value: Table) -> tuple[str, ...]:
 
 @brief(facts=_facts)
 @struct.dataclass
-class Table:
+class TabulatedEnvironment:
     """A tabulated environment; see :func:`tabulate`.
 
     Attributes:
@@ -66,7 +66,7 @@ class Table:
         ``"keys"``: all sampled keys gave the same result; ``"distinct"``: the caller's `distinct`,
         which the program does not imply.
 
-    >>> over = Table(
+    >>> over = TabulatedEnvironment(
     ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
     ...     terminated=np.array([True]), truncated=np.array([False]), evidence="declared")
     >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
@@ -90,7 +90,7 @@ def tabulate(
     num_keys: int = 4,
     key: Key | None = None,
     distinct: Callable[[PyTree], PyTree] | None = None,
-) -> Table:
+) -> TabulatedEnvironment:
     """The reachable states of an environment and their transition probabilities, as a model.
 
     Breadth-first search on batches of states, which are equal if their bytes are. A time limit is
@@ -108,7 +108,7 @@ def tabulate(
         omit parts without influence on later steps, such as counters or unused keys.
 
     Returns:
-      :class:`Table`.
+      :class:`TabulatedEnvironment`.
 
     Raises:
       ValueError: a box of actions, an undeclared random reset or step, distributions that disagree with
@@ -135,7 +135,7 @@ def tabulate(
     idle = "keyless" if _left_out_is_idle(kind) else "distinct"
     initial = np.zeros(len(listed.ended))
     np.add.at(initial, listed.start, probability)
-    return Table(
+    return TabulatedEnvironment(
         _model(inner, listed, initial),
         _typed(kind, listed.world),
         listed.start,

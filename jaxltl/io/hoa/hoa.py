@@ -26,7 +26,7 @@ from jaxltl.io.hoa.header import (
     edge_priority,
 )
 from jaxltl.io.hoa.grammar import State, split_texts
-from jaxltl.io.hoa.table import Table, only_text, parsed, read_table
+from jaxltl.io.hoa.table import EdgeTable, only_text, parsed, read_table
 
 if TYPE_CHECKING:
     from lark import Token
@@ -214,7 +214,7 @@ def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
 
 
 def _automaton(
-    header: Header, table: Table, alphabet: NDArray[np.bool_], names: tuple[str, ...]
+    header: Header, table: EdgeTable, alphabet: NDArray[np.bool_], names: tuple[str, ...]
 ) -> Automaton:
     """Automaton with min-even priorities."""
     delta: Integers = table.target[table.edge_of]

@@ -85,7 +85,7 @@ def _by_number(header: Header, states: list[State]) -> list[State]:
 
 
 @dataclass(frozen=True)
-class Table:
+class EdgeTable:
     """Edge index of each state and letter, `[Q, L]`, and the edges; `sink` is added."""
 
     edge_of: NDArray[np.int64]
@@ -137,7 +137,7 @@ class _Letters:
         return self._numbers == number
 
 
-def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> Table:
+def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> EdgeTable:
     """Transition table of the body over explicit letters."""
     algebra = _Letters(columns)
     truth = label_reader(header, algebra)
@@ -162,7 +162,9 @@ def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) 
         marks.append(frozenset())
         names.append("false")
     named = any(state.name is not None for state in states)
-    return Table(edge_of, np.array(target, np.int64), marks, tuple(names) if named else (), sink)
+    return EdgeTable(
+        edge_of, np.array(target, np.int64), marks, tuple(names) if named else (), sink
+    )
 
 
 def marks_of(header: Header, state: State, edge: Edge) -> frozenset[int]:

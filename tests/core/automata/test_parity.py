@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton
 from jaxltl.core.automata.language import find_difference, is_equivalent
-from jaxltl.core.automata.merging import Table, language_classes
+from jaxltl.core.automata.merging import ParityTable, language_classes
 from jaxltl.core.automata.parity import components, reduce_table, simplify
 from jaxltl.core.automata.translate import to_automaton
 from tests.reference_logic import random_formula, random_lasso, subsets
@@ -140,7 +140,7 @@ def test_the_language_stays_and_the_acceptance_is_the_simplest(states, prioritie
 def weak(automaton):
     """Whether no two loops of one component have different verdicts, by enumeration."""
     found = loops(automaton)
-    component = components(Table(automaton.delta, automaton.priority, 0))
+    component = components(ParityTable(automaton.delta, automaton.priority, 0))
     verdicts = {}
     for loop, accepts in found.items():
         verdicts.setdefault(component[next(iter(loop))[0]], set()).add(accepts)
@@ -243,7 +243,7 @@ def test_no_language_in_two_components():
     for _ in range(120):
         automaton = random_parity(rng, rng.randint(2, 6), [0, 1, 2])
         small = simplify(automaton)
-        component = components(Table(small.delta, small.priority, 0))
+        component = components(ParityTable(small.delta, small.priority, 0))
         for p in range(len(small.delta)):
             for q in range(p):
                 if component[p] != component[q]:
@@ -258,7 +258,7 @@ def test_language_classes_by_pairs():
     merged = 0
     for _ in range(80):
         automaton = random_parity(rng, rng.randint(1, 5), [0, 1, 2, 3])
-        classes = language_classes(Table(automaton.delta, automaton.priority, 0))
+        classes = language_classes(ParityTable(automaton.delta, automaton.priority, 0))
         for p in range(len(automaton.delta)):
             for q in range(p):
                 left, right = (replace(automaton, initial=np.int32(s)) for s in (p, q))
@@ -280,7 +280,7 @@ def test_base_states_have_the_language():
     rng = random.Random(7)
     for _ in range(80):
         automaton = random_parity(rng, rng.randint(1, 6), [0, 1, 2])
-        table = Table(automaton.delta, automaton.priority, 0)
+        table = ParityTable(automaton.delta, automaton.priority, 0)
         for thorough in (True, False):
             (delta, priority, initial), kind, base = reduce_table(table, thorough)
             small = replace(

@@ -17,7 +17,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, as_partial
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
-from jaxltl.core.environments.tabulate import Table
+from jaxltl.core.environments.tabulate import TabulatedEnvironment
 from jaxltl.core.environments.episodes import without_time_limit
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -64,7 +64,7 @@ class OptimalityGap(NamedTuple):
       lower, upper: ``float64[N]``, bounds on the gap, optimum minus value.
       mean, mean_value, mean_optimum: bounds on the means over the initial states.
       evidence: of the equality of table and environment; see
-        :class:`~jaxltl.core.environments.tabulate.Table`.
+        :class:`~jaxltl.core.environments.tabulate.TabulatedEnvironment`.
 
     Example:
       >>> from jaxltl import make_environment, tabulate
@@ -94,7 +94,10 @@ class OptimalityGap(NamedTuple):
 
 
 def tabulate_policy(
-    policy: Callable[..., jax.Array], environment: Environment, table: Table, num_memory: int
+    policy: Callable[..., jax.Array],
+    environment: Environment,
+    table: TabulatedEnvironment,
+    num_memory: int,
 ) -> np.ndarray:
     """Action probabilities of an agent in each tabulated state and automaton state.
 
@@ -124,7 +127,7 @@ def tabulate_policy(
       [[1, 0], [1, 0], [1, 0], [1, 0], [1, 0]]
     """
     inner, _ = without_time_limit(environment)
-    validation.instance("table", table, Table, "one of tabulate")
+    validation.instance("table", table, TabulatedEnvironment, "one of tabulate")
     num_memory = validation.integer("num_memory", num_memory, least=1, limit=2**24)
     count = table.model.num_states
     size = max(1, min(count, _BATCH // num_memory))
@@ -148,7 +151,7 @@ def _acts(policy: PyTree, environment: Environment, memory: jax.Array, worlds: P
 
 
 def optimality_gap(
-    table: Table,
+    table: TabulatedEnvironment,
     task: Automaton | Formula | str,
     policy: ArrayLike,
     *,
@@ -189,7 +192,7 @@ def optimality_gap(
       >>> found.optimum.value.tolist(), found.value.value.tolist(), round(found.mean[1], 9)
       ([1.0], [0.375], 0.625)
     """
-    validation.instance("table", table, Table, "one of tabulate")
+    validation.instance("table", table, TabulatedEnvironment, "one of tabulate")
     if not isinstance(task, Automaton):
         task = to_automaton(task)
     steps = table.num_steps if num_steps is None else validation.integer("num_steps", num_steps)
@@ -244,7 +247,12 @@ def _rows_of(policy: ArrayLike) -> np.ndarray:
 
 
 def _bounded(
-    table: Table, model: Product, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
+    table: TabulatedEnvironment,
+    model: Product,
+    task: Automaton,
+    policy: np.ndarray,
+    start: np.ndarray,
+    steps: int,
 ) -> tuple[Solution, Solution]:
     """Step-bounded probabilities of the agent and the optimum, from each initial state."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
@@ -287,7 +295,7 @@ def _bounded(
 
 
 def _unbounded(
-    table: Table, model: Product, policy: np.ndarray, start: np.ndarray
+    table: TabulatedEnvironment, model: Product, policy: np.ndarray, start: np.ndarray
 ) -> tuple[Solution, Solution]:
     """Probabilities of the agent and the optimum without a step bound."""
     if np.asarray(table.truncated).any():
