@@ -19,15 +19,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from jaxltl.app import distributed_errors
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
-
-Value = TypeVar("Value")
 
 LOST = 3  # exit status if another process has ended
 WAIT = 60.0  # seconds
@@ -151,21 +149,23 @@ class ProcessGroup:
         every = np.asarray(process_allgather(padded))
         return [row[:n].tobytes().decode() for row, n in zip(every, sizes.tolist(), strict=True)]
 
-    def together(self, work: Callable[[], Value]) -> Value:
-        """The result of work that each process does; an error of any of them ends all."""
+    @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """Work that each process does; an expected error of any of them ends all."""
         if self.processes == 1:
-            return work()
-        message, result = "", None
+            yield
+            return
+        message = ""
         try:
-            result = work()
+            yield
         except (ValueError, OSError) as error:
             message = str(error) or type(error).__name__
         every = self.exchanged(message)
-        if not any(every):
-            return result  # type: ignore[return-value]
-        if any(every[: self.process]) or not message:
+        if any(every[: self.process]) or (any(every) and not message):
             raise SystemExit(2)
-        raise ValueError(message if len(set(every)) == 1 else f"process {self.process}: {message}")
+        if message:
+            text = message if len(set(every)) == 1 else f"process {self.process}: {message}"
+            raise ValueError(text) from None
 
     def agree(self, values: Mapping[str, object]) -> None:
         """Checks that all processes have the same values by name."""

@@ -93,10 +93,12 @@ def check(task_file: Path) -> str:
 def learn(task_file: Path, options: Options, console: Console) -> Finished | None:
     """Runs the job of a task file unless it is finished; None in all processes but the first."""
     group = console.group
-    job = group.together(lambda: job_of(task_file))
+    with group.together():
+        job = job_of(task_file)
     from jaxltl.app.job import fingerprint
 
-    task = group.together(lambda: job.FILE.read(task_file))
+    with group.together():
+        task = job.FILE.read(task_file)
     out = directory(options.out, task.name)
     with _precision(job):
         mark = fingerprint(task.digest, options.seed, options.num_seeds)
@@ -228,11 +230,13 @@ class _Run(Generic[T, S, O]):
 
         start = time.perf_counter()
         job, group, say, options = self.job, self.console.group, self.console.say, self.options
-        setup = group.together(lambda: job.prepare(task, options.seed))
+        with group.together():
+            setup = job.prepare(task, options.seed)
         say(job.describe(setup))
         if group.mesh is not None:
             say(spread(options.num_seeds, group.num_devices))
-        group.together(lambda: self._claim(task, held))
+        with group.together():
+            self._claim(task, held)
         if group.sees(str(self.checkpoint), self.checkpoint.exists()):
             say(f"going on from {self.checkpoint}")
         group.sees(str(self.out), (self.out / "task.toml").exists())

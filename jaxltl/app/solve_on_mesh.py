@@ -57,11 +57,15 @@ def read(
     formulas = [one.parsed.path for one in queries if one.parsed is not None]
     named = {name for x in formulas if isinstance(x, Formula) for name in x.propositions}
     if path.suffix == ".umb" and not named & set(BUILT_IN):
-        model = group.together(lambda: read_sharded(path, mesh))
-        mark = {"file": group.together(lambda: _digest(path))}
+        with group.together():
+            model = read_sharded(path, mesh)
+        with group.together():
+            mark = {"file": _digest(path)}
     else:
-        whole = group.together(lambda: load(path))
-        model = group.together(lambda: on_mesh(whole, group))
+        with group.together():
+            whole = load(path)
+        with group.together():
+            model = on_mesh(whole, group)
         mark = files.fingerprint(model=whole)
     return model, mark, _entry(model, time.perf_counter() - begin)
 
@@ -111,7 +115,9 @@ class MeshSolver:
             }
         )
         if directory is not None:
-            self.group.together(lambda: make_directory(directory) if self.group.is_first else None)
+            with self.group.together():
+                if self.group.is_first:
+                    make_directory(directory)
             self.group.sees(str(directory), directory.is_dir())
 
     def solve(self, queries: Sequence[Query]) -> Iterator[Result]:

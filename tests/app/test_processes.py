@@ -1,5 +1,6 @@
 """Several processes: who they are, what they agree on, and how a run ends and goes on."""
 
+import contextlib
 import json
 import os
 import random
@@ -135,9 +136,27 @@ def test_alone_nothing_is_exchanged():
     place = ProcessGroup()
     assert place.is_first and place.exchanged("a") == ["a"] and place.sees("it", False) is False
     place.agree({"--seed": 3})
-    assert place.together(lambda: 7) == 7
-    with pytest.raises(ValueError, match="of mine"):
-        place.together(lambda: int("x of mine"))
+    with pytest.raises(ValueError, match="of mine"), place.together():
+        int("x of mine")
+
+
+@pytest.mark.parametrize(
+    ("other", "mine", "error", "text"),
+    [
+        ("", "", None, ""),
+        ("", "bad", ValueError, "process 1: bad"),
+        ("bad", "bad", SystemExit, "2"),
+        ("bad", "", SystemExit, "2"),
+    ],
+)
+def test_an_error_of_one_process_ends_all(monkeypatch, other, mine, error, text):
+    monkeypatch.setattr(ProcessGroup, "exchanged", lambda self, text: [other, text])
+    group, raised = ProcessGroup(1, 2), contextlib.nullcontext()
+    with pytest.raises(error, match=text) if error else raised, group.together():
+        if mine:
+            raise ValueError(mine)
+    with pytest.raises(TypeError), group.together():  # a bug is not exchanged
+        raise TypeError
 
 
 # --- runs of two processes ----------------------------------------------------------------------

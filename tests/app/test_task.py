@@ -16,6 +16,7 @@ from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demon
 from jaxltl.app.files.schema import File
 from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import load_world
+from jaxltl.app.processes import ProcessGroup
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.support import replaced
@@ -405,10 +406,33 @@ def test_synthetic_runs_of_a_task_without_end(write):
         assert 2 not in states and {3, 5} <= set(states.tolist())
 
 
-def test_at_most_nine_files_pass_the_formula_on(write, monkeypatch):
+def files_that_handle(action, held, error):
+    """Modules of the package with functions that take or return a value, until an error."""
+    files = set()
+
+    def note(frame, event, arg):
+        if event == "call":
+            names = frame.f_code.co_varnames[: frame.f_code.co_argcount]
+            values = [frame.f_locals.get(name) for name in names]
+        else:
+            values = [arg] if event == "return" else []
+        if any(map(held, values)):
+            files.add(frame.f_code.co_filename)
+
+    sys.setprofile(note)
+    try:
+        with pytest.raises(error):
+            action()
+    finally:
+        sys.setprofile(None)
+    return {Path(x).stem for x in files if Path(x).is_relative_to(Path(jaxltl.__file__).parent)}
+
+
+def test_at_most_eight_files_pass_the_formula_on(write, tmp_path, monkeypatch):
     """The text of the formula, or a task with it, from the file to the translation."""
-    path, files = write(), set()
+    path = write()
     formula = MlirlFile.read(path).formula
+    console = run_job.Console(None, lambda line: None, ProcessGroup())
 
     class Translated(Exception):
         pass
@@ -416,22 +440,11 @@ def test_at_most_nine_files_pass_the_formula_on(write, monkeypatch):
     def translate(*args, **options):
         raise Translated
 
-    def note(frame, event, arg):
-        if event == "call":
-            names = frame.f_code.co_varnames[: frame.f_code.co_argcount]
-            found = [frame.f_locals.get(name) for name in names]
-        else:
-            found = [arg] if event == "return" else []
-        if any(isinstance(x, File) or (isinstance(x, str) and x == formula) for x in found):
-            files.add(frame.f_code.co_filename)
-
     monkeypatch.setattr(sys.modules[product.__module__], "to_automaton", translate)
-    sys.setprofile(note)
-    try:
-        with pytest.raises(Translated):
-            run_job.check(path)
-    finally:
-        sys.setprofile(None)
-    package = {Path(x).stem for x in files if Path(x).is_relative_to(Path(jaxltl.__file__).parent)}
-    # Nine with the modules that run these in `jaxltl learn`.
-    assert package == {"schema", "task", "task_mlirl", "learn", "product", "ltl"}
+    package = files_that_handle(
+        lambda: run_job.learn(path, run_job.Options(tmp_path / "out", 0, 1), console),
+        lambda x: isinstance(x, File) or (isinstance(x, str) and x == formula),
+        Translated,
+    )
+    read = {"schema", "task", "task_mlirl"}
+    assert package | {"translate"} == read | {"run_job", "learn", "product", "ltl", "translate"}
