@@ -77,7 +77,7 @@ def _anchor(
     front_point = meeting(model, requested, steps, quickest)
     if front_point.policy is None:
         raise ValueError(
-            f"{text}, and in {steps:g} steps no policy has more than {max(front_point.most, 0):.6g}; ask "
+            f"{text}, and in {steps:g} steps no policy has more than {max(front_point.upper, 0):.6g}; ask "
             "for more steps or a smaller probability."
         )
     return front_point.policy

@@ -81,20 +81,20 @@ def average_reward(
     model = to_sparse(model)
     sign = 1 if reduction_for(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)
-    found = average(
+    enclosure = average(
         model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
     )
     small = 1e-6 if (earned >= 0).all() else 1e-3
-    error = np.maximum(found.upper - found.value, found.value - found.lower)
+    error = np.maximum(enclosure.upper - enclosure.value, enclosure.value - enclosure.lower)
     least = small * float(magnitude.max())
     solution = solution_from_error(
-        sign * found.value,
+        sign * enclosure.value,
         error,
-        found.row.astype(np.int32),
-        found.rounds,
-        enough=tolerance * np.maximum(np.abs(found.value), least),
+        enclosure.row.astype(np.int32),
+        enclosure.rounds,
+        enough=tolerance * np.maximum(np.abs(enclosure.value), least),
     )
-    residual: Array = np.float64(found.residual)
+    residual: Array = np.float64(enclosure.residual)
     return replace(solution, residual=residual)
 
 
@@ -138,10 +138,12 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
     if isinstance(form.mdp, SparseMDP):
         host = form.mdp.host
         earned = pad_rows(form.mdp, choice_reward(form.mdp, reward))
-        found = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
+        solution = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
         row = pad_rows(form.mdp, np.arange(host.num_rows))
-        policy = row[np.arange(host.num_states), np.asarray(found.policy)]
-        return reshape_solution(game_model, replace(found, policy=jnp.asarray(policy, jnp.int32)))
+        policy = row[np.arange(host.num_states), np.asarray(solution.policy)]
+        return reshape_solution(
+            game_model, replace(solution, policy=jnp.asarray(policy, jnp.int32))
+        )
     game, reward = form, expected_reward(form, reward)
     if not is_deterministic(game):
         raise ValueError(
@@ -313,9 +315,9 @@ def _taken_over(graph: _Graph, policy: Integers, v: _Biases, old: _Biases) -> _B
     slack = _images(graph, v) - v.bias[:, None]
     critical = _on_cycles(graph.successor, own & (slack == 0))
     lift = np.where(critical, old.bias - v.bias, 0)
-    far = np.abs(lift).max() + np.where(own, slack, 0).max() * len(states) + 1
-    lift = np.where(critical, lift, far)
-    slack = np.where(own, slack, 2 * far)
+    ceiling = np.abs(lift).max() + np.where(own, slack, 0).max() * len(states) + 1
+    lift = np.where(critical, lift, ceiling)
+    slack = np.where(own, slack, 2 * ceiling)
     while True:
         least = np.minimum(lift, (slack + lift[graph.successor]).min(-1))
         if (least == lift).all():

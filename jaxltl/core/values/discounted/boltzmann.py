@@ -60,8 +60,8 @@ def boltzmann_expansion(num_actions: ArrayLike) -> Array:
     else:
         high = reduce(lambda ends, i: halved(i, ends), range(30), ends)[1]
     # Errors of the bisection and of rounding.
-    found = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
-    return found if xp is jnp else float(found)
+    expansion = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
+    return expansion if xp is jnp else float(expansion)
 
 
 @validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
@@ -129,21 +129,21 @@ def _boltzmann_value(
 ) -> Solution:
     (tolerance, max_steps), (adjoint, method) = limits, options
     discount = jnp.asarray(discount, model.dtype)
-    given = _given(model, reward, discount, tolerance)
+    criterion = _given(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
-    damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    damping = jnp.where(criterion.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n, _ = newton.solve(
         sweep_operator(model),
         newton.Method(softmax_mean, _judge, monotone=False),
-        newton.Backup(gains(model, reward), discount, damping, given),
+        newton.Backup(gains(model, reward), discount, damping, criterion),
         start,
         first_sweeps=4 if method == "damped" else 0,
         max_steps=max_steps,
     )
-    bound = _error(value, image, given)
-    converged = bound <= given.goal
-    half = jnp.where(converged & given.contracts, bound, jnp.inf)
+    bound = _error(value, image, criterion)
+    converged = bound <= criterion.goal
+    half = jnp.where(converged & criterion.contracts, bound, jnp.inf)
     value, image = (x.reshape(model.state_shape) for x in (value, image))
     solution = jax.tree.map(
         lax.stop_gradient,
@@ -155,7 +155,10 @@ def _boltzmann_value(
             residual=jnp.max(jnp.abs(image - value)),
             num_steps=n,
             status=status_code(
-                converged, jnp.isfinite(bound), bound <= given.enough, certified=given.contracts
+                converged,
+                jnp.isfinite(bound),
+                bound <= criterion.enough,
+                certified=criterion.contracts,
             ),
         ),
     )
@@ -203,19 +206,19 @@ def _given(
     return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
 
 
-def _error(value: jax.Array, image: jax.Array, given: _Given) -> jax.Array:
+def _error(value: jax.Array, image: jax.Array, criterion: _Given) -> jax.Array:
     """Certified where the operator contracts; elsewhere the residual."""
-    return jnp.max(jnp.abs(image - value), axis=0) / given.gap + given.rounding
+    return jnp.max(jnp.abs(image - value), axis=0) / criterion.gap + criterion.rounding
 
 
-def _judge(value: jax.Array, image: jax.Array, given: _Given) -> tuple[jax.Array, jax.Array]:
-    error = _error(value, image, given)
-    return (error <= given.enough) | ~jnp.isfinite(error), error
+def _judge(value: jax.Array, image: jax.Array, criterion: _Given) -> tuple[jax.Array, jax.Array]:
+    error = _error(value, image, criterion)
+    return (error <= criterion.enough) | ~jnp.isfinite(error), error
 
 
-def softmax_mean(over: Layout, q: Quantity, given: _Given) -> tuple[jax.Array, Quantity]:
+def softmax_mean(over: Layout, q: Quantity, parameters: _Given) -> tuple[jax.Array, Quantity]:
     """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
-    _, policy = soft_maximum(over, q, given)
+    _, policy = soft_maximum(over, q, parameters)
     finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
     value = over.mean(policy, finite)
     return value, jax.tree.map(
@@ -268,7 +271,7 @@ def boltzmann_fixed_points(
     starts = worst + weight * (best - worst)
     # For a contraction by the discount this residual bounds the error by the tolerance.
     residual = tolerance * (1 - discount) / 10
-    found: list[Solution] = []
+    fixed_points: list[Solution] = []
 
     def run(method: str, v: jax.Array) -> Solution:
         return boltzmann_value(
@@ -279,6 +282,6 @@ def boltzmann_fixed_points(
         batch = jax.vmap(partial(run, method))(starts)
         for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
             one = jax.tree.map(itemgetter(i), batch)
-            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in found):
-                found.append(one)
-    return sorted(found, key=lambda f: float(f.value.sum()))
+            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in fixed_points):
+                fixed_points.append(one)
+    return sorted(fixed_points, key=lambda f: float(f.value.sum()))

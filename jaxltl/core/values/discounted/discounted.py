@@ -105,15 +105,15 @@ class Parameters(NamedTuple):
     error: jax.Array | float = 0  # of the double word
 
 
-def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
+def judge(value: jax.Array, image: jax.Array, problem: Parameters) -> tuple[jax.Array, jax.Array]:
     """Stopping criterion by MacQueen's bounds, and half their width."""
-    found = _enclosed(value, image, given)
-    return found.ended, found.half
+    enclosure = _enclosed(value, image, problem)
+    return enclosure.ended, enclosure.half
 
 
-def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosure:
-    rounding = backup_error(given.unit, given.size, jnp.max(jnp.abs(image), axis=0))
-    return enclose(value, image, given.discount, rounding, given.tolerance)
+def _enclosed(value: jax.Array, image: jax.Array, problem: Parameters) -> Enclosure:
+    rounding = backup_error(problem.unit, problem.size, jnp.max(jnp.abs(image), axis=0))
+    return enclose(value, image, problem.discount, rounding, problem.tolerance)
 
 
 def parameters(
@@ -153,24 +153,24 @@ def gains(model: Model, reward: jax.Array) -> Quantity:
 
 def solution_of(
     model: Model,
-    given: Parameters,
+    problem: Parameters,
     value: jax.Array,
     image: jax.Array,
     policy: jax.Array,
     num_steps: jax.Array,
 ) -> Solution:
     """The solution certified by a value and its image, without derivatives."""
-    found = _enclosed(value, image, given)
-    middle = (image + found.shift).reshape(model.state_shape)
+    enclosure = _enclosed(value, image, problem)
+    middle = (image + enclosure.shift).reshape(model.state_shape)
     # With a certificate the whole image is finite.
     solution = Solution(
         value=middle,
         policy=policy,
-        lower=middle - found.half,
-        upper=middle + found.half,
+        lower=middle - enclosure.half,
+        upper=middle + enclosure.half,
         residual=jnp.max(jnp.abs(image - value)),
         num_steps=num_steps,
-        status=status_code(found.converged, found.finite, found.exhausted),
+        status=status_code(enclosure.converged, enclosure.finite, enclosure.exhausted),
     )
     result: Solution = jax.tree.map(lax.stop_gradient, solution)
     return result
@@ -254,30 +254,32 @@ def policy_value(
 def _policy_value(
     model: PyTree, policy: Array, reward: Array, discount: Words, tolerance: Array, max_steps: Array
 ) -> Solution:
-    given, raw = parameters(model, reward, discount, tolerance), reward
+    problem, raw = parameters(model, reward, discount, tolerance), reward
     reward = expected_reward(model, reward)
     checked = valid_policy(model, policy)
     over, rows = choices(model), sweep_operator(model)
     weight = over.columns(checked.distribution)
-    given = given._replace(policy=weight)
+    problem = problem._replace(policy=weight)
 
-    def combine(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
-        return over.mean(given.policy, q), given.policy
+    def combine(over: Layout, q: Quantity, problem: PyTree) -> tuple[jax.Array, Quantity]:
+        return over.mean(problem.policy, q), problem.policy
 
     value, image, n, _ = newton.solve(
         rows,
         newton.Method(combine, judge),
-        newton.Backup(over.columns(reward), given.discount, jnp.zeros_like(given.discount), given),
+        newton.Backup(
+            over.columns(reward), problem.discount, jnp.zeros_like(problem.discount), problem
+        ),
         jnp.zeros(model.num_states, model.dtype),
         max_steps=max_steps,
     )
 
     def backup(v: jax.Array) -> jax.Array:
-        return over.mean(checked.distribution, action_value(model, reward, given.discount, v))
+        return over.mean(checked.distribution, action_value(model, reward, problem.discount, v))
 
-    solution = solution_of(model, given, value, image, checked.distribution, n)
-    solution = _refined(model, raw, given, solution, checked.distribution)
-    solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
+    solution = solution_of(model, problem, value, image, checked.distribution, n)
+    solution = _refined(model, raw, problem, solution, checked.distribution)
+    solution = differentiable(solution, backup, lambda: System(rows, weight, problem.discount))
     return refuse(replace(solution, policy=checked.distribution), checked)
 
 
@@ -375,34 +377,34 @@ def _optimal_value(
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"
-    given, raw = parameters(model, reward, discount, tolerance), reward
+    problem, raw = parameters(model, reward, discount, tolerance), reward
     reward, over = expected_reward(model, reward), choices(model)
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
         value, image, n = _modified_policy_iteration(
-            model, reward, given, max_steps, evaluation_sweeps
+            model, reward, problem, max_steps, evaluation_sweeps
         )
     else:
         value, image, n, _ = newton.solve(
             sweep_operator(model),
             newton.Method(best_action, judge, newton=method == "policy_iteration"),
             newton.Backup(
-                gains(model, reward), given.discount, jnp.zeros_like(given.discount), given
+                gains(model, reward), problem.discount, jnp.zeros_like(problem.discount), problem
             ),
             zero,
             max_steps=max_steps,
         )
-    q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
+    q = reward + problem.discount * expectation(model, value.reshape(model.state_shape))
     _, policy = over.argmax(q)
-    solution = solution_of(model, given, value, image, policy, n)
-    solution = _refined(model, raw, given, solution, None)
+    solution = solution_of(model, problem, value, image, policy, n)
+    solution = _refined(model, raw, problem, solution, None)
 
     def backup(v: jax.Array) -> jax.Array:
-        return over.max(reward + given.discount * expectation(model, v))
+        return over.max(reward + problem.discount * expectation(model, v))
 
     def system() -> System:
         chosen = over.one_hot(solution.policy, model.dtype)
-        return System(sweep_operator(model), over.columns(chosen), given.discount)
+        return System(sweep_operator(model), over.columns(chosen), problem.discount)
 
     return differentiable(solution, backup, system)
 
@@ -410,7 +412,7 @@ def _optimal_value(
 def _refined(
     model: ActionModel,
     reward: jax.Array,
-    given: Parameters,
+    problem: Parameters,
     solution: Solution,
     policy: jax.Array | None,
 ) -> Solution:
@@ -419,12 +421,12 @@ def _refined(
     world = model.mdp if isinstance(model, Product) else model
     if not isinstance(world, MDP | DenseMDP | ShardedMDP) or model.dtype.itemsize > 4:
         return solution
-    found: Solution
+    refined: Solution
     reward = jnp.asarray(reward, model.dtype)
-    found, action = sequential_vmap(_newton_steps, model, reward, given, solution, policy)
-    found = replace(found, policy=action if policy is None else solution.policy)
-    ended = (solution.status <= Status.PRECISION) & jnp.isfinite(found.lower).all()
-    result: Solution = jax.tree.map(partial(jnp.where, ended), found, solution)
+    refined, action = sequential_vmap(_newton_steps, model, reward, problem, solution, policy)
+    refined = replace(refined, policy=action if policy is None else solution.policy)
+    ended = (solution.status <= Status.PRECISION) & jnp.isfinite(refined.lower).all()
+    result: Solution = jax.tree.map(partial(jnp.where, ended), refined, solution)
     return result
 
 
@@ -435,12 +437,12 @@ _Progress = tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], jax.Array]
 def _newton_steps(
     model: ActionModel,
     reward: jax.Array,
-    given: Parameters,
+    problem: Parameters,
     solution: Solution,
     policy: jax.Array | None,
 ) -> tuple[Solution, jax.Array]:
     rows, eps = dw.normalised_rows(model, policy), float(jnp.finfo(model.dtype).eps)
-    factor = dw.double_word(given.discount, given.low)
+    factor = dw.double_word(problem.discount, problem.low)
     if reward.shape == rows.scale.shape:
         gain = dw.double_word(jnp.where(model.available, reward, 0))
     else:
@@ -458,28 +460,28 @@ def _newton_steps(
         return value, image, action, dw.minus(image, value)
 
     def bounds(image: jax.Array, change: jax.Array) -> Enclosure:
-        size = given.size + 2 * jnp.max(jnp.abs(dw.words(image)[0]))
+        size = problem.size + 2 * jnp.max(jnp.abs(dw.words(image)[0]))
         # A bound is computed from the change with some roundings.
         rounding = rows.unit * size + rows.underflow(size) + 16 * eps * jnp.max(jnp.abs(change))
-        rounding += given.error * given.discount * size
+        rounding += problem.error * problem.discount * size
         ends = jnp.zeros(change.size, change.dtype), change.ravel()
-        goal = 2 * eps * size + 4 * rounding / (1 - given.discount)
-        return enclose(*ends, given.discount, rounding, goal, given.low)
+        goal = 2 * eps * size + 4 * rounding / (1 - problem.discount)
+        return enclose(*ends, problem.discount, rounding, goal, problem.low)
 
     def newton_step(carry: _Progress) -> _Progress:
-        (value, _, action, change), kept, n = carry
+        (value, _, action, change), best, n = carry
         weight = jax.nn.one_hot(action, model.num_actions, dtype=model.dtype)
         columns = action_columns(model.num_actions, weight if policy is None else policy)
-        system = System(sweep_operator(model), columns, given.discount)
+        system = System(sweep_operator(model), columns, problem.discount)
         linear = solver(system, max_steps=_MOST_PRODUCTS)
         step = lax.cond(n < 0, jnp.zeros_like, linear.solve, change)
         new = backup(dw.plus(value, dw.double_word(step)))
         size = jnp.max(jnp.abs(new[3]))
-        better = (n < 0) | (size < jnp.max(jnp.abs(kept[3])))  # false for NaN
-        kept = jax.tree.map(partial(jnp.where, better), new, kept)
+        better = (n < 0) | (size < jnp.max(jnp.abs(best[3])))  # false for NaN
+        best = jax.tree.map(partial(jnp.where, better), new, best)
         # A greedy policy that changes may raise the residual for some steps.
         useful = better if policy is not None else jnp.isfinite(size)
-        return new, kept, jnp.where(useful, n + 1, _STEPS)
+        return new, best, jnp.where(useful, n + 1, _STEPS)
 
     def goes_on(carry: _Progress) -> jax.Array:
         _, (_, image, _, change), n = carry
@@ -490,32 +492,32 @@ def _newton_steps(
     start = value, value, none.astype(jnp.int32), none
     begin: _Progress = start, start, jnp.int32(-1)
     _, (_, image, action, change), _ = lax.while_loop(goes_on, newton_step, begin)
-    found = bounds(image, change)
+    enclosure = bounds(image, change)
     lower, upper = (
-        dw.outwards(dw.plus(image, dw.double_word(found.shift + x * found.half)), x)
+        dw.outwards(dw.plus(image, dw.double_word(enclosure.shift + x * enclosure.half)), x)
         for x in (-1, 1)
     )
     narrow = solution.status == Status.CONVERGED
-    if given.tolerance is not None:
-        narrow = jnp.max(upper - lower) <= given.tolerance
-    value = jnp.clip(dw.words(image)[0] + found.shift, lower, upper)
-    status, residual = status_code(narrow, found.finite, True), jnp.max(jnp.abs(change))
+    if problem.tolerance is not None:
+        narrow = jnp.max(upper - lower) <= problem.tolerance
+    value = jnp.clip(dw.words(image)[0] + enclosure.shift, lower, upper)
+    status, residual = status_code(narrow, enclosure.finite, True), jnp.max(jnp.abs(change))
     parts = solution.policy, lower, upper, residual, solution.num_steps, status
     return Solution(value, *parts), action
 
 
-def best_action(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
+def best_action(over: Layout, q: Quantity, parameters: PyTree) -> tuple[jax.Array, Quantity]:
     """The largest action value, and weight one on the first action that attains it."""
     return over.best(q)
 
 
 def _modified_policy_iteration(
-    model: ActionModel, reward: Array, given: Parameters, max_steps: Array, sweeps: Array
+    model: ActionModel, reward: Array, problem: Parameters, max_steps: Array, sweeps: Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     over = choices(model)
 
     def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        q = reward + given.discount * expectation(model, v.reshape(model.state_shape))
+        q = reward + problem.discount * expectation(model, v.reshape(model.state_shape))
         image, policy = over.argmax(q)
         return image.ravel(), policy
 
@@ -523,11 +525,11 @@ def _modified_policy_iteration(
         _, image, policy = carry
         onward = policy_operator(model, policy)
         gain = over.mean(policy, reward).ravel()
-        value = lax.fori_loop(0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
+        value = lax.fori_loop(0, sweeps, lambda _, v: gain + problem.discount * onward(v), image)
         return value, *greedy(value)
 
     def finished(carry: PyTree, _: None) -> jax.Array:
-        return judge(carry[0], carry[1], given)[0]
+        return judge(carry[0], carry[1], problem)[0]
 
     zero = jnp.zeros(model.num_states, model.dtype)
     start = lax.stop_gradient((zero, *greedy(zero)))

@@ -107,8 +107,8 @@ def minimax_value(
       ([4.0, 4.0], [1, 0])
     """
     (max_steps,) = validation.options("minimax_value", options, max_steps=100_000)
-    given = as_game(game)
-    form, reward = compiled_form(given, reward)
+    game_model = as_game(game)
+    form, reward = compiled_form(game_model, reward)
     if allowed is not None:
         require_shape("allowed", allowed, choice_shape(form))
     graph = graph_of(form, allowed)
@@ -122,7 +122,9 @@ def minimax_value(
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
     problem = _Problem(form, None, moves, live, defined, reward, discount)
-    return reshape_solution(given, _solve(problem, tolerance, max_steps, per=per, method=method))
+    return reshape_solution(
+        game_model, _solve(problem, tolerance, max_steps, per=per, method=method)
+    )
 
 
 @validated(per=_PER, method=_METHODS, environment=("adversarial",))
@@ -175,10 +177,10 @@ def strategy_value(
     if isinstance(environment, str):
         environment = None
     strategy, environment = (flatten_policy(game_model.mdp, x) for x in (strategy, environment))
-    given = [("strategy", strategy, form.system)]
+    policies = [("strategy", strategy, form.system)]
     if environment is not None:
-        given.append(("environment", environment, ~form.system))
-    for name, policy, states in given:
+        policies.append(("environment", environment, ~form.system))
+    for name, policy, states in policies:
         kind, shape = "stochastic", choice_shape(form)
         if is_deterministic(policy):
             kind, shape = "of integers", form.state_shape
@@ -233,15 +235,15 @@ class _Problem(NamedTuple):
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
     """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
-    weight, given, valid, representable = valid_policy(game, jnp.asarray(strategy), read)
+    weight, joint, valid, representable = valid_policy(game, jnp.asarray(strategy), read)
     weight = jnp.where(over.spread(read), weight, 0)  # rows that are not read
     if environment is not None:
         read = _read(game, ~game.system)
         other = valid_policy(game, jnp.asarray(environment), read)
         weight = jnp.where(over.spread(read), other.distribution, weight)
-        given = jnp.where(over.spread(read), other.masked, given)
+        joint = jnp.where(over.spread(read), other.masked, joint)
         valid &= other.valid
-    return _Drawn(Policy(weight, given, valid, representable), lax.stop_gradient(weight) > 0)
+    return _Drawn(Policy(weight, joint, valid, representable), lax.stop_gradient(weight) > 0)
 
 
 def _returns(graph: Graph, per: str, goal: Array, moves: Array, drawn: Array) -> Array:
@@ -296,13 +298,13 @@ def _gains(
     never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
     if play.drawn is not None:
         never = jnp.where(play.drawn, 0, never)
-    spread = rows.choices.spread
+    to_choices = rows.choices.spread
     return jax.tree.map(
         lambda lives, m, r, none: jnp.where(lives, jnp.where(m, r, none), 0),
-        spread(live, reward),
+        to_choices(live, reward),
         moves,
         reward,
-        spread(never, reward),
+        to_choices(never, reward),
     )
 
 
@@ -325,16 +327,16 @@ def _horizon(
         slow = play._replace(system=jnp.ones_like(live))
 
         def judge(
-            tau: jax.Array, after: jax.Array, given: tuple[_Play, jax.Array]
+            tau: jax.Array, after: jax.Array, parameters: tuple[_Play, jax.Array]
         ) -> tuple[jax.Array, jax.Array]:
             growth = jnp.max(after - tau, axis=0)
             # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
-            return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
+            return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~parameters[1], jnp.abs(growth)
 
         ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
         tau, after, *_ = newton.solve(
             rows,
-            newton.Method(lambda over, q, given: _chosen(over, q, given[0]), judge),
+            newton.Method(lambda over, q, parameters: _chosen(over, q, parameters[0]), judge),
             newton.Backup(
                 _gains(rows, slow, ones, moves, free),
                 free.astype(tau.dtype),
@@ -373,9 +375,9 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
 
 
 def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
-    found = _certify(play, value, image)
+    enclosure = _certify(play, value, image)
     # Without a finite horizon no number of sweeps gives a bound.
-    return found.converged | found.exhausted | ~jnp.isfinite(found.half), found.half
+    return enclosure.converged | enclosure.exhausted | ~jnp.isfinite(enclosure.half), enclosure.half
 
 
 _FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far from the value
@@ -500,9 +502,9 @@ def _strategy_iteration(
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
 
-    def step(rows: SweepOperator, k: _Strategies, given: newton.Backup) -> _Strategies:
-        over, play = rows.choices, given.extra
-        q = newton.action_values(over, given, rows.expectation(k.z))
+    def step(rows: SweepOperator, k: _Strategies, backup: newton.Backup) -> _Strategies:
+        over, play = rows.choices, backup.extra
+        q = newton.action_values(over, backup, rows.expectation(k.z))
         image, best = _chosen(over, q, play)
         own = _mean(over, k.weight, q)
         margin = 2 * play.unit * (play.size + jnp.max(jnp.abs(k.z)))
@@ -517,7 +519,7 @@ def _strategy_iteration(
 
         def solved() -> jax.Array:
             # Solving for the correction refines the value where the choices stay the same.
-            return k.z + solver(System(rows, weight, given.scale)).solve(
+            return k.z + solver(System(rows, weight, backup.scale)).solve(
                 _mean(over, weight, q) - k.z
             )
 

@@ -88,30 +88,32 @@ def _soft_value(
     method: str,
 ) -> Solution:
     tolerance, max_steps = limits
-    given = parameters(model, reward, discount, tolerance)
+    problem = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n, _ = newton.solve(
         sweep_operator(model),
         newton.Method(soft_maximum, judge, newton=method == "newton"),
-        newton.Backup(gains(model, reward), given.discount, jnp.zeros_like(given.discount), given),
+        newton.Backup(
+            gains(model, reward), problem.discount, jnp.zeros_like(problem.discount), problem
+        ),
         start,
         max_steps=max_steps,
     )
-    solution = solution_of(model, given, value, image, value, n)
+    solution = solution_of(model, problem, value, image, value, n)
 
     def backup(v: jax.Array) -> jax.Array:
-        return over.logsumexp(policy_logits(model, reward, given.discount, v))
+        return over.logsumexp(policy_logits(model, reward, problem.discount, v))
 
     def system() -> System:
-        logits = policy_logits(model, reward, given.discount, solution.value)
-        return System(sweep_operator(model), over.columns(over.softmax(logits)), given.discount)
+        logits = policy_logits(model, reward, problem.discount, solution.value)
+        return System(sweep_operator(model), over.columns(over.softmax(logits)), problem.discount)
 
     solution = differentiable(solution, backup, system)
-    return with_softmax(model, reward, given.discount, solution)
+    return with_softmax(model, reward, problem.discount, solution)
 
 
-def soft_maximum(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
+def soft_maximum(over: Layout, q: Quantity, parameters: PyTree) -> tuple[jax.Array, Quantity]:
     """``log sum_a exp q_a`` of columns, and its derivative, the softmax."""
     # Elementwise over columns: reductions over a short last axis take several times as long.
     top = over.max(q)
@@ -176,14 +178,14 @@ def soft_policy_adjoint(
             return result
         return discount * pushforward(model, over.whole(mass)).ravel()
 
-    def step(before: PyTree, carry: PyTree, given: PyTree) -> PyTree:
-        (x, r), (weight, discount, _) = carry, given
+    def step(before: PyTree, carry: PyTree, parameters: PyTree) -> PyTree:
+        (x, r), (weight, discount, _) = carry, parameters
         return x + r, push(
             before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight))
         )
 
-    def finished(carry: PyTree, given: PyTree) -> jax.Array:
-        result: jax.Array = jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
+    def finished(carry: PyTree, parameters: PyTree) -> jax.Array:
+        result: jax.Array = jnp.sum(jnp.abs(carry[1]), 0) <= parameters[2]
         return result
 
     b = push(predecessors, discount, over.columns(g))

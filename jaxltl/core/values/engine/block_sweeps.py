@@ -97,10 +97,10 @@ def images(blocks: Blocks, x: jax.Array) -> jax.Array:
 
 def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
     """Names of the rows chosen by the nodes, ``int32[N]``."""
-    found = jnp.take_along_axis(names, rank[:, None], 1).ravel()
+    name = jnp.take_along_axis(names, rank[:, None], 1).ravel()
     for _ in range(rounds):
-        found = jnp.where(found < 0, _look(found, jnp.maximum(-1 - found, 0)), found)
-    return found
+        name = jnp.where(name < 0, _look(name, jnp.maximum(-1 - name, 0)), name)
+    return name
 
 
 def meets(
@@ -114,10 +114,10 @@ def meets(
         def body(x: jax.Array, block: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array | None]:
             c, target, has = block
             start = blocks.first + c * size
-            found = lax.dynamic_slice(x, (start,), (size,))
+            reached = lax.dynamic_slice(x, (start,), (size,))
             for k in range(target.shape[1]):
-                found = found | (has[0, k] & _look(x, target[0, k]))
-            return lax.dynamic_update_slice(x, found, (start,)), None
+                reached = reached | (has[0, k] & _look(x, target[0, k]))
+            return lax.dynamic_update_slice(x, reached, (start,)), None
 
         if not count:
             return x
@@ -177,8 +177,8 @@ class Chosen:
         sums = jnp.concatenate([b, jnp.zeros(3, b.dtype)])
         if self.cyclic:
             inner = onward | (self.target >= b.size)
-            spread = jnp.where(inner, 0, self.weight) * x.reshape(self.target.shape[0], 1, size)
-            sums = sums.at[self.target].add(spread)
+            flow = jnp.where(inner, 0, self.weight) * x.reshape(self.target.shape[0], 1, size)
+            sums = sums.at[self.target].add(flow)
 
         def body(
             sums: jax.Array, block: tuple[jax.Array, ...]

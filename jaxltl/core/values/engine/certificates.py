@@ -134,11 +134,11 @@ def m_matrix_error(
         def step(carry: Carry) -> Carry:
             best, least, y, n = carry
             image = dw.plus(rows.mean(rows.expectation(y)), dw.double_word(constant))
-            left = jnp.where(undecided, dw.minus(image, y), 0)
-            better = jnp.max(jnp.abs(left)) < jnp.max(jnp.abs(least)) / 2  # false for NaN
-            best, least = (jnp.where(better, *x) for x in ((y, best), (left, least)))
-            ended = ~better | jnp.all(jnp.abs(left) <= enough)
-            correction = solve(jnp.where(ended, 0, left))
+            rest = jnp.where(undecided, dw.minus(image, y), 0)
+            better = jnp.max(jnp.abs(rest)) < jnp.max(jnp.abs(least)) / 2  # false for NaN
+            best, least = (jnp.where(better, *x) for x in ((y, best), (rest, least)))
+            ended = ~better | jnp.all(jnp.abs(rest) <= enough)
+            correction = solve(jnp.where(ended, 0, rest))
             correction = jnp.where(undecided & jnp.isfinite(correction), correction, 0)
             y = dw.plus(y, dw.double_word(correction))
             return best, least, y, jnp.where(ended, _REFINEMENTS, n + 1)
@@ -152,7 +152,7 @@ def m_matrix_error(
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
     zero = jnp.zeros_like(one)
     unit, least = rows.unit, rows.underflow(jnp.ones_like(one))
-    given, value = value, lax.stop_gradient(value)
+    approximation, value = value, lax.stop_gradient(value)
 
     def claimed(exact: jax.Array, residual: jax.Array) -> jax.Array:
         size = jnp.abs(dw.words(exact)[0])
@@ -168,10 +168,10 @@ def m_matrix_error(
 
     # One loop, so that the program has each operation once.
     none = dw.double_word(zero), zero
-    (exact, residual), (error, left) = lax.fori_loop(0, 2, refine, (none, none))
+    (exact, residual), (error, rest) = lax.fori_loop(0, 2, refine, (none, none))
     claim, residual = claimed(exact, residual), jnp.abs(residual)
     size, half = jnp.abs(dw.words(exact)[0]), dw.words(error)[0]
-    enough = claim - left >= residual + unit * (size + half) + least * (1 + half)
+    enough = claim - rest >= residual + unit * (size + half) + least * (1 + half)
     proven = jnp.all(jnp.where(undecided, enough, True) & (half >= 0))
     lower, upper = dw.outwards(dw.plus(exact, -error), -1), dw.outwards(dw.plus(exact, error), 1)
     lower = jnp.where(proven, jnp.maximum(lower, 0), 0)
@@ -179,7 +179,9 @@ def m_matrix_error(
     upper = jnp.where(proven, jnp.clip(upper, jnp.finfo(one.dtype).tiny, 1), 1)
     lower, upper = (jnp.where(undecided, x, one) for x in (lower, upper))
     # The derivative is that of the approximation.
-    value = given + lax.stop_gradient(jnp.clip(dw.words(exact)[0], lower, upper) - given)
+    value = approximation + lax.stop_gradient(
+        jnp.clip(dw.words(exact)[0], lower, upper) - approximation
+    )
     return value, lower, upper, jnp.max(residual)
 
 

@@ -146,9 +146,9 @@ def _transitions(system: ChainSystem) -> csr_array | None:
     chain = (mix @ host.matrix).tocsr()
     if system.row_of is not None:
         chain = chain[system.row_of.ravel()]
-    found = (diags_array(system.mask.ravel().astype(np.float64)) @ chain).tocsr()
-    found.eliminate_zeros()
-    return found
+    transient = (diags_array(system.mask.ravel().astype(np.float64)) @ chain).tocsr()
+    transient.eliminate_zeros()
+    return transient
 
 
 def _solution(chain: csr_array | None, b: np.ndarray, transposed: bool) -> np.ndarray:

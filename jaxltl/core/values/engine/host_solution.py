@@ -35,10 +35,15 @@ def status_between(
 
 
 def solution_from_enclosure(
-    model: Model, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
+    model: Model,
+    sparse: SparseMDP | None,
+    enclosure: Enclosure,
+    tolerance: float,
+    *,
+    relative: bool,
 ) -> Solution:
     """A solution in the shapes and precision of a model, with bounds rounded outwards."""
-    value, low, high, policy = found.value, found.lower, found.upper, found.row
+    value, low, high, policy = enclosure.value, enclosure.lower, enclosure.upper, enclosure.row
     status = status_between(low, high, tolerance, relative=relative)
     dtype = np.dtype(np.float64)
     if not is_sparse(model):
@@ -56,12 +61,12 @@ def solution_from_enclosure(
         value = np.clip(value.astype(dtype), low, high)
     parts: list[Array] = [
         *(x.reshape(model.state_shape) for x in (value, policy.astype(np.int32), low, high)),
-        np.asarray(found.residual, dtype)[()],
-        np.int32(found.rounds),
+        np.asarray(enclosure.residual, dtype)[()],
+        np.int32(enclosure.rounds),
         np.int32(status),
     ]
     solution = Solution(*(parts if is_sparse(model) else to_jax(parts)))
-    return replace(solution, method=found.method)
+    return replace(solution, method=enclosure.method)
 
 
 def complement_event(solution: Solution) -> Solution:
@@ -79,7 +84,7 @@ def complement(
     parts = value, upper, lower
     if is_traced(parts):
         parts = parts[0], *lax.stop_gradient(parts[1:])
-    xp, value, far, near = namespace(*parts)
+    xp, value, high, low = namespace(*parts)
     one = xp.ones((), value.dtype)
 
     def outwards(bound: Array, end: int) -> Array:
@@ -88,12 +93,12 @@ def complement(
         # By Sterbenz's lemma, 1 - rounded has no rounding error, so that this test is exact.
         return xp.where(one - rounded == bound, rounded, beyond)
 
-    found: tuple[Array, ...] = one - value, outwards(far, -1), outwards(near, 2)
+    event: tuple[Array, ...] = one - value, outwards(high, -1), outwards(low, 2)
     if any(isinstance(x, jax.Array) for x in parts):
-        found = to_jax(found)
+        event = to_jax(event)
     else:
-        found = tuple(np.asarray(x) for x in found)
-    return found[0], found[1], found[2]
+        event = tuple(np.asarray(x) for x in event)
+    return event[0], event[1], event[2]
 
 
 @brief
@@ -128,8 +133,10 @@ def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
     mix = csr_array((weight[taken], taken, starts), shape=(host.num_states, host.num_rows))
     chain = (mix @ host.matrix).tocsr()
     chain.sort_indices()
-    most = int(count.max())
-    depth = 2 * most + 4 if most > 1 else 0  # two sums of that many terms, one to divide by
+    num_terms = int(count.max())
+    depth = (
+        2 * num_terms + 4 if num_terms > 1 else 0
+    )  # two sums of that many terms, one to divide by
     states = np.arange(host.num_states + 1)
     return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
@@ -154,8 +161,8 @@ def with_given_policy(solution: Solution, policy: Array) -> Solution:
     if policy is None:
         return solution
     table = np.asarray(policy)
-    given: Array = table.astype(np.int32) if is_deterministic(table) else table.copy()
-    return replace(solution, policy=given)
+    weight: Array = table.astype(np.int32) if is_deterministic(table) else table.copy()
+    return replace(solution, policy=weight)
 
 
 def discounted(
@@ -176,10 +183,10 @@ def discounted(
         chain = induced_chain(model, sparse, policy)
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
-    found = discounted_value(
+    enclosure = discounted_value(
         host, earned, magnitude, float(discount), tolerance=requested, depth=depth
     )
-    solution = solution_from_enclosure(model, sparse, found, requested, relative=False)
+    solution = solution_from_enclosure(model, sparse, enclosure, requested, relative=False)
     return with_given_policy(solution, policy)
 
 

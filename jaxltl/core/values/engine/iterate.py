@@ -37,12 +37,14 @@ def iterate(
     `start` has the table, the first carry and what is given, trees of arrays.
     """
 
-    def loop(table: Table, carry: Carry, given: Given, most: jax.Array) -> tuple[Carry, jax.Array]:
+    def loop(
+        table: Table, carry: Carry, parameters: Given, limit: jax.Array
+    ) -> tuple[Carry, jax.Array]:
         def one(carry: Carry, n: jax.Array, active: jax.Array) -> tuple[Carry, jax.Array]:
-            new = step(table, carry, given)
-            if every == 1 and most.ndim == 0:
+            new = step(table, carry, parameters)
+            if every == 1 and limit.ndim == 0:
                 return new, n + 1  # the loop condition has tested it
-            goes = active & (n < most)
+            goes = active & (n < limit)
             return jax.tree.map(partial(jnp.where, goes), new, carry), n + goes
 
         def body(state: tuple[Carry, jax.Array, jax.Array]) -> tuple[Carry, jax.Array, jax.Array]:
@@ -51,17 +53,17 @@ def iterate(
                 carry, n = one(carry, n, active)
             else:
                 carry, n = lax.fori_loop(0, every, lambda _, c: one(c[0], c[1], active), (carry, n))
-            return carry, n, active & ~finished(carry, given) & (n < most)
+            return carry, n, active & ~finished(carry, parameters) & (n < limit)
 
-        n = jnp.zeros(most.shape, jnp.int32)
-        first = (carry, n, jnp.ones(most.shape, bool))
+        n = jnp.zeros(limit.shape, jnp.int32)
+        first = (carry, n, jnp.ones(limit.shape, bool))
         return lax.while_loop(lambda state: jnp.any(state[2]), body, first)[:2]
 
-    most = jnp.maximum(jnp.asarray(max_steps, jnp.int32), 1)
+    limit = jnp.maximum(jnp.asarray(max_steps, jnp.int32), 1)
     if lanes == "mapped":
-        return loop(*start, most)
+        return loop(*start, limit)
     run = side_by_side if lanes == "side by side" else sequential_vmap
-    return run(loop, *start, most)
+    return run(loop, *start, limit)
 
 
 def sequential_vmap(function: Callable[..., Result], *arguments: object) -> Result:
@@ -93,16 +95,16 @@ def side_by_side(function: Callable[..., Result], table: Table, *arguments: obje
         of_table, of_arguments = batched
         if any(jax.tree.leaves(of_table)):
             axes = jax.tree.map(lambda b: 0 if b else None, (of_table, of_arguments))
-            found = jax.vmap(lambda t, x: function(t, *x), axes)(table, arguments)
+            result = jax.vmap(lambda t, x: function(t, *x), axes)(table, arguments)
         else:
 
             def last(x: jax.Array, b: bool) -> jax.Array:
                 x = x if b else jnp.broadcast_to(x, (size, *x.shape))
                 return fill_row(jnp.moveaxis(x, 0, -1))
 
-            found = function(table, *jax.tree.map(last, arguments, of_arguments))
-            found = jax.tree.map(lambda x: jnp.moveaxis(x[..., :size], -1, 0), found)
-        return found, jax.tree.map(lambda _: True, found)
+            result = function(table, *jax.tree.map(last, arguments, of_arguments))
+            result = jax.tree.map(lambda x: jnp.moveaxis(x[..., :size], -1, 0), result)
+        return result, jax.tree.map(lambda _: True, result)
 
     table, arguments = lax.stop_gradient((table, arguments))
     result: Result = one(table, jax.tree.map(jnp.asarray, arguments))

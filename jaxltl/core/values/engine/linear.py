@@ -70,12 +70,12 @@ class System(NamedTuple):
             if isinstance(self.table, ModelOperator):
                 model = self.table.model
                 policy = jnp.stack(self.weight, -1).reshape(*model.state_shape, -1)
-                found = transition_matrix(model, policy)
+                matrix = transition_matrix(model, policy)
             elif isinstance(self.table, RowEntries):
-                found = self.table.matrix(self.weight)
+                matrix = self.table.matrix(self.weight)
             else:
-                found = self.table.choices.mean(self.weight, self.table.expectation(eye))
-            return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * found
+                matrix = self.table.choices.mean(self.weight, self.table.expectation(eye))
+            return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * matrix
         rows = jnp.arange(n)
         target = jnp.asarray(self.table.successor)  # [A, K, N]
         weight = jnp.stack(self.weight)[:, None] * jnp.asarray(self.table.probability)
@@ -133,8 +133,8 @@ def solver(
 
 def is_small(table: SweepOperator, num_states: int) -> bool:
     """True if systems of `num_states` are inverted; sharded ones are not."""
-    spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
-    return num_states <= DENSE_LIMIT and not spread
+    sharded = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
+    return num_states <= DENSE_LIMIT and not sharded
 
 
 def inverse(matrix: jax.Array) -> jax.Array:

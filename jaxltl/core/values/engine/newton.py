@@ -126,29 +126,29 @@ def _judged(
     return image, weight, *method.judge(k.z, image, backup.extra)
 
 
-def _sweep(method: Method, table: SweepOperator, k: _Search, given: _Given) -> _Search:
-    image, _, done, error = _judged(method, table, k, given[0])
-    z = k.z + (1 - given[0].damping) * (image - k.z)
+def _sweep(method: Method, table: SweepOperator, k: _Search, parameters: _Given) -> _Search:
+    image, _, done, error = _judged(method, table, k, parameters[0])
+    z = k.z + (1 - parameters[0].damping) * (image - k.z)
     return k._replace(z=z, value=k.z, image=image, error=error, done=done)
 
 
-def _newton_step(method: Method, table: SweepOperator, k: _Search, given: _Given) -> _Search:
+def _newton_step(method: Method, table: SweepOperator, k: _Search, parameters: _Given) -> _Search:
     """Judges z, and makes a step of Newton's method or a sweep."""
-    (backup, most), over = given, table.choices
+    (backup, limit), over = parameters, table.choices
     image, weight, done, error = _judged(method, table, k, backup)
-    kept = ~k.newton | (error <= k.error / 2)  # false for NaN
+    accepted = ~k.newton | (error <= k.error / 2)  # false for NaN
     if method.monotone:
-        kept |= k.solved & jnp.isfinite(error)
+        accepted |= k.solved & jnp.isfinite(error)
     value, image, weight, error = jax.tree.map(
-        partial(jnp.where, kept),
+        partial(jnp.where, accepted),
         (k.z, image, over.packed(weight), error),
         (k.value, k.image, k.weight, k.error),
     )
     change, num_steps = image - value, k.num_steps + 1
-    pause = jnp.where(kept, jnp.where(k.newton, 0, k.pause), 2 * k.pause + 4)
-    plain = jnp.where(kept, jnp.maximum(k.plain - 1, 0), pause)
-    done = (done & kept) | (num_steps >= most)
-    products = jnp.minimum(_INNER, most - num_steps - 1)  # one more step judges the result
+    pause = jnp.where(accepted, jnp.where(k.newton, 0, k.pause), 2 * k.pause + 4)
+    plain = jnp.where(accepted, jnp.maximum(k.plain - 1, 0), pause)
+    done = (done & accepted) | (num_steps >= limit)
+    products = jnp.minimum(_INNER, limit - num_steps - 1)  # one more step judges the result
     sweeps = (plain > 0) | done | (products < 2)
 
     def swept() -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -180,8 +180,8 @@ def _newton_step(method: Method, table: SweepOperator, k: _Search, given: _Given
     )
 
 
-def action_values(over: Layout, given: Backup, ahead: Quantity) -> Quantity:
+def action_values(over: Layout, backup: Backup, ahead: Quantity) -> Quantity:
     """Action values ``g + c x``, with x the expected next value of each choice."""
     return jax.tree.map(
-        lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead
+        lambda g, c, x: g + c * x, backup.reward, over.spread(backup.scale, ahead), ahead
     )

@@ -26,34 +26,34 @@ def reduction_for(objective: str) -> np.ufunc:
     return np.maximum if objective == "max" else np.minimum
 
 
-def state_mask(model: SparseMDP, given: Array | str, name: str) -> np.ndarray:
+def state_mask(model: SparseMDP, states: Array | str, name: str) -> np.ndarray:
     """A set of states as ``bool[S]``, from one in the model's shape or a label."""
-    if isinstance(given, str):
-        return np.asarray(model.states_with_label(given), bool)
-    shape = np.shape(given)
+    if isinstance(states, str):
+        return np.asarray(model.states_with_label(states), bool)
+    shape = np.shape(states)
     fits = shape and int(np.prod(shape)) == model.num_states
-    require_states(name, given, shape if fits else (model.num_states,))
-    found = np.asarray(given).reshape(-1)
-    if found.dtype != bool:
-        raise ValueError(f"{name} is {found.dtype}[{found.size}]; give booleans, or a label.")
-    return found
+    require_states(name, states, shape if fits else (model.num_states,))
+    mask = np.asarray(states).reshape(-1)
+    if mask.dtype != bool:
+        raise ValueError(f"{name} is {mask.dtype}[{mask.size}]; give booleans, or a label.")
+    return mask
 
 
 def state_reward(model: SparseMDP, reward: Reward) -> np.ndarray:
     """The rewards of states, ``float64[S]``; ValueError without any, or if some are not finite."""
-    given = reward_structure(model, reward)
-    if given.state is None:
+    rewards = reward_structure(model, reward)
+    if rewards.state is None:
         raise ValueError(
             "the reward of a state after so many steps needs a reward on states, and "
             "this one has none; give an array of one number a state."
         )
-    return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
+    return finite_reward(model, Rewards(state=rewards.state))[0][model.host.row_start[:-1]]
 
 
 def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndarray]:
     """Expected rewards of rows, and those of absolute values: ``float64[R]``; ValueError if not finite."""
-    given = reward_structure(model, reward)
-    earned = choice_reward(model, given)
+    rewards = reward_structure(model, reward)
+    earned = choice_reward(model, rewards)
     if not np.isfinite(earned).all():
         row = int(np.flatnonzero(~np.isfinite(earned))[0])
         state = int(model.host.state[row])
@@ -61,7 +61,7 @@ def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndar
             f"the reward of state {state}, choice {row - int(model.row_start[state])} "
             f"is {earned[row]}; make it finite."
         )
-    return earned, choice_reward(model, jax.tree.map(np.abs, given))
+    return earned, choice_reward(model, jax.tree.map(np.abs, rewards))
 
 
 def nonnegative_reward(
@@ -79,23 +79,23 @@ def nonnegative_reward(
     return earned
 
 
-def transition_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
+def transition_reward(model: SparseMDP, rewards: Rewards) -> np.ndarray:
     """The reward of each entry, ``float64[T]``."""
     mdp = model.host
-    found = np.zeros(mdp.num_transitions)
-    if given.transition is not None:
-        found += np.asarray(given.transition, np.float64)
-    if given.choice is not None:
-        found += np.asarray(given.choice, np.float64)[mdp.row]
-    if given.state is not None:
-        found += np.asarray(given.state, np.float64)[mdp.state[mdp.row]]
-    if not np.isfinite(found).all():
-        e = int(np.flatnonzero(~np.isfinite(found))[0])
+    earned = np.zeros(mdp.num_transitions)
+    if rewards.transition is not None:
+        earned += np.asarray(rewards.transition, np.float64)
+    if rewards.choice is not None:
+        earned += np.asarray(rewards.choice, np.float64)[mdp.row]
+    if rewards.state is not None:
+        earned += np.asarray(rewards.state, np.float64)[mdp.state[mdp.row]]
+    if not np.isfinite(earned).all():
+        e = int(np.flatnonzero(~np.isfinite(earned))[0])
         raise ValueError(
-            f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
+            f"the reward is {earned[e]} from state {mdp.state[mdp.row[e]]} to "
             f"{mdp.successor[e]}; make it finite."
         )
-    return found
+    return earned
 
 
 def solution_from_error(
@@ -118,7 +118,7 @@ def solution_from_error(
     finite = bool(np.isfinite(value).all())
     narrow = bool((error <= enough).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
-    found: dict[str, Array] = {
+    fields: dict[str, Array] = {
         "value": value + 0.0,
         "policy": policy,
         "lower": lower,
@@ -127,7 +127,7 @@ def solution_from_error(
         "num_steps": np.int32(min(num_steps, 2**31 - 1)),
         "status": np.int32(status),
     }
-    return Solution(**found)
+    return Solution(**fields)
 
 
 def safe_mean(share: np.ndarray, bound: ArrayLike, *, up: bool, highest: float = np.inf) -> float:
@@ -142,7 +142,7 @@ def safe_mean(share: np.ndarray, bound: ArrayLike, *, up: bool, highest: float =
 
 def safe_ends(
     model: Model,
-    found: Solution | Enclosure | RobustValues | AverageReward,
+    enclosure: Solution | Enclosure | RobustValues | AverageReward,
     *,
     highest: float = np.inf,
 ) -> tuple[float, float]:
@@ -151,6 +151,6 @@ def safe_ends(
     start = np.flatnonzero(share)
     low, high = (
         safe_mean(share[start], np.asarray(x).ravel()[start], up=up, highest=highest)
-        for x, up in ((found.lower, False), (found.upper, True))
+        for x, up in ((enclosure.lower, False), (enclosure.upper, True))
     )
     return low, high

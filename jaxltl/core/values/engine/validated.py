@@ -45,16 +45,16 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
         @wraps(solve)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
             bound = signature.bind(*args, **kwargs)
-            given = dict(bound.arguments)
-            options = {k: x for k, x in given.pop("options", {}).items() if x is not None}
-            given.update(options)
+            arguments = dict(bound.arguments)
+            options = {k: x for k, x in arguments.pop("options", {}).items() if x is not None}
+            arguments.update(options)
             if "options" in bound.arguments:
                 bound.arguments["options"] = options
             for name, known in words.items():
-                if isinstance(given.get(name), str):
-                    choice(name, given[name], known)
+                if isinstance(arguments.get(name), str):
+                    choice(name, arguments[name], known)
             traced = traced_arguments(
-                {name: x for name, x in given.items() if x is not None or name not in optional}
+                {name: x for name, x in arguments.items() if x is not None or name not in optional}
             )
             if not traced:
                 return solve(*bound.args, **bound.kwargs)

@@ -148,8 +148,8 @@ def learn_guarantee(
             method="anytime" if method is None else method,
             entry_start=sparse.entry_start,
         )
-    interval, kept = _with_sets(sparse, sets)
-    found = robust_satisfaction(
+    interval, aligned = _with_sets(sparse, sets)
+    worst = robust_satisfaction(
         interval, task, objective=objective, nature="adversarial", tolerance=tolerance
     )
     best = robust_satisfaction(
@@ -157,17 +157,19 @@ def learn_guarantee(
     )
     share = np.asarray(interval.initial)
     share = share[share > 0]
-    sure, most = ("lower", "upper") if objective == "max" else ("upper", "lower")
-    center = np.asarray(sets.center, np.float64)[kept]
+    sure, optimistic = ("lower", "upper") if objective == "max" else ("upper", "lower")
+    center = np.asarray(sets.center, np.float64)[aligned]
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
-        bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max", highest=1),
+        bound=safe_mean(share, getattr(worst.solution, sure), up=objective != "max", highest=1),
         confidence=float(confidence),
-        satisfaction=found,
-        optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max", highest=1),
+        satisfaction=worst,
+        optimistic=safe_mean(
+            share, getattr(best.solution, optimistic), up=objective == "max", highest=1
+        ),
         model=interval,
         sets=sets,
-        gain=sign * _gain(interval, found, center, share),
+        gain=sign * _gain(interval, worst, center, share),
         graph=graph,
     )
 
@@ -197,29 +199,29 @@ def _confidence_of_sets(model: SparseMDP, graph: Graph, confidence: float) -> fl
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
     """The interval model, with all transitions of the model."""
     ball = {} if sets.radius is None else {"center": sets.center, "radius": sets.radius}
-    found = make_interval(model, sets.lower, sets.upper, **ball)
-    if found.num_transitions == model.num_transitions:
-        return found, np.ones(model.num_transitions, bool)
+    interval = make_interval(model, sets.lower, sets.upper, **ball)
+    if interval.num_transitions == model.num_transitions:
+        return interval, np.ones(model.num_transitions, bool)
     code = [
         np.asarray(x.host.row, np.int64) * model.num_states + x.successor
-        for x in (model, found.nominal)
+        for x in (model, interval.nominal)
     ]
-    return found, np.isin(*code)
+    return interval, np.isin(*code)
 
 
 def _gain(
-    model: IntervalMDP, found: Satisfaction, center: np.ndarray, share: np.ndarray
+    model: IntervalMDP, satisfaction: Satisfaction, center: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
     """Expected visits of each row times the loss to nature there: ``float64[R]``."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import spsolve
 
-    product, value = found.product, found.value
+    product, value = satisfaction.product, satisfaction.value
     host = product.host
-    policy = np.asarray(found.solution.policy)
+    policy = np.asarray(satisfaction.solution.policy)
     taken = product.base_row == policy[host.state]
     entry = taken[host.row]
-    nature = np.asarray(found.solution.nature)
+    nature = np.asarray(satisfaction.solution.nature)
     open_ = (value > 0) & (value < 1)
     # Under this nature every undecided state is left almost surely.
     inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)

@@ -69,20 +69,20 @@ def episode_totals(
         return result
 
     def move(carry: PyTree) -> PyTree:
-        now, time, paid, kept, sums = carry
-        now, made = continue_episode(now, environment, agent, jax.random.fold_in(path, time))
-        kept, read = kept * discount, accepting(now.world)
+        now, time, paid, factor, sums = carry
+        now, transition = continue_episode(now, environment, agent, jax.random.fold_in(path, time))
+        factor, read = factor * discount, accepting(now.world)
         reward, discounted, cost, visits, early = sums
         sums = (
-            reward + made.reward,
-            discounted + paid * made.reward,
-            cost + made.cost,
+            reward + transition.reward,
+            discounted + paid * transition.reward,
+            cost + transition.cost,
             visits + read.astype(jnp.int32),
-            early + jnp.where(read, kept, 0),
+            early + jnp.where(read, factor, 0),
         )
         sums = tuple(x.astype(y.dtype) for x, y in zip(sums, carry[-1], strict=True))
-        paid = (paid * discount * made.discount).astype(number)
-        return now, time + 1, paid, kept.astype(number), sums
+        paid = (paid * discount * transition.discount).astype(number)
+        return now, time + 1, paid, factor.astype(number), sums
 
     now, time, _, _, sums = lax.while_loop(going, move, (begin, jnp.int32(0), one, one, sums))
     reward, discounted, cost, visits, early = sums
@@ -185,10 +185,10 @@ def evaluate(
     """
     environment = require_environment(environment)
     num_steps = checked_steps(environment, num_steps)
-    most = 2**31 - 1
-    num_episodes = validation.integer("num_episodes", num_episodes, least=1, limit=most)
+    limit = 2**31 - 1
+    num_episodes = validation.integer("num_episodes", num_episodes, least=1, limit=limit)
     batch = batch if isinstance(batch, Batch) else Batch(batch)
-    size = validation.integer("batch", batch.size, least=1, limit=most)
+    size = validation.integer("batch", batch.size, least=1, limit=limit)
     confidence = validation.fraction("confidence", confidence, ends=(False, False))
     if threshold is not None:
         threshold = validation.fraction("threshold", threshold, ends=(False, False))
@@ -204,7 +204,7 @@ def evaluate(
         )
     failure, parts, count, success, decision = 1 - confidence, [], 0, 0, None
     while count < num_episodes and decision is None:
-        found = on_host(
+        episodes = on_host(
             _batch(
                 key,
                 (environment, agent),
@@ -214,7 +214,7 @@ def evaluate(
                 batch=Batch(min(size, num_episodes), batch.sharding),
             )
         )
-        parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
+        parts.append(jax.tree.map(lambda x, limit=num_episodes - count: x[:limit], episodes))
         count += len(parts[-1].length)
         if threshold is not None:
             success += int((parts[-1].verdict == Verdict.SATISFIED).sum())
@@ -277,14 +277,14 @@ def _checked_agent(agent: object, environment: Environment) -> tuple[Agent, PyTr
         seen, mask = environment.observe(world), allowed_in(environment, world)
         return agent.act(agent.memory, seen, mask, key)[0], world
 
-    found, world = jax.eval_shape(first, jax.random.key(0))
+    action, world = jax.eval_shape(first, jax.random.key(0))
     space = some_action(environment.actions)
     whole = jnp.issubdtype(space.dtype, jnp.integer)
-    if getattr(found, "shape", None) != space.shape or (
-        whole and not jnp.issubdtype(found.dtype, jnp.integer)
+    if getattr(action, "shape", None) != space.shape or (
+        whole and not jnp.issubdtype(action.dtype, jnp.integer)
     ):
         raise ValueError(
-            f"the agent's action is {found}; the environment takes {space.dtype}"
+            f"the agent's action is {action}; the environment takes {space.dtype}"
             f"{list(space.shape)}."
         )
     return agent, world

@@ -48,8 +48,8 @@ def _facts(value: OptimalityGap) -> Iterator[str]:
         ("optimum", value.mean_optimum),
     ):
         yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
-    most = readable(value.upper)
-    yield f"gap at most {number(most.max(initial=0.0))}" if most is not None else ""
+    upper = readable(value.upper)
+    yield f"gap at most {number(upper.max(initial=0.0))}" if upper is not None else ""
     yield f"evidence {value.evidence!r}"
 
 
@@ -197,23 +197,23 @@ def optimality_gap(
         task = to_automaton(task)
     steps = table.num_steps if num_steps is None else validation.integer("num_steps", num_steps)
     model = product(table.model, task)
-    shown = _rows_of(policy)
+    table_of_policy = _rows_of(policy)
     shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
     if (
-        shown.shape[:2] != shape
-        or shown.ndim != 2 + (not is_deterministic(shown))
-        or (shown.ndim == 3 and shown.shape[2] < num_actions)
+        table_of_policy.shape[:2] != shape
+        or table_of_policy.ndim != 2 + (not is_deterministic(table_of_policy))
+        or (table_of_policy.ndim == 3 and table_of_policy.shape[2] < num_actions)
     ):
         raise ValueError(
-            f"policy is {shown.dtype}{list(shown.shape)}; expected actions "
+            f"policy is {table_of_policy.dtype}{list(table_of_policy.shape)}; expected actions "
             f"int{list(shape)}, or probabilities float{[*shape, num_actions]}."
         )
     start = np.unique(np.asarray(table.start))
     weight = np.asarray(table.model.initial)[start]
     if steps is None:
-        value, optimum = _unbounded(table, model, shown, start)
+        value, optimum = _unbounded(table, model, table_of_policy, start)
     else:
-        value, optimum = _bounded(table, model, task, shown, start, steps)
+        value, optimum = _bounded(table, model, task, table_of_policy, start, steps)
     own, best = (tuple(np.asarray(x) for x in (y.lower, y.upper)) for y in (value, optimum))
     sure = np.isin(own, (0, 1)).all(axis=0) & np.isin(best, (0, 1)).all(axis=0)
     below, above = best[0] - own[1], best[1] - own[0]
@@ -236,14 +236,14 @@ def optimality_gap(
 
 def _rows_of(policy: ArrayLike) -> np.ndarray:
     try:
-        found = np.asarray(policy)
+        array = np.asarray(policy)
     except ValueError:  # ragged
-        found = np.asarray(None)
-    if found.dtype.kind not in "iuf":
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
         raise ValueError(
             f"policy is {validation.shorten(policy)}; give actions, or their probabilities."
         )
-    return found
+    return array
 
 
 def _bounded(
@@ -256,40 +256,44 @@ def _bounded(
 ) -> tuple[Solution, Solution]:
     """Step-bounded probabilities of the agent and the optimum, from each initial state."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
-    found = sparse_product(
+    reachable = sparse_product(
         base,
         np.asarray(task.delta),
         letter,
         (start, np.asarray(model.initial_memory)[start]),
         still=decisions != Verdict.UNDECIDED,
     )
-    ended = np.asarray(table.terminated)[found.base_state]
-    at_end = lasso_verdicts(task)[found.memory, letter[found.base_state]]
-    target = np.where(ended, at_end, decisions[found.memory]) == Verdict.SATISFIED
-    going = ~np.asarray(table.truncated)[found.base_state]
-    best = host.until(found.host, target, going, steps, np.maximum)
-    single = np.diff(base.row_start)[found.base_state] == 1
-    fixed = found.still | (single & (ended | ~going))
+    ended = np.asarray(table.terminated)[reachable.base_state]
+    at_end = lasso_verdicts(task)[reachable.memory, letter[reachable.base_state]]
+    target = np.where(ended, at_end, decisions[reachable.memory]) == Verdict.SATISFIED
+    going = ~np.asarray(table.truncated)[reachable.base_state]
+    best = host.until(reachable.host, target, going, steps, np.maximum)
+    single = np.diff(base.row_start)[reachable.base_state] == 1
+    fixed = reachable.still | (single & (ended | ~going))
     weight = _weights(
         policy,
-        np.asarray(table.model.action)[found.base_row],
-        found.base_state,
-        found.memory,
-        found.host,
+        np.asarray(table.model.action)[reachable.base_row],
+        reachable.base_state,
+        reachable.memory,
+        reachable.host,
         fixed,
     )
-    written = sparse_mdp_of_product(found)
+    written = sparse_mdp_of_product(reachable)
     chain = induced_chain(written, written, weight)
     own = host.until(chain.mdp, target, going, steps, np.maximum)
     # The chain's numbers are rounded before the sweeps begin.
     unit = host.backup_unit(chain.mdp) + chain.depth * float(np.finfo(np.float64).eps)
     wide = np.minimum(own.value * host.relative_error(unit, steps) + host.UNDERFLOW, 1)
     error = np.where(own.error > 0, wide, 0)
-    at = found.start
+    at = reachable.start
     return (
         solution_from_error(own.value[at], error[at], None, own.num_steps, highest=1),
         solution_from_error(
-            best.value[at], best.error[at], found.base_row[best.row[at]], best.num_steps, highest=1
+            best.value[at],
+            best.error[at],
+            reachable.base_row[best.row[at]],
+            best.num_steps,
+            highest=1,
         ),
     )
 

@@ -95,7 +95,7 @@ class FrontSearch:
             if part.kind != "gain":
                 continue
             earns = (cyclic & (self.problem.gain[part.place] > 0)).any()
-            if earns or (part.open is not None and (everywhere & part.open[mdp.state]).any()):
+            if earns or (part.pending is not None and (everywhere & part.pending[mdp.state]).any()):
                 why = (
                     "reward is earned for ever in an end component"
                     if earns
@@ -120,10 +120,10 @@ class FrontSearch:
             weights[part.kind][part.place] = w
             shift += w if part.kind == "sure" and part.sign < 0 else 0
         tolerance = self.tolerance / 4 * float((normal * self.scale).sum())
-        found = weighted_optimum(self.problem, self.ends, **weights, tolerance=tolerance)
-        bound = found.bound - shift + 1e-15 * (abs(found.bound) + shift)
-        value, lower, upper = self._evaluate(found.weight, found.home)
-        known = _Sum(found.weight, value, lower, upper, normal, bound, self.tolerance)
+        optimum = weighted_optimum(self.problem, self.ends, **weights, tolerance=tolerance)
+        bound = optimum.bound - shift + 1e-15 * (abs(optimum.bound) + shift)
+        value, lower, upper = self._evaluate(optimum.weight, optimum.home)
+        known = _Sum(optimum.weight, value, lower, upper, normal, bound, self.tolerance)
         self.solved.append(known)
 
     def _evaluate(self, weight: np.ndarray, home: np.ndarray) -> np.ndarray:
@@ -134,7 +134,7 @@ class FrontSearch:
         component = end_components(problem.mdp, rows=inside).component
         leader = component[problem.mdp.state[inside]]
         tolerance, depth = self.tolerance / 8, chain.depth
-        found = []
+        values = []
         for part in self.parts:
             if part.kind == "sure":
                 least = np.full(home.size, np.iinfo(np.int64).max)
@@ -149,16 +149,16 @@ class FrontSearch:
                 x = optimal.total_reward(
                     chain.mdp, earned, home, maximize=False, tolerance=tolerance, depth=depth
                 )
-            found.append(self._expected(part, x))
-        return np.array(found).T
+            values.append(self._expected(part, x))
+        return np.array(values).T
 
-    def _expected(self, part: Part, found: Enclosure) -> tuple[float, float, float]:
+    def _expected(self, part: Part, enclosure: Enclosure) -> tuple[float, float, float]:
         """Value, lower and upper bound from the initial distribution."""
         first = np.flatnonzero(self.problem.start)
         share = self.problem.start[first]
         slack = 1e-15 * (first.size + 2)
         value, low, high = (
-            float(share @ x[first]) for x in (found.value, found.lower, found.upper)
+            float(share @ x[first]) for x in (enclosure.value, enclosure.lower, enclosure.upper)
         )
         exact = low == high and (first.size == 1 or (part.kind == "sure" and low in (0, 1)))
         if not exact:
@@ -187,10 +187,10 @@ class FrontSearch:
             self.product,
         )
 
-    def thresholds(self, given: Sequence[float | Fraction | None]) -> Thresholds:
+    def thresholds(self, limits: Sequence[float | Fraction | None]) -> Thresholds:
         """Thresholds with the signs of the objectives, minus infinity without one."""
-        found = np.full((2, len(given)), -np.inf)
-        for i, (threshold, sign) in enumerate(zip(given, self.signs.tolist(), strict=True)):
+        doubles = np.full((2, len(limits)), -np.inf)
+        for i, (threshold, sign) in enumerate(zip(limits, self.signs.tolist(), strict=True)):
             if threshold is None:
                 continue
             if not math.isfinite(threshold):
@@ -198,10 +198,10 @@ class FrontSearch:
                     f"the threshold of objective {i + 1} is {threshold}; give a finite number."
                 )
             exact = sign * Fraction(threshold)
-            near = float(exact)
-            found[0, i] = near if near >= exact else math.nextafter(near, math.inf)
-            found[1, i] = near if near <= exact else math.nextafter(near, -math.inf)
-        return Thresholds(*found)
+            rounded = float(exact)
+            doubles[0, i] = rounded if rounded >= exact else math.nextafter(rounded, math.inf)
+            doubles[1, i] = rounded if rounded <= exact else math.nextafter(rounded, -math.inf)
+        return Thresholds(*doubles)
 
     def decide(
         self, wanted: Thresholds, max_points: int
@@ -247,8 +247,8 @@ class FrontSearch:
         share = apart.share
         if index is not None:
             enough = wanted - (apart.distance + 1e-15) * self.scale
-            found = frontier.largest(lower, self.half_spaces, index, (enough, enough), self.scale)
-            share = found.share if np.isfinite(found.lower) else share
+            optimum = frontier.largest(lower, self.half_spaces, index, (enough, enough), self.scale)
+            share = optimum.share if np.isfinite(optimum.lower) else share
         front, used = self.front(), share > 0
         low = frontier.mixture(front.lower[used], share[used])
         high = -frontier.mixture(-front.upper[used], share[used])
@@ -282,10 +282,10 @@ class FrontSearch:
             return ConstrainedOptimum(
                 (low + high) / 2, low, high, True, known.share, self.front(), status
             )
-        near = self.nearest(wanted.hard, index)
-        value = float(np.clip((near.lower[index] + near.upper[index]) / 2, low, high))
+        nearest = self.nearest(wanted.hard, index)
+        value = float(np.clip((nearest.lower[index] + nearest.upper[index]) / 2, low, high))
         return ConstrainedOptimum(
-            value, low, high, holds, None, self.front(), Status.PRECISION, near
+            value, low, high, holds, None, self.front(), Status.PRECISION, nearest
         )
 
     def close(self, tolerance: float, max_points: int) -> float:
@@ -299,10 +299,10 @@ class FrontSearch:
             if not np.array_equal(before, self.scale):
                 held.clear()
             floor = lower.min(0) - self.scale
-            far = frontier.corners(*self.half_spaces, floor)
-            if not len(far):
+            corners = frontier.corners(*self.half_spaces, floor)
+            if not len(corners):
                 return float("inf")
-            worst = self._farthest(np.maximum(far, lower.min(0)), held)
+            worst = self._farthest(np.maximum(corners, lower.min(0)), held)
             gap = max(worst.distance, 0.0)
             if gap <= tolerance or len(lower) >= max_points or not self.ask_anew(worst.normal):
                 return gap
@@ -312,9 +312,9 @@ class FrontSearch:
     ) -> frontier.Separation:
         """The corner farthest beyond the mixtures; distances only shrink as points are added."""
         lower, names, fresh = self.lower, [x.tobytes() for x in corners], set()
-        far = np.array([held[x].distance if x in held else np.inf for x in names])
-        while (i := int(far.argmax())) not in fresh:
+        distance = np.array([held[x].distance if x in held else np.inf for x in names])
+        while (i := int(distance.argmax())) not in fresh:
             held[names[i]] = frontier.separation(lower, corners[i], self.scale)
-            far[i] = held[names[i]].distance
+            distance[i] = held[names[i]].distance
             fresh.add(i)
         return held[names[i]]

@@ -84,8 +84,8 @@ def achievable(
     wanted = search.thresholds(thresholds)
     holds, share, normal = search.decide(wanted, max_points)
     if holds is None:
-        near = search.nearest(wanted.hard)
-        return Achievable(None, None, None, search.front(), Status.PRECISION, near)
+        nearest = search.nearest(wanted.hard)
+        return Achievable(None, None, None, search.front(), Status.PRECISION, nearest)
     return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
 
 
@@ -118,15 +118,16 @@ def pareto(
     search = FrontSearch(model, objectives, tolerance / 8)
     gap = search.close(tolerance, max_points)
     front = search.front()
-    lower, near = search.lower, search.tolerance * search.scale
-    kept = [
+    lower, margin = search.lower, search.tolerance * search.scale
+    efficient = [
         i
         for i, x in enumerate(lower)
         if not any(
-            (y >= x - near).all() and ((y > x + near).any() or j < i) for j, y in enumerate(lower)
+            (y >= x - margin).all() and ((y > x + margin).any() or j < i)
+            for j, y in enumerate(lower)
         )
     ]
-    points = front.points[kept]
+    points = front.points[efficient]
     status = Status.CONVERGED if gap <= tolerance else Status.MAX_STEPS
     return Pareto(points[np.lexsort(points.T[::-1])], front, gap, status)
 

@@ -26,9 +26,9 @@ _MOST = 8  # probabilities at once, of which all sets are looked at
 
 def _facts(value: Objective) -> Iterator[str]:
     for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
-        given = getattr(value, name)
-        if given is not None:
-            yield f"{name}={describe(given)}"
+        field = getattr(value, name)
+        if field is not None:
+            yield f"{name}={describe(field)}"
     yield f"direction={value.direction!r}"
 
 
@@ -80,7 +80,7 @@ class Part(NamedTuple):
     kind: str  # "sure" for a probability, "gain" for a maximised reward, "cost"
     place: int  # its number among those of its kind
     sign: int  # 1 to maximise, -1 to minimise
-    open: np.ndarray | None  # bool[N], of a reward with a target, where that is not reached yet
+    pending: np.ndarray | None  # bool[N], of a reward with a target, where that is not reached yet
 
 
 class _Tracker(NamedTuple):
@@ -118,24 +118,24 @@ def weighted_problem(
     state = members[product.memory]  # int[N, trackers]
     still = product.still
     parts: list[Part] = []
-    found: dict[str, list[np.ndarray]] = {"sure": [], "gain": [], "cost": []}
+    rows: dict[str, list[np.ndarray]] = {"sure": [], "gain": [], "cost": []}
     ended = np.ones(mdp.num_states, bool)
     for i, (objective, reward) in enumerate(zip(objectives, rewards, strict=True)):
         tracker, sign = trackers[i], 1 if objective.direction == "max" else -1
         memory = None if tracker is None else state[:, used.index(i)]
-        open_ = None
+        pending = None
         if reward is not None:
             kind = "gain" if sign > 0 else "cost"
             counted = reward[product.base_row]
             if tracker is not None and memory is not None:
-                open_ = ~tracker.decided[memory]
-                ended &= ~open_
-                counted = np.where(open_[mdp.state], counted, 0)
+                pending = ~tracker.decided[memory]
+                ended &= ~pending
+                counted = np.where(pending[mdp.state], counted, 0)
         else:
             assert tracker is not None and memory is not None
             kind, counted = "sure", _priorities(product, tracker, memory, still)
-        parts.append(Part(i, kind, len(found[kind]), sign, open_))
-        found[kind].append(counted)
+        parts.append(Part(i, kind, len(rows[kind]), sign, pending))
+        rows[kind].append(counted)
     initial = np.asarray(model.initial, np.float64)
     start = np.zeros(mdp.num_states)
     start[product.start] = initial[initial > 0]
@@ -144,9 +144,9 @@ def weighted_problem(
         WeightedProblem(
             mdp,
             start,
-            np.array(found["sure"], np.int64).reshape(shape),
-            np.array(found["gain"], np.float64).reshape(shape),
-            np.array(found["cost"], np.float64).reshape(shape),
+            np.array(rows["sure"], np.int64).reshape(shape),
+            np.array(rows["gain"], np.float64).reshape(shape),
+            np.array(rows["cost"], np.float64).reshape(shape),
             ended,
         ),
         parts,
@@ -159,15 +159,15 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
     name = f"objective {index + 1}"
     if objective.direction not in ("max", "min"):
         raise ValueError(f'{name}: direction={objective.direction!r}; it must be "max" or "min".')
-    given = [n for n in ("formula", "avoid", "reward") if getattr(objective, n) is not None]
-    if len(given) > 1 or (not given and objective.target is None):
+    kinds = [n for n in ("formula", "avoid", "reward") if getattr(objective, n) is not None]
+    if len(kinds) > 1 or (not kinds and objective.target is None):
         raise ValueError(
             f"{name}: give one of formula, avoid, reward or target; it has "
-            f"{', '.join(given) or 'none'}."
+            f"{', '.join(kinds) or 'none'}."
         )
-    if given and given[0] != "reward" and objective.target is not None:
-        raise ValueError(f"{name}: a target goes with a reward or alone, not with {given[0]}.")
-    if objective.stay is not None and (given or objective.target is None):
+    if kinds and kinds[0] != "reward" and objective.target is not None:
+        raise ValueError(f"{name}: a target goes with a reward or alone, not with {kinds[0]}.")
+    if objective.stay is not None and (kinds or objective.target is None):
         raise ValueError(f"{name}: stay goes with the probability of a target.")
     if objective.reward is None:
         return None
@@ -219,8 +219,8 @@ def _product(
     letters: Integers = np.zeros((model.num_states, len(trackers)), np.int64)
     for i, x in enumerate(trackers):
         letters[:, i] = x.letter
-    shown, letter = np.unique(letters, axis=0, return_inverse=True)
-    letter, words = letter.reshape(-1), shown.tolist()
+    combinations, letter = np.unique(letters, axis=0, return_inverse=True)
+    letter, words = letter.reshape(-1), combinations.tolist()
     tables = [x.delta.tolist() for x in trackers]
 
     def step(members: tuple[int, ...]) -> list[tuple[tuple[int, ...], int]]:

@@ -64,14 +64,14 @@ class Problem(NamedTuple):
 
     def sweep(self, x: jax.Array, factor: float, shift: float | jax.Array) -> jax.Array:
         rounding = (factor, shift)
-        found = sweep(self.core, x, maximize=self.maximize, fixed=self.fixed, rounding=rounding)
-        return found[0]
+        swept = sweep(self.core, x, maximize=self.maximize, fixed=self.fixed, rounding=rounding)
+        return swept[0]
 
     def image(self, outer: jax.Array, x: jax.Array) -> jax.Array:
         """``c + P x`` of all rows, ``[C, A, B]``."""
         count, _, _, block = self.core.target.shape
-        found = images(self.core, outer.at[self.span].set(x))
-        return found * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
+        rows = images(self.core, outer.at[self.span].set(x))
+        return rows * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
 
     def best(self, image: jax.Array) -> tuple[jax.Array, jax.Array]:
         rank = jnp.argmax(self.sign * image, axis=1).astype(jnp.int32)
@@ -98,7 +98,7 @@ class State(NamedTuple):
     high: jax.Array
     guessed: jax.Array
     proven: jax.Array
-    near: jax.Array  # how little values move before a guess
+    threshold: jax.Array  # how little values move before a guess
     wide: jax.Array  # how far a guess is above
     since: jax.Array
     steps: jax.Array
@@ -161,13 +161,13 @@ def _risen(problem: Problem, s: State) -> State:
     proven = s.guessed & jnp.all(high[span] <= s.high[span])
     crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
     failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
-    near = jnp.where(failed, s.near * _FINER, s.near)
+    threshold = jnp.where(failed, s.threshold * _FINER, s.threshold)
     wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
-    guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
+    guess = (~s.guessed | failed) & (moved <= jnp.maximum(threshold, 4 * unit))
     high = jnp.where(guess, _above(problem, low, high, wide), high)
     guessed = guess | (s.guessed & ~failed)
     since = jnp.where(guess, 0, s.since + 1)
-    return State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
+    return State(low, high, guessed, proven, threshold, wide, since, s.steps + 1, moved)
 
 
 # --- policy iteration ---------------------------------------------------------------------------
@@ -197,9 +197,9 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     def improve(p: _Policy) -> _Policy:
         timing = (p.rounds == 1) | p.done
         residual = _of(p.rank, problem.image(middle, p.value)) + sign * p.extra - p.value
-        found = problem.system(p.rank).solve(jnp.where(timing, 1, residual))
-        time = jnp.where(timing, found, p.time)
-        value = jnp.where(timing, p.value, p.value + found)
+        solution = problem.system(p.rank).solve(jnp.where(timing, 1, residual))
+        time = jnp.where(timing, solution, p.time)
+        value = jnp.where(timing, p.value, p.value + solution)
         extra = jnp.where(p.rounds == 1, _extra(problem, value, time), p.extra)
         now = problem.image(middle, value)
         rank, optimum = problem.best(now)
@@ -236,19 +236,17 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
 def _proven(problem: Problem, state: State, high: jax.Array, p: _Policy) -> State:
     """Bounds certified by the last policy; the unchanged state if it proves none."""
     core, span, sign, time = problem.core, problem.span, problem.sign, p.time
-    far, near = p.value, p.value - sign * 1.5 * p.extra * time
-    outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
-    beyond = sign * far - sign * problem.best(problem.image(outer_far, far))[1]
-    attained = sign * _of(p.rank, problem.image(outer_near, near)) - sign * near
+    bound, attained = p.value, p.value - sign * 1.5 * p.extra * time
+    outer_bound, outer_attained = (high, state.low) if sign > 0 else (state.low, high)
+    beyond = sign * bound - sign * problem.best(problem.image(outer_bound, bound))[1]
+    gain = sign * _of(p.rank, problem.image(outer_attained, attained)) - sign * attained
     # Known values, and places without a node, which have the value 0.
     fixed = (problem.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
-    far, near = (jnp.where(fixed, problem.put, y) for y in (far, near))
-    slack = problem.unit * jnp.abs(far) * 2 + problem.least
+    bound, attained = (jnp.where(fixed, problem.put, y) for y in (bound, attained))
+    slack = problem.unit * jnp.abs(bound) * 2 + problem.least
     onward = time - problem.system(p.rank).image(jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
-    proven = jnp.all(
-        fixed | ((beyond >= slack) & (attained >= slack) & (time >= 0) & (onward >= 0.5))
-    )
-    low, top = (near, far) if sign > 0 else (far, near)
+    proven = jnp.all(fixed | ((beyond >= slack) & (gain >= slack) & (time >= 0) & (onward >= 0.5)))
+    low, top = (attained, bound) if sign > 0 else (bound, attained)
     proven, low = proven & jnp.all(top >= 0), jnp.maximum(low, 0)
     width = problem.tolerance * top if problem.relative else problem.tolerance
     good = proven & jnp.all(top - low <= width)
@@ -292,5 +290,5 @@ def _extra(problem: Problem, value: jax.Array, time: jax.Array) -> jax.Array:
         some = (value > SLACK * problem.least) & (problem.keep > 0)
         share = jnp.min(jnp.where(some, value / time, jnp.inf))
         share = jnp.where(jnp.isfinite(share), share, 1)
-    most = jnp.maximum(jnp.max(jnp.abs(value)), 1e-30)
-    return jnp.maximum(_AIM * problem.tolerance * share, 32 * problem.unit * most)
+    largest = jnp.maximum(jnp.max(jnp.abs(value)), 1e-30)
+    return jnp.maximum(_AIM * problem.tolerance * share, 32 * problem.unit * largest)

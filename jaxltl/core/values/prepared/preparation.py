@@ -187,9 +187,9 @@ def prepare(
             reduce_reachability(host, target, maximize=objective == "max", stay=stay), None
         )
     else:
-        kept = host.over_choices(np.maximum, cost) > 0
+        earning = host.over_choices(np.maximum, cost) > 0
         plan = plan_optimum(
-            reduce_total_reward(host, cost, target, maximize=objective == "max", kept=kept), cost
+            reduce_total_reward(host, cost, target, maximize=objective == "max", kept=earning), cost
         )
     return _prepared(host, plan, cost, objective)
 

@@ -145,15 +145,17 @@ def _solve(
 ) -> Solution:
     tolerance = jnp.asarray(tolerance, prepared.probability.dtype)
     finite, valid = _checked_numbers(prepared, probability, reward)
-    given = _given_policy(prepared, policy) if prepared.objective == "policy" else None
-    decided = None if given is None else _decided(prepared, reward, given)
-    if given is not None:
-        finite, valid = finite & given.finite, valid & given.valid
-    prepared = _filled(prepared, probability, reward, None if given is None else given.weight)
-    found = _enclosed(prepared, decided, tolerance, max_steps)
-    value = _attached(prepared, found, decided)
-    solution = _answer(prepared, found._replace(value=value), decided, tolerance, (finite, valid))
-    return solution if given is None else replace(solution, policy=given.policy)
+    weights = _given_policy(prepared, policy) if prepared.objective == "policy" else None
+    decided = None if weights is None else _decided(prepared, reward, weights)
+    if weights is not None:
+        finite, valid = finite & weights.finite, valid & weights.valid
+    prepared = _filled(prepared, probability, reward, None if weights is None else weights.weight)
+    enclosure = _enclosed(prepared, decided, tolerance, max_steps)
+    value = _attached(prepared, enclosure, decided)
+    solution = _answer(
+        prepared, enclosure._replace(value=value), decided, tolerance, (finite, valid)
+    )
+    return solution if weights is None else replace(solution, policy=weights.policy)
 
 
 class _GivenPolicy(NamedTuple):
@@ -236,12 +238,12 @@ class _Decided(NamedTuple):
     infinite: jax.Array
 
 
-def _decided(prepared: Prepared, reward: _Maybe, given: _GivenPolicy) -> _Decided:
+def _decided(prepared: Prepared, reward: _Maybe, weights: _GivenPolicy) -> _Decided:
     """Places where the value of a policy is 0, 1 or infinite."""
     size = prepared.size
     earned = prepared.reward if reward is None else reward
-    paid = jnp.zeros(prepared.num_rows, bool) if earned is None else given.used & (earned > 0)
-    used = jnp.concatenate([given.used[prepared.entry_row], paid, jnp.asarray([True, False])])
+    paid = jnp.zeros(prepared.num_rows, bool) if earned is None else weights.used & (earned > 0)
+    used = jnp.concatenate([weights.used[prepared.entry_row], paid, jnp.asarray([True, False])])
     support = tuple(used[x.source] for x in prepared.segments)
     goal = size if prepared.question == "probability" else size + 1
     seed = jnp.zeros(size + 3, bool).at[goal].set(True)
@@ -316,10 +318,10 @@ def _enclosed_cycles(
     down, up = (partial(one_sweep, rounding=x) for x in ((1 - unit, -least), (1 + unit, least)))
 
     def enclosed(core: Blocks, fixed: tuple[jax.Array, jax.Array], *numbers: jax.Array) -> State:
-        tolerance, low, high, most = numbers
+        tolerance, low, high, limit = numbers
         relative = prepared.question == "reward"
         problem = Problem(core, maximize, fixed, unit, least, tolerance, relative)
-        return enclose_cycles(problem, low, high, most)
+        return enclose_cycles(problem, low, high, limit)
 
     # How much work it is depends on the lane.
     s = sequential_vmap(
@@ -347,13 +349,13 @@ def _enclosed_cycles(
 
 
 def _attached(
-    prepared: Prepared, found: _Found | None, decided: _Decided | None = None
+    prepared: Prepared, enclosure: _Found | None, decided: _Decided | None = None
 ) -> jax.Array:
     """Values of the places with implicit derivatives; of a chain also their approximation."""
     size, dtype = prepared.size, prepared.probability.dtype
     if not size:
         return jnp.zeros(0, dtype)
-    system = _chosen_rows(prepared, None if found is None else found.rank)
+    system = _chosen_rows(prepared, None if enclosure is None else enclosure.rank)
     one, put = jnp.asarray([1, 0, 0], dtype), jnp.zeros(size, dtype)
     if decided is not None:
         count, _, block = system.target.shape
@@ -365,10 +367,10 @@ def _attached(
 
     fixed = lax.stop_gradient(system)
     solvers: _Solvers = fixed.solve, fixed.transpose_solve
-    if found is None and prepared.cyclic and is_direct(prepared):
+    if enclosure is None and prepared.cyclic and is_direct(prepared):
         solvers = _eliminated(fixed, prepared.nodes)
     solve, transpose = solvers
-    value = solve(lax.stop_gradient(operator(put))) if found is None else found.value
+    value = solve(lax.stop_gradient(operator(put))) if enclosure is None else enclosure.value
     return implicit(operator, value, solve=solve, transpose_solve=transpose)
 
 
@@ -386,18 +388,18 @@ def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
 
 def _answer(
     prepared: Prepared,
-    found: _Found,
+    enclosure: _Found,
     decided: _Decided | None,
     tolerance: jax.Array,
     checks: tuple[jax.Array, jax.Array],
 ) -> Solution:
     """The solution; checked at the nodes, which may be far fewer than the states."""
     finite, valid = checks
-    dtype, size, value = prepared.probability.dtype, prepared.size, found.value
+    dtype, size, value = prepared.probability.dtype, prepared.size, enclosure.value
     relative = prepared.question == "reward"
-    most = jnp.inf if relative else 1.0
-    value = value + lax.stop_gradient(jnp.clip(value, 0, most) - value)
-    lower, upper = found.lower, jnp.minimum(found.upper, most)
+    highest = jnp.inf if relative else 1.0
+    value = value + lax.stop_gradient(jnp.clip(value, 0, highest) - value)
+    lower, upper = enclosure.lower, jnp.minimum(enclosure.upper, highest)
     if decided is not None:
         keep, put, infinite = (x[:size] for x in decided)
         known = jnp.where(infinite, jnp.inf, put.astype(dtype))
@@ -407,7 +409,7 @@ def _answer(
     floor = 1e3 * SLACK * _rounding(prepared)[1]  # what rewards of zero are known to
     narrow = jnp.all((width <= tolerance * scale + floor) & (lower <= upper))
     finite &= jnp.all(~jnp.isnan(lax.stop_gradient(value)))
-    status = status_code(found.proven & narrow, finite, found.proven, valid=valid | ~finite)
+    status = status_code(enclosure.proven & narrow, finite, enclosure.proven, valid=valid | ~finite)
     good = valid & finite
 
     def everywhere(x: jax.Array, bad: float) -> jax.Array:
@@ -417,9 +419,9 @@ def _answer(
         value=everywhere(value, jnp.nan),
         lower=everywhere(lower, -jnp.inf),
         upper=everywhere(upper, jnp.inf),
-        policy=_policy(prepared, found),
-        residual=jnp.where(good, found.residual, jnp.nan),
-        num_steps=found.steps,
+        policy=_policy(prepared, enclosure),
+        residual=jnp.where(good, enclosure.residual, jnp.nan),
+        num_steps=enclosure.steps,
         status=status,
     )
 
@@ -430,12 +432,12 @@ def _at_states(prepared: Prepared, x: jax.Array) -> jax.Array:
     return jnp.concatenate([x, ends]).at[prepared.place].get(mode="promise_in_bounds")
 
 
-def _policy(prepared: Prepared, found: _Found) -> jax.Array:
+def _policy(prepared: Prepared, enclosure: _Found) -> jax.Array:
     """An optimal policy, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
-    if found.rank is None or not names.shape[0]:
+    if enclosure.rank is None or not names.shape[0]:
         return prepared.row
-    chosen = chosen_names(names, found.rank, prepared.choices)
+    chosen = chosen_names(names, enclosure.rank, prepared.choices)
     own = prepared.own
     rows = jnp.where(own >= 0, chosen[jnp.maximum(own, 0)], prepared.row)
     return rows if prepared.cycles is None else _towards_exits(prepared, prepared.cycles, rows)
@@ -497,24 +499,28 @@ def _evaluate(
 def _eliminated(system: Chosen, nodes: jax.Array) -> _Solvers:
     """Solvers of a system and of its transpose by a dense inverse on its nodes."""
     count, _, block = system.target.shape
-    size, most = count * block, nodes.shape[0]
-    number = jnp.full(size + 3, most, jnp.int32).at[nodes].set(jnp.arange(most, dtype=jnp.int32))
+    size, num_nodes = count * block, nodes.shape[0]
+    number = (
+        jnp.full(size + 3, num_nodes, jnp.int32)
+        .at[nodes]
+        .set(jnp.arange(num_nodes, dtype=jnp.int32))
+    )
     target, weight = (
         jnp.moveaxis(x, 1, 2).reshape(size, -1)[nodes] for x in (system.target, system.weight)
     )
-    rows = jnp.arange(most, dtype=jnp.int32)[:, None]
-    matrix = jnp.eye(most, most + 1, dtype=weight.dtype)
-    matrix = matrix.at[rows, number[target]].add(-weight)[:, :most]
-    found = inverse(matrix)
+    rows = jnp.arange(num_nodes, dtype=jnp.int32)[:, None]
+    matrix = jnp.eye(num_nodes, num_nodes + 1, dtype=weight.dtype)
+    matrix = matrix.at[rows, number[target]].add(-weight)[:, :num_nodes]
+    inverted = inverse(matrix)
 
     def solve(b: jax.Array) -> jax.Array:
         c = b[nodes]
-        x = found @ c
-        return b.at[nodes].set(x + found @ (c - matrix @ x))
+        x = inverted @ c
+        return b.at[nodes].set(x + inverted @ (c - matrix @ x))
 
     def transpose(b: jax.Array) -> jax.Array:
         c = b[nodes]
-        x = c @ found
-        return b.at[nodes].set(x + (c - x @ matrix) @ found)
+        x = c @ inverted
+        return b.at[nodes].set(x + (c - x @ matrix) @ inverted)
 
     return solve, transpose

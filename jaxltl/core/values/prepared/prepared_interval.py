@@ -72,7 +72,7 @@ class PreparedInterval:
       node: ``int32[S]``, of each state.
       policy: ``int32[S]``, rows of states that are no nodes, or of all if a policy was given.
       entry_row: ``int32[T]``, the row of each entry.
-      kept: ``bool[T]``, entries to which nature keeps where values are known.
+      within: ``bool[T]``, entries to which nature keeps where values are known.
       answers: invariants of the preprocessing: entries, questions, their rows, answers.
       lower, upper, reward: ``float[T]``, ``float[T]``, ``float[R]``, as they were.
       question: ``"probability"`` or ``"reward"``, static.
@@ -97,7 +97,7 @@ class PreparedInterval:
     node: Array
     policy: Array
     entry_row: Array
-    kept: Array
+    within: Array
     answers: Array
     lower: Array
     upper: Array
@@ -159,8 +159,8 @@ def prepare_interval(
         mine = cost if policy is None else cost[np.asarray(policy)]
         plan = plan_total_reward(host, mine, target, Query(up, large))
     origin = np.arange(host.mdp.num_rows) if policy is None else np.asarray(policy)
-    found = _prepared(model, cost, host, plan, entry, origin)
-    return replace(found, objective=objective, nature_objective=direction)
+    prepared = _prepared(model, cost, host, plan, entry, origin)
+    return replace(prepared, objective=objective, nature_objective=direction)
 
 
 def _prepared(
@@ -185,9 +185,9 @@ def _prepared(
     mine = concatenated_ranges(mdp.entry_start[rows], count)
     nowhere = whole.num_transitions
     table, target = (np.full((rows.size, width), x, np.int32) for x in (nowhere, size))
-    kept = plan.used[mine]
-    table[place] = np.where(kept, entry[mine], nowhere)
-    target[place] = np.where(kept, node[mdp.successor[mine]], size)
+    used = plan.used[mine]
+    table[place] = np.where(used, entry[mine], nowhere)
+    target[place] = np.where(used, node[mdp.successor[mine]], size)
     owner = node[mdp.state[rows]]
     each = np.bincount(owner, minlength=size)
     rank = np.minimum(np.arange(each.max(initial=1)), each[:, None] - 1)
@@ -198,7 +198,7 @@ def _prepared(
     inside = np.ones(whole.num_transitions, bool)
     inside[entry] = plan.within
     answers = plan.queries
-    found = PreparedInterval(
+    prepared = PreparedInterval(
         table=table,
         target=target,
         owner=owner.astype(np.int32),
@@ -208,7 +208,7 @@ def _prepared(
         node=node.astype(np.int32),
         policy=origin[plan.row].astype(np.int32),
         entry_row=whole.row.astype(np.int32),
-        kept=inside,
+        within=inside,
         answers=(
             entry[answers.entry].astype(np.int32),
             answers.group.astype(np.int32),
@@ -224,7 +224,7 @@ def _prepared(
         num_rows=whole.num_rows,
         has_free_cycles=plan.has_free_cycles,
     )
-    result: PreparedInterval = to_jax(found)
+    result: PreparedInterval = to_jax(prepared)
     return result
 
 
@@ -279,11 +279,13 @@ def _solve(
     contest = _contest(prepared, lower, upper, reward)
     tolerance = jnp.asarray(tolerance, lower.dtype)
     if prepared.size:
-        found = sequential_vmap(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
+        bounds = sequential_vmap(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
     else:
         none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
-        found = Bounds(none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0))
-    return _answer(prepared, contest, found, (lower, upper), tolerance, (finite, valid))
+        bounds = Bounds(
+            none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0)
+        )
+    return _answer(prepared, contest, bounds, (lower, upper), tolerance, (finite, valid))
 
 
 def _checked(
@@ -312,14 +314,14 @@ def _checked(
                 indices_are_sorted=True,
             )
             ends = high[entry]
-            given = parts(ends)
+            mass = parts(ends)
             # A sum near one has the right sign if no addition rounds, and the same one if nothing
             # has changed; else it does not tell.
             grain = 1 / float(jnp.finfo(low.dtype).eps)
             coarse = parts(jnp.where(ends * grain == jnp.floor(ends * grain), 0, 1)) == 0
             same = parts(jnp.where(ends == prepared.upper[entry], 0, 1)) == 0
-            clear = jnp.abs(given - 1) > rounding(width, low.dtype)
-            valid &= jnp.all(same | ((clear | coarse) & ((given >= 1) == room)))
+            clear = jnp.abs(mass - 1) > rounding(width, low.dtype)
+            valid &= jnp.all(same | ((clear | coarse) & ((mass >= 1) == room)))
     if reward is not None:
         finite &= jnp.all(jnp.isfinite(reward))
         valid &= jnp.all(reward >= 0) & jnp.all((reward > 0) == (prepared.reward > 0))
@@ -352,7 +354,7 @@ def _contest(prepared: PreparedInterval, lower: Array, upper: Array, reward: Arr
 def _answer(
     prepared: PreparedInterval,
     contest: Contest,
-    found: Bounds,
+    bounds: Bounds,
     ends: tuple[jax.Array, jax.Array],
     tolerance: jax.Array,
     checks: tuple[jax.Array, jax.Array],
@@ -360,20 +362,21 @@ def _answer(
     """The solution at the states."""
     (lower, upper), (finite, valid) = ends, checks
     is_reward, dtype = contest.relative, contest.lower.dtype
-    near, far, middle = found.lower, found.upper, found.middle
-    most = jnp.inf if is_reward else 1.0
+    middle = bounds.middle
+    highest = jnp.inf if is_reward else 1.0
     sign = -1 if is_reward else 1
-    low, high = (sign * x for x in ((far, near) if is_reward else (near, far)))
-    sure = found.lower_proven, found.upper_proven
+    ends = (bounds.upper, bounds.lower) if is_reward else (bounds.lower, bounds.upper)
+    low, high = (sign * x for x in ends)
+    sure = bounds.lower_proven, bounds.upper_proven
     sure = sure[::-1] if is_reward else sure
-    low = jnp.where(sure[0], jnp.clip(low, 0, most), 0)
-    high = jnp.where(sure[1], jnp.clip(high, 0, most), most)
+    low = jnp.where(sure[0], jnp.clip(low, 0, highest), 0)
+    high = jnp.where(sure[1], jnp.clip(high, 0, highest), highest)
     middle = jnp.clip(sign * middle, low, high)
     residual = jnp.max(jnp.abs(_image(contest, middle, sign) - middle), initial=0)
-    value = _attached(contest, found, middle, sign) if prepared.size else middle
+    value = _attached(contest, bounds, middle, sign) if prepared.size else middle
     scale = jnp.where(jnp.isfinite(high), high, 1) if is_reward else 1.0
     narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
-    proven = found.lower_proven & found.upper_proven
+    proven = bounds.lower_proven & bounds.upper_proven
     small = residual <= tolerance * jnp.max(jnp.abs(middle), initial=1 if not is_reward else 0)
     valid |= ~finite  # NaN and infinity have the status NONFINITE
     finite &= jnp.all(jnp.isfinite(lax.stop_gradient(middle)))
@@ -387,13 +390,13 @@ def _answer(
 
     row, free = prepared.policy, upper - lower
     if prepared.size:
-        mine = jnp.append(prepared.row[found.row], 0)[jnp.minimum(prepared.node, prepared.size)]
+        mine = jnp.append(prepared.row[bounds.row], 0)[jnp.minimum(prepared.node, prepared.size)]
         row = jnp.where(prepared.node < prepared.size, mine, row)
-    room = prepared.sum_rows(jnp.where(prepared.kept, free, 0))
+    room = prepared.sum_rows(jnp.where(prepared.within, free, 0))
     rest = jnp.maximum(1 - prepared.sum_rows(lower), 0)
     share = jnp.where(room > 0, jnp.minimum(rest / jnp.where(room > 0, room, 1), 1), 0)
-    chance = jnp.where(prepared.kept, lower + free * share[prepared.entry_row], 0)
-    chance = chance.at[prepared.table].set(found.probability, mode="drop")
+    chance = jnp.where(prepared.within, lower + free * share[prepared.entry_row], 0)
+    chance = chance.at[prepared.table].set(bounds.probability, mode="drop")
     return Solution(
         value=everywhere(value, jnp.nan),
         policy=row,
@@ -401,7 +404,7 @@ def _answer(
         lower=everywhere(low, -jnp.inf),
         upper=everywhere(high, jnp.inf),
         residual=jnp.where(good, residual, jnp.nan),
-        num_steps=found.rounds,
+        num_steps=bounds.rounds,
         status=status,
         method="policy iteration with nature",
     )
@@ -416,9 +419,9 @@ def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
     return lax.stop_gradient(x + sign * best)
 
 
-def _attached(contest: Contest, found: Bounds, value: jax.Array, sign: int) -> jax.Array:
+def _attached(contest: Contest, bounds: Bounds, value: jax.Array, sign: int) -> jax.Array:
     """Values with implicit derivatives, policy and order of successors held fixed."""
-    row, target = found.row, contest.target[found.row]
+    row, target = bounds.row, contest.target[bounds.row]
     value = lax.stop_gradient(value)
     key = lax.stop_gradient(contest.ahead(sign * value))[row]
     p = greedy_distributions(contest.lower[row], contest.upper[row], contest.key(key))

@@ -65,8 +65,8 @@ def exact_steps(
     for _ in range(num_steps):
         value = _backup(mdp, value, objective)
         if stay is not None:
-            kept = zip(target, stay, value, strict=True)
-            value = [Fraction(1) if t else x if s else Fraction(0) for t, s, x in kept]
+            states = zip(target, stay, value, strict=True)
+            value = [Fraction(1) if t else x if s else Fraction(0) for t, s, x in states]
     return _bounds(value)
 
 
@@ -121,6 +121,6 @@ def _row(mdp: HostMDP, number: int) -> dict[int, Fraction]:
 
 def _rounded(number: Fraction, direction: int) -> float:
     """The double next to a fraction, not above it (-1) or not below it (1)."""
-    found = float(number)
-    beyond = (Fraction(found) - number) * direction < 0
-    return math.nextafter(found, direction * math.inf) if beyond else found
+    nearest = float(number)
+    beyond = (Fraction(nearest) - number) * direction < 0
+    return math.nextafter(nearest, direction * math.inf) if beyond else nearest

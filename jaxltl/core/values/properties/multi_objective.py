@@ -65,12 +65,12 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
 
     if path.operator not in ("F", "G", "U") or not all(is_boolean(f) for f in path.operands):
         return {"formula": path}
-    left, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))
+    stay, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))
     if path.operator == "G":
         return {"avoid": ~right}
     if path.operator == "F":
         return {"target": right}
-    return {"target": right, "stay": left}
+    return {"target": right, "stay": stay}
 
 
 def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:

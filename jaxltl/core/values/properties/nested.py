@@ -64,8 +64,8 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
         return _at(answer, 0)
     if kind in ("min", "max"):
         place, best = (np.argmin, np.min) if kind == "min" else (np.argmax, np.max)
-        found = best(lower), best(value), best(upper)
-        return _number(prop, _at(answer, int(place(value))), found, tolerance)
+        numbers = best(lower), best(value), best(upper)
+        return _number(prop, _at(answer, int(place(value))), numbers, tolerance)
     whole = answer._replace(states=np.array([-1]), strategy=None)
     if answer.holds is not None:
         return _truth(whole, kind, answer.holds)
@@ -104,23 +104,23 @@ def _truth(answer: Answer, kind: str | None, holds: list[bool | None]) -> Answer
         return answer._replace(value=low, lower=low, upper=high, holds=None, status=status)
     decided = sure > 0 if kind == "exists" else sure + open_ < len(holds)
     # A true one decides "exists", a false one "forall".
-    found = (kind == "exists") if decided else None if open_ else (kind == "forall")
-    bounds = (np.array([float(x)]) for x in (found is True, found is not False))
+    verdict = (kind == "exists") if decided else None if open_ else (kind == "forall")
+    bounds = (np.array([float(x)]) for x in (verdict is True, verdict is not False))
     lower, upper = bounds
-    status = Status.PRECISION if found is None else Status.CONVERGED
-    return answer._replace(value=lower, lower=lower, upper=upper, holds=[found], status=status)
+    status = Status.PRECISION if verdict is None else Status.CONVERGED
+    return answer._replace(value=lower, lower=lower, upper=upper, holds=[verdict], status=status)
 
 
 def _number(
-    prop: Property, answer: Answer, found: tuple[float, float, float], tolerance: float
+    prop: Property, answer: Answer, numbers: tuple[float, float, float], tolerance: float
 ) -> Answer:
     """An answer of one number with its bounds."""
-    lower, value, upper = (np.array([float(x)]) for x in found)
+    lower, value, upper = (np.array([float(x)]) for x in numbers)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0.0, upper - lower)[0]
     relative = prop.operator in ("R", "T") or isinstance(tolerance, RelativeTolerance)
-    scale = max(abs(found[0]), abs(found[2])) if relative else 1.0
+    scale = max(abs(numbers[0]), abs(numbers[2])) if relative else 1.0
     # Rounding of the aggregate itself is not counted.
-    narrow = width <= tolerance * scale + 1e-14 * abs(found[1])
+    narrow = width <= tolerance * scale + 1e-14 * abs(numbers[1])
     status = answer.status if narrow else max(answer.status, Status.PRECISION)
     return answer._replace(value=value, lower=lower, upper=upper, status=status)

@@ -54,14 +54,14 @@ class Question:
         """Half the width to ask for, a little less: bounds have to be as narrow as is wanted."""
         return 0.49 * wanted * part
 
-    def answer(self, found: Solution, wanted: float) -> Answer:
+    def answer(self, solution: Solution, wanted: float) -> Answer:
         """The answer of a solution."""
         names = ("value", "lower", "upper")
-        small: dict[str, Array] = {name: self.taken(getattr(found, name)) for name in names}
+        small: dict[str, Array] = {name: self.taken(getattr(solution, name)) for name in names}
         nobody: Array = np.zeros(0, np.int32)
-        solution = replace(found, **small, policy=nobody, status=on_host(found.status))
+        answer = replace(solution, **small, policy=nobody, status=on_host(solution.status))
         method = "interval iteration" if self.goes_on else "policy iteration by a Krylov method"
-        return as_answer(self.prop, self.states, solution, wanted, f"{method} on the mesh")
+        return as_answer(self.prop, self.states, answer, wanted, f"{method} on the mesh")
 
     def is_answered(self, answer: Answer, part: float) -> bool:
         """True if the answer needs no narrower bounds of those in :data:`FINER`."""
@@ -113,13 +113,13 @@ def _path(prop: Property) -> Formula:
     path = prop.path
     if prop.operator in ("P", "R", "T") and isinstance(path, Formula):
         return path
-    what = {
+    quantity = {
         "LRA": "averages in the long run",
         "multi": "several objectives",
         "P": "bounds on steps or rewards",
     }.get(prop.operator, f"rewards [ {path} ]")
     raise ValueError(
-        f"{prop.text}: {what} are not solved for over a mesh; probabilities of formulas are, and "
+        f"{prop.text}: {quantity} are not solved for over a mesh; probabilities of formulas are, and "
         "expected rewards and steps until a state is reached (F). Leave --mesh out for this one."
     )
 
@@ -163,16 +163,18 @@ def _objective(model: ShardedMDP, prop: Property) -> str:
 def _starts(model: ShardedMDP) -> jax.Array:
     """Positions of the initial states in order; on every device."""
     number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
-    found = _everywhere(model, lambda x: jnp.flatnonzero(x > 0, size=number), model.initial)
-    order = np.argsort(on_host(_pick(model, model.number, found)), kind="stable")
-    return _everywhere(model, lambda x: x[order], found)
+    positions = _everywhere(model, lambda x: jnp.flatnonzero(x > 0, size=number), model.initial)
+    order = np.argsort(on_host(_pick(model, model.number, positions)), kind="stable")
+    return _everywhere(model, lambda x: x[order], positions)
 
 
-def _everywhere(model: ShardedMDP, function: Callable[..., jax.Array], *given: PyTree) -> jax.Array:
+def _everywhere(
+    model: ShardedMDP, function: Callable[..., jax.Array], *arrays: PyTree
+) -> jax.Array:
     """The result of a function of arrays, on every device."""
     whole = NamedSharding(model.mesh, PartitionSpec())
-    found: jax.Array = jax.jit(function, out_shardings=whole)(*given)
-    return found
+    result: jax.Array = jax.jit(function, out_shardings=whole)(*arrays)
+    return result
 
 
 def _pick(model: ShardedMDP, quantity: jax.Array, *index: jax.Array) -> jax.Array:

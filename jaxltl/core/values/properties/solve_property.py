@@ -155,9 +155,11 @@ def solve_property(
     width = RelativeTolerance if relative else float
     if prop.operator == "multi":
         if states is not None or isinstance(model, IntervalMDP):
-            what = "from other than the initial states" if states is not None else "with intervals"
+            restriction = (
+                "from other than the initial states" if states is not None else "with intervals"
+            )
             raise ValueError(
-                f"{prop.text}: multi(...) is not supported {what}; ask for one objective at a time."
+                f"{prop.text}: multi(...) is not supported {restriction}; ask for one objective at a time."
             )
         return solve_multi_objective(model, prop, tolerance)
     if prop.aggregate is not None:
@@ -167,22 +169,22 @@ def solve_property(
     states = starting_states(model, states)
     tolerance = requested_width(tolerance)
     solve = partial(_solved, _Query(model, states, prop.text), prop, _aim(model, prop))
-    found = solve(width(tolerance))
+    result = solve(width(tolerance))
     if prop.relation is None:
-        answer = _answer(prop, states, found, None, width(tolerance))
+        answer = _answer(prop, states, result, None, width(tolerance))
         least = answer.lower.min()
         if relative and answer.status == Status.PRECISION and 0 < least < 1:
             # A complementary event: its width is relative to the other probability.
-            found = solve(width(tolerance * least / 2))
-            answer = _answer(prop, states, found, None, width(tolerance))
+            result = solve(width(tolerance * least / 2))
+            answer = _answer(prop, states, result, None, width(tolerance))
         return answer
-    verdicts = _verdicts(prop, found)
+    verdicts = _verdicts(prop, result)
     for share in FINER[1:]:
-        if None not in verdicts or _is_exact(found):
+        if None not in verdicts or _is_exact(result):
             break
-        found = solve(width(tolerance * share))
-        verdicts = _verdicts(prop, found)
-    return _answer(prop, states, found, verdicts, tolerance)
+        result = solve(width(tolerance * share))
+        verdicts = _verdicts(prop, result)
+    return _answer(prop, states, result, verdicts, tolerance)
 
 
 def _filter(
@@ -209,44 +211,44 @@ def as_answer(
     prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
 ) -> Answer:
     """The answer of a solution at the requested states, without a strategy."""
-    found = _Found(replace(solution, method=method), None)
-    holds = None if prop.relation is None else _verdicts(prop, found)
-    return _answer(prop, states, found, holds, tolerance)
+    result = _Found(replace(solution, method=method), None)
+    holds = None if prop.relation is None else _verdicts(prop, result)
+    return _answer(prop, states, result, holds, tolerance)
 
 
 def _answer(
     prop: Property,
     states: np.ndarray,
-    found: _Found,
+    result: _Found,
     holds: list[bool | None] | None,
     tolerance: float,
 ) -> Answer:
     value, lower, upper = (
         np.asarray(x, np.float64)
-        for x in (found.solution.value, found.solution.lower, found.solution.upper)
+        for x in (result.solution.value, result.solution.lower, result.solution.upper)
     )
     if holds is None:
-        status = _status(prop, found, tolerance)
+        status = _status(prop, result, tolerance)
     else:
         status = Status.PRECISION if None in holds else Status.CONVERGED
-    method = found.solution.method
-    return Answer(states, value, lower, upper, holds, status, method, found.strategy)
+    method = result.solution.method
+    return Answer(states, value, lower, upper, holds, status, method, result.strategy)
 
 
-def _status(prop: Property, found: _Found, tolerance: float) -> Status:
+def _status(prop: Property, result: _Found, tolerance: float) -> Status:
     """CONVERGED if the bounds at the requested states are within the tolerance."""
-    lower, upper = found.solution.lower, found.solution.upper
-    status = Status(int(np.max(found.solution.status)))
+    lower, upper = result.solution.lower, result.solution.upper
+    status = Status(int(np.max(result.solution.status)))
     if np.isnan(lower).any() or np.isnan(upper).any() or status == Status.INVALID:
         return max(status, Status.NONFINITE)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0, upper - lower)
-        most: Array = tolerance
+        limit: Array = tolerance
         relative = isinstance(tolerance, RelativeTolerance)
         if prop.operator in ("R", "T") or relative:
-            most = tolerance * np.maximum(np.abs(lower), np.abs(upper))
-            most = most if relative else np.maximum(most, TINY)
-        narrow = (width == 0) | ((width <= most) & np.isfinite(width))
+            limit = tolerance * np.maximum(np.abs(lower), np.abs(upper))
+            limit = limit if relative else np.maximum(limit, TINY)
+        narrow = (width == 0) | ((width <= limit) & np.isfinite(width))
     # An average near zero is narrow as a share of the rewards that cancel out in it.
     proven_narrow = prop.path == Earned("average") and status == Status.CONVERGED
     if narrow.all() or proven_narrow:
@@ -254,13 +256,13 @@ def _status(prop: Property, found: _Found, tolerance: float) -> Status:
     return max(status, Status.PRECISION)
 
 
-def _is_exact(found: _Found) -> bool:
-    return bool((found.solution.lower == found.solution.upper).all())
+def _is_exact(result: _Found) -> bool:
+    return bool((result.solution.lower == result.solution.upper).all())
 
 
-def _verdicts(prop: Property, found: _Found) -> list[bool | None]:
+def _verdicts(prop: Property, result: _Found) -> list[bool | None]:
     assert prop.relation is not None and prop.threshold is not None
-    lower, upper = np.asarray(found.solution.lower), np.asarray(found.solution.upper)
+    lower, upper = np.asarray(result.solution.lower), np.asarray(result.solution.upper)
     return [
         meets(prop.relation, prop.threshold, low, high)
         for low, high in zip(lower.tolist(), upper.tolist(), strict=True)
@@ -338,7 +340,7 @@ def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Foun
         elif prop.operator == "T":
             reward = np.ones(model.num_rows)
         average = average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
-        return query.found(replace(average, method=_AVERAGE))
+        return query.result(replace(average, method=_AVERAGE))
     reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
     target = None
     if isinstance(path, Formula):
@@ -346,10 +348,10 @@ def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Foun
     elif isinstance(path, Earned) and path.steps is not None:
         cumulative = path.kind == "cumulative"
         solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
-        return query.found(solve(model, reward, path.steps, **aim.directions), by="steps")
+        return query.result(solve(model, reward, path.steps, **aim.directions), by="steps")
     else:
         model = _without_intervals(model, prop.text, "rewards for ever (C)")
-    return query.found(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
+    return query.result(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
 
 
 def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
@@ -358,13 +360,13 @@ def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
 
 
 def _without_intervals(
-    model: SparseMDP | IntervalMDP, prop: Property | str, what: str
+    model: SparseMDP | IntervalMDP, prop: Property | str, quantity: str
 ) -> SparseMDP:
     """The model, if it is not an interval model."""
     if not isinstance(model, IntervalMDP):
         return model
     raise ValueError(
-        f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
+        f"{prop}: {quantity} are not solved for where probabilities are intervals; solved for are "
         "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
         "steps (C<=k) and after them (I=k). Ask for one of these, or give model.nominal, which is "
         "one choice of nature."
@@ -381,7 +383,7 @@ class _Query(NamedTuple):
     def where(self, condition: Formula) -> np.ndarray:
         return states_satisfying(_graph(self.model), condition, self.text)
 
-    def found(self, solution: Solution, by: str = "") -> _Found:
+    def result(self, solution: Solution, by: str = "") -> _Found:
         """A solution at all states, at those that are asked for."""
         method = {"steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
         nature = None if solution.nature is None else np.asarray(solution.nature)
@@ -389,18 +391,20 @@ class _Query(NamedTuple):
         solution = replace(solution, method=solution.method or method)
         return _Found(at_states(solution, self.states), strategy)
 
-    def exact(self, found: _Found, tolerance: float, solve: Callable[..., Bounds | None]) -> _Found:
+    def exact(
+        self, result: _Found, tolerance: float, solve: Callable[..., Bounds | None]
+    ) -> _Found:
         """The solution with bounds by rational arithmetic, if these are asked for and possible."""
         if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
-            return found
+            return result
         bounds = solve(self.model.host)
         if bounds is None:
-            return found
+            return result
         lower, upper = (x[self.states] for x in bounds)
         solution = replace(
-            found.solution, value=lower, lower=lower, upper=upper, method="rational arithmetic"
+            result.solution, value=lower, lower=lower, upper=upper, method="rational arithmetic"
         )
-        return found._replace(solution=solution)
+        return result._replace(solution=solution)
 
     def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
         """The probability of a path formula; simple ones need no automaton."""
@@ -412,23 +416,23 @@ class _Query(NamedTuple):
             return self.opposite(path.operands[0], aim, tolerance)
         if not all(is_boolean(f) for f in path.operands):
             return self.automaton(path, aim, tolerance)
-        left, right = path.operands[0], path.operands[-1]
+        first, right = path.operands[0], path.operands[-1]
         match path.operator:
             case "X":
                 target = self.where(right)
                 solution = bounded.next_probability(self.model, target, **aim.directions)
                 exact = partial(exact_steps, target=target, objective=aim.policy)
-                return self.exact(self.found(solution), tolerance, exact)
+                return self.exact(self.result(solution), tolerance, exact)
             case "F":
                 return self.until(TRUE, right, aim, tolerance)
             case "U":
-                return self.until(left, right, aim, tolerance)
+                return self.until(first, right, aim, tolerance)
             case "G":
                 return self.opposite(Formula("F", (~right,)), aim, tolerance)
             case "W":
-                return self.opposite(Formula("U", (~right, ~left & ~right)), aim, tolerance)
+                return self.opposite(Formula("U", (~right, ~first & ~right)), aim, tolerance)
             case "R":
-                return self.opposite(Formula("U", (~left, ~right)), aim, tolerance)
+                return self.opposite(Formula("U", (~first, ~right)), aim, tolerance)
         raise AssertionError(path.operator)
 
     def at_once(self, path: Formula) -> _Found:
@@ -440,12 +444,12 @@ class _Query(NamedTuple):
         )
 
     def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
-        found = self.probability(path, aim.opposite, tolerance)
-        return found._replace(solution=complement_event(found.solution))
+        result = self.probability(path, aim.opposite, tolerance)
+        return result._replace(solution=complement_event(result.solution))
 
-    def until(self, left: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Found:
+    def until(self, first: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Found:
         target: Array = self.where(right)
-        stay: Array = None if left == TRUE else self.where(left)
+        stay: Array = None if first == TRUE else self.where(first)
         solution = reachability_probability(
             self.model, target, stay=stay, tolerance=tolerance, **aim.directions
         )
@@ -453,7 +457,7 @@ class _Query(NamedTuple):
         exact = partial(
             exact_reachability, target=target, stay=stay, policy=policy, objective=aim.policy
         )
-        return self.exact(self.found(solution), tolerance, exact)
+        return self.exact(self.result(solution), tolerance, exact)
 
     def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Found:
         result = optimal_satisfaction(
@@ -478,7 +482,7 @@ class _Query(NamedTuple):
             solution = bounded.reward_bounded_reachability(
                 model, target, path.reward or None, limit, stay=stay, objective=aim.policy
             )
-            return self.found(solution, by="reward")
+            return self.result(solution, by="reward")
         if path.lower or path.upper is None:
             if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
                 raise ValueError(
@@ -492,4 +496,4 @@ class _Query(NamedTuple):
         exact = partial(
             exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
         )
-        return self.exact(self.found(solution, by="steps"), tolerance, exact)
+        return self.exact(self.result(solution, by="steps"), tolerance, exact)

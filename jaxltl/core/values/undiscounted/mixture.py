@@ -75,8 +75,8 @@ def from_starts(model: Product, value: Array) -> np.ndarray:
 def attained(model: Product, policy: Array, over: str, tolerance: float | None = None) -> float:
     """Lower bound of a policy's probability, for the mean or the worst initial state."""
     policy = to_jax(np.asarray(policy, model.dtype))
-    found = satisfaction_probability(model, policy, tolerance=tolerance)
-    return at_starts(model, found.lower, over)[0]
+    solution = satisfaction_probability(model, policy, tolerance=tolerance)
+    return at_starts(model, solution.lower, over)[0]
 
 
 def attained_if_near(model: Product, policy: Array, over: str, probability: float) -> float:
@@ -91,9 +91,9 @@ def attained_if_near(model: Product, policy: Array, over: str, probability: floa
 def certified(model: Product, policy: Array, over: str, probability: float) -> Solution:
     """A policy's satisfaction probability, enclosed as closely as a required one needs."""
     policy = to_jax(np.asarray(policy, model.dtype))
-    found = satisfaction_probability(model, policy, tolerance=_FINE)
-    if at_starts(model, found.lower, over)[0] >= probability:
-        return found
+    solution = satisfaction_probability(model, policy, tolerance=_FINE)
+    if at_starts(model, solution.lower, over)[0] >= probability:
+        return solution
     return satisfaction_probability(model, policy)
 
 
@@ -133,9 +133,9 @@ def least_mixture(
     # The share is below 1 if possible, so that no action of `policy` gets probability 0.
     policy, sure = np.asarray(policy), np.asarray(sure)
     if np.isinf(steps):
-        found = probable_mixture(model, policy, sure, probability, over)
-        close = attained(model, found.policy, over, _FINE)
-        return found._replace(attained=max(found.attained, close))
+        mixture = probable_mixture(model, policy, sure, probability, over)
+        close = attained(model, mixture.policy, over, _FINE)
+        return mixture._replace(attained=max(mixture.attained, close))
     clock, tolerance = StepAnalysis(model), None
 
     def judged(share: float) -> Mixture:
@@ -148,30 +148,30 @@ def least_mixture(
             return Mixture(mixed, share, attained_if_near(model, mixed, over, probability), taken)
         return Mixture(mixed, share, attained(model, mixed, over, tolerance), taken)
 
-    def upper(found: Mixture) -> float:
-        return np.inf if found.steps is None else found.steps.upper
+    def upper(mixture: Mixture) -> float:
+        return np.inf if mixture.steps is None else mixture.steps.upper
 
-    def suffices(found: Mixture) -> bool:
-        return found.attained >= probability and upper(found) <= steps
+    def suffices(mixture: Mixture) -> bool:
+        return mixture.attained >= probability and upper(mixture) <= steps
 
-    found = judged(0)
-    if suffices(found):
-        return found
-    found = judged(1)
+    mixture = judged(0)
+    if suffices(mixture):
+        return mixture
+    mixture = judged(1)
     low, high = 0.0, 1.0
-    aim = probability + min(_AIM, (found.attained - probability) / 64)
+    aim = probability + min(_AIM, (mixture.attained - probability) / 64)
     tolerance = max((aim - probability) / 4, _FINEST)
-    longest = max(steps * (1 - _AIM), upper(found))
+    longest = max(steps * (1 - _AIM), upper(mixture))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         tried = judged(middle)
         if not suffices(tried):
             low = middle
             continue
-        high, found = middle, tried
+        high, mixture = middle, tried
         if (probability > 0 and tried.attained <= aim) or upper(tried) >= longest:
             break
-    return found
+    return mixture
 
 
 def probable_mixture(
@@ -185,8 +185,8 @@ def probable_mixture(
     reached = attained_if_near(model, policy, over, probability)
     if reached >= probability:
         return Mixture(policy, 0.0, reached)
-    found = Mixture(sure, 1.0, attained(model, sure, over))
-    top, excess = found.attained, min(_AIM, (found.attained - probability) / 64)
+    mixture = Mixture(sure, 1.0, attained(model, sure, over))
+    top, excess = mixture.attained, min(_AIM, (mixture.attained - probability) / 64)
     tolerance = max(excess / 4, _FINEST)
     aim = np.log(max(top - probability - excess / 2, _FINEST))
     # Logarithms of 1 - share and of top - probability: the bracket, and the last two mixtures.
@@ -198,7 +198,7 @@ def probable_mixture(
         reached = attained(model, mixed, over, tolerance)
         now = rest, np.log(max(top - reached, _FINEST))
         if reached >= probability:
-            high, found = rest, Mixture(mixed, float(share), reached)
+            high, mixture = rest, Mixture(mixed, float(share), reached)
             if reached <= probability + excess:
                 break
         else:
@@ -208,10 +208,10 @@ def probable_mixture(
         slope = (now[1] - before[1]) / (now[0] - before[0])
         rest, before = now[0] + (aim - now[1]) / slope if slope > 0 else np.nan, now
         # The step is at most to twice the logarithm, and into the bracket; else half of that.
-        end = high if found.share < 1 else max(high, 2 * low - 1)
+        end = high if mixture.share < 1 else max(high, 2 * low - 1)
         if not end < rest < low:
-            rest = end if found.share == 1 else (low + high) / 2
-    return found
+            rest = end if mixture.share == 1 else (low + high) / 2
+    return mixture
 
 
 def _mixed(policy: np.ndarray, sure: np.ndarray, share: float) -> np.ndarray:
@@ -273,9 +273,9 @@ def reaching(
     # If the mixture with `inside` exceeds the required probability by more than a window (because
     # `inside` takes long, so that the smallest share of suboptimal actions matters), the mixture
     # with the fastest optimal policy is tried too.
-    found = least_mixture(model, policy, inside, probability, over=over)
-    if found.share and found.attained > probability + WINDOW:
+    mixture = least_mixture(model, policy, inside, probability, over=over)
+    if mixture.share and mixture.attained > probability + WINDOW:
         quickest = np.eye(model.num_actions)[np.asarray(best.policy)]
         other = least_mixture(model, policy, quickest, probability, over=over)
-        found = other if other.share < found.share else found
-    return found
+        mixture = other if other.share < mixture.share else mixture
+    return mixture

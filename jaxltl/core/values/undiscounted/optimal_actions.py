@@ -132,11 +132,11 @@ def optimal_actions(
     problem = as_reachability(model, objective)
     if solution is None:
         solution = optimal_satisfaction(model, objective=objective, tolerance=goal / 8)
-    found = _certified(
+    actions = _certified(
         model, solution, _conserving(problem, solution, objective), problem, objective, goal
     )
-    if int(found.status) == Status.CONVERGED:
-        return found
+    if int(actions.status) == Status.CONVERGED:
+        return actions
     attaining = _attaining(problem)
     if attaining is not None:
         keeps, bounds = attaining
@@ -173,15 +173,15 @@ def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
 
 def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
     """Actions with an optimistic bound not worse than the pessimistic bound of the state."""
-    near, far = np.asarray(solution.lower, float), np.asarray(solution.upper, float)
+    pessimistic, optimistic = np.asarray(solution.lower, float), np.asarray(solution.upper, float)
     sign = 1
     if objective == "min":
-        near, far, sign = far, near, -1
+        pessimistic, optimistic, sign = optimistic, pessimistic, -1
     sparse = rows_of_model(model)
-    ahead = on_actions(sparse, sparse.host.expectation(far.ravel()), model)
+    ahead = on_actions(sparse, sparse.host.expectation(optimistic.ravel()), model)
     # The model's probabilities may be rounded ones.
-    slack = rounding_unit(model) * np.maximum(ahead, near[..., None])
-    result: Booleans = sign * ahead + slack >= sign * near[..., None]
+    slack = rounding_unit(model) * np.maximum(ahead, pessimistic[..., None])
+    result: Booleans = sign * ahead + slack >= sign * pessimistic[..., None]
     return result
 
 
@@ -192,17 +192,17 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
         return None
     sparse = rows_of_model(problem.model)
     host = sparse.host
-    found = enclose(host, problem.target, problem.objective, 1e-12)
-    keeps = conserving_rows(host, problem.objective, found)
-    decided = found.lower == found.upper
-    slower = attained_by_ties(host, problem.objective, found)
+    enclosure = enclose(host, problem.target, problem.objective, 1e-12)
+    keeps = conserving_rows(host, problem.objective, enclosure)
+    decided = enclosure.lower == enclosure.upper
+    slower = attained_by_ties(host, problem.objective, enclosure)
     if slower is not None:
         more = conserving_rows(host, problem.objective, slower)
         if more.sum() >= keeps.sum() and backward_reachable(host, decided, more).all():
-            keeps, found = more, slower
+            keeps, enclosure = more, slower
     if not backward_reachable(host, decided, keeps).all():
         return None
-    bounds = solution_from_enclosure(problem.model, sparse, found, np.inf, relative=False)
+    bounds = solution_from_enclosure(problem.model, sparse, enclosure, np.inf, relative=False)
     return on_actions(sparse, keeps, problem.model), bounds
 
 

@@ -85,12 +85,12 @@ def policy_reachability(
         return m_matrix_error(rows, solve, solve(one), one, undecided)
 
     start, n = linear.counted(one)
-    found = m_matrix_error(rows, linear.solve, start, one, undecided)
+    enclosure = m_matrix_error(rows, linear.solve, start, one, undecided)
     if eliminable and linear.inverse is None:
         # Without a proof the width is 1, which a loose tolerance admits.
-        narrow = jnp.max(found[2] - found[1]) <= jnp.minimum(goal, 0.5)
-        found = lax.cond(narrow, lambda: found, eliminated)
-    value, lower, upper, residual = lax.stop_gradient(found)
+        narrow = jnp.max(enclosure[2] - enclosure[1]) <= jnp.minimum(goal, 0.5)
+        enclosure = lax.cond(narrow, lambda: enclosure, eliminated)
+    value, lower, upper, residual = lax.stop_gradient(enclosure)
     solution = Solution(
         value=value,
         policy=constant[1],
@@ -104,8 +104,8 @@ def policy_reachability(
         ),
     )
     inverse = None if linear.inverse is None else linear
-    given = ChainSystem(model, policy, undecided)
-    value = with_derivative(value, given, outside=one, inverse=inverse)
+    system_of_policy = ChainSystem(model, policy, undecided)
+    value = with_derivative(value, system_of_policy, outside=one, inverse=inverse)
     solution = replace(lax.stop_gradient(solution), value=value, policy=policy)
     return refuse(solution, checked)
 
@@ -246,8 +246,10 @@ def _tighter(finest: bool, table: None, bounds: _Bounds, search: _Search) -> _Bo
     drop = jnp.max(upper - new)
     rests &= ~failed & (drop <= search.slack / 8)
     moved = (gain > 0) | (drop > 0) | failed
-    found = _Bounds(raised, new, failed, ~moved)
-    return found._replace(ended=~moved | (rests if finest else found.half <= search.goal))
+    bounds_after = _Bounds(raised, new, failed, ~moved)
+    return bounds_after._replace(
+        ended=~moved | (rests if finest else bounds_after.half <= search.goal)
+    )
 
 
 def _followed(search: _Search, lower: jax.Array, action: jax.Array) -> jax.Array:
@@ -303,11 +305,11 @@ def _by_policy_iteration(
         rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
     )
     finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
-    found, leaves = solve_problem(problem, jnp.minimum(requested, finest), requested)
+    solution, leaves = solve_problem(problem, jnp.minimum(requested, finest), requested)
     value, lower, upper = (
-        jnp.where(open_, x, one) for x in (found.value, found.lower, found.upper)
+        jnp.where(open_, x, one) for x in (solution.value, solution.lower, solution.upper)
     )
-    return replace(found, value=value, lower=lower, upper=upper), leaves
+    return replace(solution, value=value, lower=lower, upper=upper), leaves
 
 
 def _by_intervals(

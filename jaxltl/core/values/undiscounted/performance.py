@@ -147,11 +147,13 @@ def _task_performance(
             method="iterative" if math.prod(model.state_shape) > _BLOCK_LIMIT else "auto",
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
-    found = _summarize(model, value, lower, upper, tolerance)
-    nan, worst_state = jnp.nan, found.worst_state
+    performance = _summarize(model, value, lower, upper, tolerance)
+    nan, worst_state = jnp.nan, performance.worst_state
     unknown: list[PyTree] = [nan, 0, 1, nan, 0, 1, worst_state, nan, Status.INVALID]
     result: Performance = jax.tree.map(
-        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)), found, Performance(*unknown)
+        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
+        performance,
+        Performance(*unknown),
     )
     return result
 
@@ -174,10 +176,10 @@ def _summarize(
 
     def mean(x: jax.Array, slack: jax.Array) -> jax.Array:
         # Rounding must not move the mean out of the range.
-        least, most = (
+        least, greatest = (
             f(jnp.where(starts, x, out)) for f, out in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
         )
-        return jnp.clip(jnp.sum(weight * x) + slack, least, most)
+        return jnp.clip(jnp.sum(weight * x) + slack, least, greatest)
 
     return Performance(
         mean=mean(value, 0 * slack),
@@ -243,8 +245,8 @@ def _block_solver(
 def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:
     """``float[Q, S, S]``, the policy's transitions that do not change the memory."""
     steps = jax.vmap(partial(transition_matrix, model.mdp), in_axes=1)(policy)
-    kept = stays.T[:, :, None] if model.label_on == "exit" else stays.T[:, None, :]
-    return jnp.where(kept, steps, 0)
+    inside = stays.T[:, :, None] if model.label_on == "exit" else stays.T[:, None, :]
+    return jnp.where(inside, steps, 0)
 
 
 # --- many worlds ------------------------------------------------------------------------------
@@ -296,8 +298,8 @@ def task_performances(
     require_shape("policies", policies, shape)
     parts: list[PyTree] = [None] * num_worlds(models)
     if models.automaton.has_final_states:
-        found = _batched(models, policies, tolerance, batch=batch)
-        parts = [jax.tree.map(itemgetter(w), found) for w in range(len(parts))]
+        performances = _batched(models, policies, tolerance, batch=batch)
+        parts = [jax.tree.map(itemgetter(w), performances) for w in range(len(parts))]
     for w, part in enumerate(parts):
         if part is not None and part.status == Status.INVALID:
             require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
@@ -316,8 +318,8 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
         # The last batch overlaps with the one before, so that all have one shape.
         begin = min(first, count - size)
         some, chosen = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
-        found = jax.block_until_ready(_together(some, chosen, tolerance))
-        parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], found))
+        performances = jax.block_until_ready(_together(some, chosen, tolerance))
+        parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], performances))
     result: Performance = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     return result
 
@@ -325,8 +327,10 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
 def _on_host(models: Product, policies: jax.Array, world: int, tolerance: Array) -> Performance:
     """Evaluation in one world by the sparse engine."""
     model, policy = jax.tree.map(lambda x: np.asarray(x)[world], (models, policies))
-    found = satisfaction_probability(model, policy, tolerance=tolerance)
-    result: Performance = _summarized(model, found.value, found.lower, found.upper, tolerance)
+    solution = satisfaction_probability(model, policy, tolerance=tolerance)
+    result: Performance = _summarized(
+        model, solution.value, solution.lower, solution.upper, tolerance
+    )
     return result
 
 
@@ -390,8 +394,8 @@ def summarize(
     for name in leave_out:
         if name not in names:
             raise ValueError(f"leave_out: there is no world {name!r}; there are {names[:5]}, ...")
-    kept = np.array([name not in leave_out for name in names])
-    if not kept.any():
+    included = np.array([name not in leave_out for name in names])
+    if not included.any():
         raise ValueError("leave_out names every world; leave at least one in.")
     infeasible = np.array(
         [
@@ -402,21 +406,21 @@ def summarize(
         ]
     )
     mean = np.asarray(performance.mean, np.float64)
-    worst = int(np.argmin(np.where(kept, mean, np.inf)))
+    worst = int(np.argmin(np.where(included, mean, np.inf)))
 
     def named(chosen: np.ndarray) -> tuple[str, ...]:
         return tuple(name for name, is_in in zip(names, chosen, strict=True) if is_in)
 
     return Summary(
-        mean=float(mean[kept].mean()),
-        std=float(mean[kept].std(ddof=1)) if kept.sum() > 1 else 0.0,
-        lower=float(np.asarray(performance.lower, np.float64)[kept].mean()),
-        upper=float(np.asarray(performance.upper, np.float64)[kept].mean()),
+        mean=float(mean[included].mean()),
+        std=float(mean[included].std(ddof=1)) if included.sum() > 1 else 0.0,
+        lower=float(np.asarray(performance.lower, np.float64)[included].mean()),
+        upper=float(np.asarray(performance.upper, np.float64)[included].mean()),
         worst_world=names[worst],
         worst=float(mean[worst]),
-        worst_start=float(np.asarray(performance.worst)[kept].min()),
-        num_worlds=int(kept.sum()),
+        worst_start=float(np.asarray(performance.worst)[included].min()),
+        num_worlds=int(included.sum()),
         infeasible=named(infeasible),
-        left_out=named(~kept),
+        left_out=named(~included),
         uncertain=named(np.asarray(performance.status) != Status.CONVERGED),
     )

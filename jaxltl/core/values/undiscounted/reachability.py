@@ -142,17 +142,21 @@ def reachability_probability(
     if traced or not is_table(model) or iterative or max_steps is not None or start is not None:
         padded = cast(ActionModel, model)
         if policy is not None:
-            most = 1_000_000 if max_steps is None else max_steps
+            limit = 1_000_000 if max_steps is None else max_steps
             return optimum.policy_reachability(
-                padded, policy, target, tolerance, most, method=method
+                padded, policy, target, tolerance, limit, method=method
             )
         return optimum.optimal_reachability(
             padded, target, tolerance, max_steps, start, objective=objective
         )
-    found = None
+    solution = None
     if policy is None:
-        found = _by_layers(model, target, tolerance, objective)
-    return _on_host(model, target, None, policy, objective, tolerance) if found is None else found
+        solution = _by_layers(model, target, tolerance, objective)
+    return (
+        _on_host(model, target, None, policy, objective, tolerance)
+        if solution is None
+        else solution
+    )
 
 
 def refuse_iteration(max_steps: object, start: object) -> None:
@@ -189,14 +193,14 @@ def _on_host(
     host, depth = sparse.host, 0
     if policy is not None:
         host, _, depth = induced_chain(model, sparse, policy)
-    found = enclose(host, target, objective, fine, stay=stay, depth=depth)
+    enclosure = enclose(host, target, objective, fine, stay=stay, depth=depth)
     if policy is None and stay is None and not is_sparse(model):
-        found = replace(
-            found, row=_fastest(host, np.asarray(target, bool).ravel(), objective, found)
+        enclosure = replace(
+            enclosure, row=_fastest(host, np.asarray(target, bool).ravel(), objective, enclosure)
         )
     return with_given_policy(
         solution_from_enclosure(
-            model, sparse, found, requested, relative=isinstance(requested, RelativeTolerance)
+            model, sparse, enclosure, requested, relative=isinstance(requested, RelativeTolerance)
         ),
         policy,
     )
@@ -230,9 +234,9 @@ def on_rows(sparse: SparseMDP, quantity: Array) -> Array:
 
 def on_actions(sparse: SparseMDP, quantity: Array, model: ActionModel) -> Array:
     """A quantity on rows ``[R]`` as one on actions ``[S, A]``, 0 at unavailable ones."""
-    found = np.zeros((sparse.num_states, model.num_actions), quantity.dtype)
-    found[sparse.host.state, np.asarray(sparse.action)] = quantity
-    return found.reshape(*model.state_shape, -1)
+    table = np.zeros((sparse.num_states, model.num_actions), quantity.dtype)
+    table[sparse.host.state, np.asarray(sparse.action)] = quantity
+    return table.reshape(*model.state_shape, -1)
 
 
 def row_of_action(sparse: SparseMDP, action: Array) -> Integers:
@@ -264,34 +268,34 @@ def enclose(
 # --- ties -----------------------------------------------------------------------------------------
 
 
-def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
+def conserving_rows(mdp: HostMDP, objective: str, enclosure: Enclosure) -> Booleans:
     """Rows in undecided states by which every policy that decides almost surely attains the bound."""
     # ``P l >= l`` for the lower bound l of a maximum makes l a submartingale, and bounds the value
     # of a policy of such rows from below by its limit, which is 0 or 1; likewise ``P u <= u`` for
     # the upper bound of a minimum.
-    undecided = found.lower != found.upper
+    undecided = enclosure.lower != enclosure.upper
     unit = _backup_unit(mdp)
     if objective == "max":
-        keeps = mdp.expectation(found.lower) * (1 - unit) >= found.lower[mdp.state]
+        keeps = mdp.expectation(enclosure.lower) * (1 - unit) >= enclosure.lower[mdp.state]
         keeps |= end_components(mdp, undecided).inside
     else:
-        keeps = mdp.expectation(found.upper) * (1 + unit) <= found.upper[mdp.state]
+        keeps = mdp.expectation(enclosure.upper) * (1 + unit) <= enclosure.upper[mdp.state]
     result: Booleans = keeps & undecided[mdp.state]
     return result
 
 
-def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosure | None:
+def attained_by_ties(mdp: HostMDP, objective: str, enclosure: Enclosure) -> Enclosure | None:
     """Enclosure with a bound that every policy of tied rows may attain."""
     # The value less a few roundings for each step that the slowest policy of tied rows takes; it is
     # not proven, except by :func:`conserving_rows`. None if such policies may never decide.
-    largest, undecided = objective == "max", found.lower != found.upper
-    sign, near, far = 1, found.lower, found.upper
+    largest, undecided = objective == "max", enclosure.lower != enclosure.upper
+    sign, pessimistic, optimistic = 1, enclosure.lower, enclosure.upper
     if not largest:
-        sign, near, far = -1, far, near
+        sign, pessimistic, optimistic = -1, optimistic, pessimistic
     unit = _backup_unit(mdp)
-    ahead = mdp.expectation(far)
-    ties = sign * ahead + unit * ahead >= sign * near[mdp.state]
-    ties[found.row] = True
+    ahead = mdp.expectation(optimistic)
+    ties = sign * ahead + unit * ahead >= sign * pessimistic[mdp.state]
+    ties[enclosure.row] = True
     free = ~undecided[mdp.state]
     if largest:
         free |= end_components(mdp, undecided).inside
@@ -302,9 +306,9 @@ def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosur
     time = solver.reward_forever(tied, cost, maximize=True).value
     if not np.isfinite(time).all():
         return None
-    bound = np.clip(found.value - sign * _TIE_ROUNDINGS * unit * time, 0, 1)
-    bound = np.where(undecided, bound, near)
-    return replace(found, lower=bound) if largest else replace(found, upper=bound)
+    bound = np.clip(enclosure.value - sign * _TIE_ROUNDINGS * unit * time, 0, 1)
+    bound = np.where(undecided, bound, pessimistic)
+    return replace(enclosure, lower=bound) if largest else replace(enclosure, upper=bound)
 
 
 def _backup_unit(mdp: HostMDP) -> float:
@@ -312,19 +316,19 @@ def _backup_unit(mdp: HostMDP) -> float:
     return (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
 
 
-def _fastest(mdp: HostMDP, target: Booleans, objective: str, found: Enclosure) -> Integers:
+def _fastest(mdp: HostMDP, target: Booleans, objective: str, enclosure: Enclosure) -> Integers:
     """The rows of the policy with the least expected time to decide, among those that attain."""
     if mdp.num_states > QUICK_LIMIT:
-        return found.row
-    good = conserving_rows(mdp, objective, found)
-    undecided = found.lower != found.upper
-    good[found.row[undecided]] = True
+        return enclosure.row
+    good = conserving_rows(mdp, objective, enclosure)
+    undecided = enclosure.lower != enclosure.upper
+    good[enclosure.row[undecided]] = True
     decided = ~undecided
     if objective == "max":
-        one = found.lower == 1
+        one = enclosure.lower == 1
         good |= one[mdp.state] & ~mdp.support.some_successor_in(~one)
         decided &= ~one | target
-    return fastest_rows(mdp, good, decided, found.row)
+    return fastest_rows(mdp, good, decided, enclosure.row)
 
 
 # --- large products -------------------------------------------------------------------------------
@@ -354,20 +358,20 @@ def _by_layers(
         np.asarray(model.letter),
         None if model.allowed is None else np.asarray(model.allowed),
     )
-    found = layered_reachability(
+    layered = layered_reachability(
         layers, np.asarray(target), maximize=objective == "max", tolerance=width
     )
-    if found is None:
+    if layered is None:
         return None
-    half = (found.upper - found.lower) / 2
+    half = (layered.upper - layered.lower) / 2
     # The operator contracts the bounds towards each other, so the residual is at most half of the
     # width.
     bounds = Enclosure(
-        value=found.lower + half,
-        lower=found.lower,
-        upper=found.upper,
-        row=found.action,
-        rounds=found.sweeps,
+        value=layered.lower + half,
+        lower=layered.lower,
+        upper=layered.upper,
+        row=layered.action,
+        rounds=layered.sweeps,
         residual=float(half.max()),
         method="sweeps in place",
     )

@@ -247,11 +247,11 @@ def _optimal(
     *,
     objective: str,
 ) -> Solution:
-    problem, given = as_reachability(model, objective), start
+    problem, bounds = as_reachability(model, objective), start
     if start is not None and problem.opposite:  # rounded outwards
         eps = np.finfo(model.dtype).eps
         start = 1 - start[1] - eps, 1 - start[0] + eps
-    found = reachability_probability(
+    solution = reachability_probability(
         problem.model,
         problem.target,
         objective=problem.objective,
@@ -261,20 +261,22 @@ def _optimal(
     )
     if problem.accepting is not None:
         xp, region, action, chosen = namespace(
-            problem.accepting.region, _visiting(problem, found), found.policy
+            problem.accepting.region, _visiting(problem, solution), solution.policy
         )
-        found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
+        solution = replace(
+            solution, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32))
+        )
     if not problem.opposite:
-        return found
-    found = complement_event(found)
-    return found if given is None else _within(found, given)
+        return solution
+    solution = complement_event(solution)
+    return solution if bounds is None else _within(solution, bounds)
 
 
-def _within(found: Solution, bounds: tuple[jax.Array, jax.Array]) -> Solution:
+def _within(solution: Solution, bounds: tuple[jax.Array, jax.Array]) -> Solution:
     """A solution with bounds no wider than given ones, despite rounding outwards."""
-    lower = jnp.maximum(found.lower, bounds[0])
-    upper = jnp.minimum(found.upper, bounds[1])
-    return replace(found, value=jnp.clip(found.value, lower, upper), lower=lower, upper=upper)
+    lower = jnp.maximum(solution.lower, bounds[0])
+    upper = jnp.minimum(solution.upper, bounds[1])
+    return replace(solution, value=jnp.clip(solution.value, lower, upper), lower=lower, upper=upper)
 
 
 # One program for a model over a mesh, instead of one for each operation.
@@ -307,11 +309,11 @@ def as_reachability(model: Product, objective: str) -> Reaching:
     return Reaching(model, accepting.region, "max", objective == "min", accepting)
 
 
-def _visiting(problem: Reaching, found: Solution) -> Array:
+def _visiting(problem: Reaching, solution: Solution) -> Array:
     """A policy that reads the least priority of accepting end components infinitely often."""
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
-    if is_traced((model, found)) or model.num_states > QUICK_LIMIT:
+    if is_traced((model, solution)) or model.num_states > QUICK_LIMIT:
         return accepting.action
     sparse = rows_of_model(model)
     visits = until_visit(problem, sparse.host)

@@ -186,14 +186,14 @@ class StepAnalysis:
         if self.problem.opposite:
             return Steps(0.0, 0.0, 0.0, Status.CONVERGED)
         chain = induced_chain(self.model, self.sparse, policy)
-        found = optimal.reward_forever(
+        total = optimal.reward_forever(
             chain.mdp,
             self.undecided.astype(float),
             maximize=False,
             tolerance=_SOLVED,
             depth=chain.depth,
         )
-        value, low, high = self.mean(found)
+        value, low, high = self.mean(total)
         if self.problem.accepting is not None:
             part = self._between_rounds(chain)
             value, low, high = value + part[0], low + part[1], high + part[2]
@@ -209,10 +209,10 @@ class StepAnalysis:
         host = self.sparse.host
         rows = on_rows(self.sparse, actions.allowed)
         cost = np.where(rows, self.undecided[host.state], np.inf)
-        found = optimal.reward_forever(host, cost, maximize=False, tolerance=_SOLVED)
-        least = self.mean(found)[1]
+        total = optimal.reward_forever(host, cost, maximize=False, tolerance=_SOLVED)
+        least = self.mean(total)[1]
         shape = self.model.state_shape
-        taken = np.asarray(self.sparse.action)[found.row].reshape(shape)
+        taken = np.asarray(self.sparse.action)[total.row].reshape(shape)
         if self.problem.accepting is not None:
             rounds, inner = self._fewest_between_rounds(rows)
             least = (least + rounds) * (1 - _EPS)
@@ -229,17 +229,17 @@ class StepAnalysis:
 
     def probability(self, policy: Array) -> tuple[float, float, float]:
         """Satisfaction probability from the initial distribution: value, lower and upper bound."""
-        found = satisfaction_probability(self.model, policy, tolerance=_CLOSE)
-        return self.mean(found, 1.0)
+        solution = satisfaction_probability(self.model, policy, tolerance=_CLOSE)
+        return self.mean(solution, 1.0)
 
     def mean(
-        self, found: Enclosure | AverageReward | Solution, highest: float = np.inf
+        self, enclosure: Enclosure | AverageReward | Solution, highest: float = np.inf
     ) -> tuple[float, float, float]:
         """Value, lower and upper bound of the mean over the initial distribution."""
         share = np.asarray(self.model.initial, np.float64).ravel()
-        low, high = safe_ends(self.model, found, highest=highest)
+        low, high = safe_ends(self.model, enclosure, highest=highest)
         start = np.flatnonzero(share)
-        middle = share[start] @ np.asarray(found.value).ravel()[start] / share.sum()
+        middle = share[start] @ np.asarray(enclosure.value).ravel()[start] / share.sum()
         return float(np.clip(middle, low, high)), low, high
 
     # --- rounds of acceptance ---------------------------------------------------------------------
@@ -250,14 +250,14 @@ class StepAnalysis:
         source = mdp.state[mdp.row]
         read = mdp.successor if self.model.label_on == "entry" else source
         letter = np.asarray(self.model.letter)[read // count]
-        found: Integers = np.asarray(self.model.automaton.priority)[source % count, letter]
-        return found
+        priority: Integers = np.asarray(self.model.automaton.priority)[source % count, letter]
+        return priority
 
     def _between_rounds(self, chain: Chain) -> tuple[float, float, float]:
         """Steps between two rounds of a policy: value, lower and upper bound."""
         mdp, size = chain.mdp, chain.mdp.num_states
-        found = end_components(mdp)
-        member, leader = found.inside, found.component
+        components = end_components(mdp)
+        member, leader = components.inside, components.component
         read = self._priorities(mdp)
         among, part, is_odd = member[mdp.row], leader[mdp.row], read % 2 == 1
         odd, even = np.full((2, size), np.iinfo(np.int64).max)
@@ -299,7 +299,7 @@ class StepAnalysis:
         region = np.asarray(accepting.region).ravel()
         read, start = self._priorities(host), host.entry_start[:-1]
         hits = np.where((read % 2 == 0) & region[host.state][host.row], host.probability, 0)
-        most = self.mean(_gain(*_among(host, rows, np.add.reduceat(hits, start))[:2]), 1.0)
+        rate = self.mean(_gain(*_among(host, rows, np.add.reduceat(hits, start))[:2]), 1.0)
         reached = optimal.reachability(host, region, maximize=True, tolerance=_SOLVED)
         share = self.mean(reached, highest=1.0)[1]
         # Inside an accepting end component the least priority alone is sure to be accepted.
@@ -308,7 +308,7 @@ class StepAnalysis:
         hits = np.where((read == least) & region[host.state][host.row], host.probability, 0)
         small, reward, row = _among(host, inner, np.add.reduceat(hits, start))
         action = np.asarray(self.sparse.action)[row[_gain(small, reward).row]]
-        return share / most[2] * (1 - 2 * _EPS) if most[2] > 0 else np.inf, action
+        return share / rate[2] * (1 - 2 * _EPS) if rate[2] > 0 else np.inf, action
 
 
 def _gain(mdp: HostMDP, reward: Floats) -> AverageReward:

@@ -89,14 +89,14 @@ def sparse_satisfaction(
     states = starting_states(model, states)
     reader = _Reader(automaton, letter, label_on == "entry")
     product = _product(model, reader, states)
-    found, row = _best(product, reader, objective, tolerance)
+    solution, row = _best(product, reader, objective, tolerance)
     return Satisfaction(
-        at_states(found, product.start),
+        at_states(solution, product.start),
         automaton,
         letter,
         product,
         product.base_row[row],
-        np.asarray(found.value),
+        np.asarray(solution.value),
         label_on,
     )
 
@@ -105,17 +105,17 @@ def starting_states(model: Model, states: Array) -> np.ndarray:
     """The given states ``int64[I]``, else the initial states; ValueError if they are not states."""
     if states is None:
         return np.flatnonzero(np.asarray(model.initial) > 0)
-    given = np.asarray(states)
-    if not given.size or given.dtype.kind not in "iu":
+    numbers = np.asarray(states)
+    if not numbers.size or numbers.dtype.kind not in "iu":
         raise ValueError(
-            f"states is {given.dtype}{list(given.shape)}; give the numbers of states, at least one."
+            f"states is {numbers.dtype}{list(numbers.shape)}; give the numbers of states, at least one."
         )
-    wrong = (given < 0) | (given >= model.num_states)
+    wrong = (numbers < 0) | (numbers >= model.num_states)
     if wrong.any():
         raise ValueError(
-            f"states has {given[wrong][0]}; the states are 0 to {model.num_states - 1}."
+            f"states has {numbers[wrong][0]}; the states are 0 to {model.num_states - 1}."
         )
-    return given.astype(np.int64)
+    return numbers.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -162,17 +162,17 @@ def _best(
         aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
     whole = sparse_mdp_of_product(product)
     requested = default_tolerance(whole) if tolerance is None else as_width(tolerance)
-    found = solution_from_enclosure(
+    solution = solution_from_enclosure(
         whole,
         whole,
         reachability(product.host, goal, maximize=aim == "max", tolerance=requested, depth=depth),
         requested,
         relative=isinstance(requested, RelativeTolerance),
     )
-    row = np.asarray(found.policy)
+    row = np.asarray(solution.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
-    return (complement_event(found) if opposite else found), row
+    return (complement_event(solution) if opposite else solution), row
 
 
 def product_satisfaction(
@@ -202,9 +202,9 @@ def product_satisfaction(
         chain = _chain(product, model, policy)
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
     reader = _Reader(automaton, letter, on_entry)
-    found, row = _best(product, reader, objective, tolerance, depth)
+    solution, row = _best(product, reader, objective, tolerance, depth)
     parts: dict[str, Array] = {
-        name: np.asarray(getattr(found, name)).reshape(shape)
+        name: np.asarray(getattr(solution, name)).reshape(shape)
         for name in ("value", "lower", "upper")
     }
     parts["policy"] = (
@@ -212,7 +212,7 @@ def product_satisfaction(
         if policy is not None
         else product.base_row[row].astype(np.int32).reshape(shape)
     )
-    return replace(found, **parts)
+    return replace(solution, **parts)
 
 
 def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
@@ -247,11 +247,11 @@ def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.n
     """The automaton of a task over the letters of a model, and the letter of each state."""
     if not isinstance(task, Automaton):
         task = as_formula(task)
-        shown, number = state_letters(model, task.propositions)
-        task = to_automaton(task, letters=shown)
+        letters, number = state_letters(model, task.propositions)
+        task = to_automaton(task, letters=letters)
     else:
-        shown, number = state_letters(model, task.propositions)
-    index = np.array([letter_index(task, letter) for letter in shown], np.int64)
+        letters, number = state_letters(model, task.propositions)
+    index = np.array([letter_index(task, letter) for letter in letters], np.int64)
     automaton = replace(
         task,
         delta=np.asarray(task.delta),

@@ -131,8 +131,8 @@ def bounded_reachability(
     model, operation = _problem(model, objective, num_steps)
     target = state_mask(model, target, "target")
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
-    found = host.until(model.host, target, stay, num_steps, operation, by_step)
-    return solution_from_error(found.value, found.error, found.row, found.num_steps, highest=1)
+    values = host.until(model.host, target, stay, num_steps, operation, by_step)
+    return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
 
 
 def cumulative_reward(
@@ -171,8 +171,8 @@ def cumulative_reward(
         )
     model, operation = _problem(model, objective, num_steps)
     rewards = *finite_reward(model, reward), np.zeros(model.num_states)
-    found = host.total(model.host, rewards, num_steps, operation, by_step)
-    return solution_from_error(found.value, found.error, found.row, found.num_steps)
+    values = host.total(model.host, rewards, num_steps, operation, by_step)
+    return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
 def instantaneous_reward(
@@ -214,8 +214,8 @@ def instantaneous_reward(
     model, operation = _problem(model, objective, num_step)
     zero = np.zeros(model.num_rows)
     rewards = zero, zero, state_reward(model, reward)
-    found = host.total(model.host, rewards, num_step, operation, by_step)
-    return solution_from_error(found.value, found.error, found.row, found.num_steps)
+    values = host.total(model.host, rewards, num_step, operation, by_step)
+    return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
 def reward_bounded_reachability(
@@ -269,9 +269,9 @@ def reward_bounded_reachability(
             f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0."
         )
     budget = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
-    found = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
-    error = np.where(found.undecided, found.error, 0)
-    return solution_from_error(found.value, error, found.row, budget[1] + 1, highest=1)
+    values = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
+    error = np.where(values.undecided, values.error, 0)
+    return solution_from_error(values.value, error, values.row, budget[1] + 1, highest=1)
 
 
 # --- what these and other host solvers share -----------------------------------------------------

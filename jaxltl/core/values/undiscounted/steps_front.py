@@ -94,11 +94,11 @@ def steps_front(
             vertices.append(between)
             lines += [(first, between), (between, last)]
     vertices.sort(key=lambda one: (-one.probability[0], one.steps[0]))
-    least, kept = np.inf, list[Vertex]()
+    least, front_vertices = np.inf, list[Vertex]()
     for one in vertices:
         if one.steps[0] < least * (1 - _NEAR):
-            least, kept = one.steps[0], [*kept, one]
-    return kept
+            least, front_vertices = one.steps[0], [*front_vertices, one]
+    return front_vertices
 
 
 class Meeting(NamedTuple):
@@ -106,7 +106,7 @@ class Meeting(NamedTuple):
 
     policy: np.ndarray | None  # float[S, Q, A]
     # certified upper bound of the probability of all policies with so few steps
-    most: float
+    upper: float
 
 
 def meeting(model: Product, probability: float, steps: float, quickest: Quickest) -> Meeting:
@@ -114,25 +114,27 @@ def meeting(model: Product, probability: float, steps: float, quickest: Quickest
     front = _Front.of(model, quickest)
     one_hot = np.eye(model.num_actions)
     first, last = front.ends
-    most = min(1.0, first.probability[2])
+    highest = min(1.0, first.probability[2])
     if first.steps[2] <= steps:
-        return Meeting(one_hot[first.policy] if first.probability[1] >= probability else None, most)
+        return Meeting(
+            one_hot[first.policy] if first.probability[1] >= probability else None, highest
+        )
     if steps < quickest.steps.upper and last.steps[1] > steps:
         return Meeting(None, 0.0)
     for _ in range(_MOST_SUMS):
         if last.steps[2] <= steps and last.probability[1] >= probability:
-            return Meeting(one_hot[last.policy], most)
+            return Meeting(one_hot[last.policy], highest)
         gain = first.probability[1] - last.probability[1]
         share = (probability + _MARGIN - last.probability[1]) / gain
         time = (1 - share) * last.steps[2] + share * first.steps[2]
         if share <= 1 and time <= steps * (1 - _MARGIN):
-            return Meeting(front.mixed(first, last, share), most)
+            return Meeting(front.mixed(first, last, share), highest)
         between, slope, bound = front.between(first, last)
-        most = min(most, 1 + slope * steps - bound)
-        if between is None or most < probability:
+        highest = min(highest, 1 + slope * steps - bound)
+        if between is None or highest < probability:
             break
         first, last = (first, between) if between.steps[2] <= steps else (between, last)
-    return Meeting(None, most)
+    return Meeting(None, highest)
 
 
 @dataclass(frozen=True)
@@ -163,25 +165,25 @@ class _Front:
         clock, host = self.clock, self.clock.sparse.host
         lost = clock.lost.astype(float)
         cost = np.where(clock.undecided[host.state], slope + worth * host.expectation(lost), 0)
-        found = optimal.total_reward(
+        total = optimal.total_reward(
             host, cost, ~clock.undecided, maximize=False, tolerance=_SOLVED
         )
-        action = np.asarray(clock.sparse.action)[found.row].reshape(clock.model.state_shape)
+        action = np.asarray(clock.sparse.action)[total.row].reshape(clock.model.state_shape)
         # States that are lost already count too; rounding of one sum of products for each row.
         start = np.asarray(clock.model.initial, float).ravel()
-        bound = clock.mean(found)[1] * (1 - 1e-12) + worth * float(start @ lost) - 1e-12
+        bound = clock.mean(total)[1] * (1 - 1e-12) + worth * float(start @ lost) - 1e-12
         return action.astype(np.int32), bound
 
     def between(
-        self, first: Vertex, last: Vertex, near: float = _NEAR
+        self, first: Vertex, last: Vertex, distance: float = _NEAR
     ) -> tuple[Vertex | None, float, float]:
         """A vertex beyond the line between two, the line's slope, and the weighted sum's bound."""
         slope = (first.probability[0] - last.probability[0]) / (first.steps[0] - last.steps[0])
         policy, bound = self.cheapest(slope)
-        found = self.vertex(policy)
+        vertex = self.vertex(policy)
         line = slope * last.steps[0] - last.probability[0]
-        beyond = line - (slope * found.steps[0] - found.probability[0])
-        return found if beyond > near else None, slope, bound
+        beyond = line - (slope * vertex.steps[0] - vertex.probability[0])
+        return vertex if beyond > distance else None, slope, bound
 
     def mixed(self, first: Vertex, last: Vertex, share: float) -> np.ndarray:
         """Policy with the mean occupancy of two, and so the mean probability and steps."""

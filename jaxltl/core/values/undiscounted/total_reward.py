@@ -122,15 +122,15 @@ def total_reward(
         earned = chain.mean(earned, host.row_start)
         host, depth = chain.mdp, chain.depth
     if target is None:
-        found = optimal.reward_forever(
+        enclosure = optimal.reward_forever(
             host, earned, maximize=maximize, tolerance=requested, depth=depth
         )
     else:
-        found = optimal.total_reward(
+        enclosure = optimal.total_reward(
             host, earned, target, maximize=maximize, tolerance=requested, depth=depth
         )
     return with_given_policy(
-        solution_from_enclosure(model, sparse, found, requested, relative=True), policy
+        solution_from_enclosure(model, sparse, enclosure, requested, relative=True), policy
     )
 
 
@@ -163,7 +163,7 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
     require_states("target", target, model.state_shape)
     chain = induced_chain(model, to_sparse(model), policy)
     goal = np.asarray(target, bool).ravel()
-    found = optimal.total_reward(
+    enclosure = optimal.total_reward(
         chain.mdp,
         np.ones(chain.mdp.num_rows),
         goal,
@@ -172,8 +172,8 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
         depth=chain.depth,
     )
     with np.errstate(invalid="ignore"):
-        narrow = found.upper - found.lower <= _SIX_DIGITS * found.upper
-    time = np.where(narrow | np.isinf(found.value), found.value, np.nan)
+        narrow = enclosure.upper - enclosure.lower <= _SIX_DIGITS * enclosure.upper
+    time = np.where(narrow | np.isinf(enclosure.value), enclosure.value, np.nan)
     return time.reshape(model.state_shape)
 
 
@@ -232,8 +232,8 @@ def _on_choices(model: ActionModel, world: World, reward: Reward) -> Array:
             raise ValueError(
                 f"reward={reward!r} is no reward of this {type(world).__name__}{known}."
             )
-        found = named[reward]
-        return found if world is model else jnp.broadcast_to(found[:, None], actions)
+        earned = named[reward]
+        return earned if world is model else jnp.broadcast_to(earned[:, None], actions)
     if np.shape(reward) == model.state_shape:
         return jnp.broadcast_to(jnp.asarray(reward)[..., None], actions)
     require_shape("reward", reward, actions)
@@ -297,12 +297,12 @@ def worst_case_steps(game: Game, goal: Array, strategy: Array) -> Solution:
     moves = to_jax(np.append(np.asarray(game.system) & (total[:, 0] > 0), False))
     weight = np.append(on_rows(rows_of_model(game), table / np.where(total > 0, total, 1)), 1.0)
     cost, end = np.ones(weight.size), np.arange(size + 1) == size
-    found = robust_total_reward(Game(model, moves), cost, end, policy=weight, objective="min")
+    solution = robust_total_reward(Game(model, moves), cost, end, policy=weight, objective="min")
     return replace(
-        found,
-        value=found.value[:size],
-        lower=found.lower[:size],
-        upper=found.upper[:size],
+        solution,
+        value=solution.value[:size],
+        lower=solution.lower[:size],
+        upper=solution.upper[:size],
         policy=to_jax(table),
         nature=None,
     )

@@ -82,13 +82,13 @@ class Problem(NamedTuple):
     sign: int  # 1 for a maximum, -1 for a minimum; static
     reward: jax.Array  # ``[S, A]``, in double words
     policy: jax.Array | None  # ``float[S, A]``, the policy as given, or None
-    open: jax.Array  # ``bool[S]``, where the value is finite and not 0
+    undecided: jax.Array  # ``bool[S]``, where the value is finite and not 0
     finite: jax.Array  # ``bool[S]``
     # ``bool[S, A]``, the actions to choose from; in collapsed end components those that leave
     allowed: jax.Array
-    # ``int32[S]``, actions that leave the open states almost surely; None if all do
+    # ``int32[S]``, actions that leave the undecided states almost surely; None if all do
     start: jax.Array | None
-    decided: jax.Array  # ``int32[S]``, actions for the states that are not open
+    decided: jax.Array  # ``int32[S]``, actions for the other states
     circles: EndComponents | None  # the end components that are collapsed
     highest: float = float("inf")  # static: a bound on the value; finite ones make widths absolute
 
@@ -132,19 +132,21 @@ def total_reward_by_sweeps(
     reward = jnp.where(model.available & earns, reward, 0)
     checked = None if policy is None else valid_policy(model, policy)
     weight = None if checked is None else checked.distribution
-    found, leaves, open_, finite = sequential_vmap(
+    enclosure, leaves, undecided, finite = sequential_vmap(
         partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
     )
-    chosen = found.policy if weight is None else weight
-    chain = ChainSystem(model, chosen, open_, leaves)
-    value, finite = with_derivative(found.value, chain, reward=reward), finite & earns
+    chosen = enclosure.policy if weight is None else weight
+    chain = ChainSystem(model, chosen, undecided, leaves)
+    value, finite = with_derivative(enclosure.value, chain, reward=reward), finite & earns
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
-        for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
+        for x, bad in ((value, jnp.nan), (enclosure.lower, -jnp.inf), (enclosure.upper, jnp.inf))
     )
     none = status_code(earns, earns, valid=is_representable(model))
-    status = jnp.maximum(found.status, none)
-    solution = replace(found, value=value, policy=chosen, lower=lower, upper=upper, status=status)
+    status = jnp.maximum(enclosure.status, none)
+    solution = replace(
+        enclosure, value=value, policy=chosen, lower=lower, upper=upper, status=status
+    )
     return refuse(solution, checked)
 
 
@@ -164,7 +166,7 @@ def _enclosed(
     else:
         problem = (_largest if objective == "max" else _smallest)(graph, rows, reward, target)
     tolerance = jnp.asarray(tolerance, model.dtype)
-    return *solve_problem(problem, tolerance, tolerance), problem.open, problem.finite
+    return *solve_problem(problem, tolerance, tolerance), problem.undecided, problem.finite
 
 
 # --- qualitative preprocessing ----------------------------------------------------------------
@@ -211,9 +213,9 @@ def _largest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.A
     first = graph.first(graph.available)[1]
     avoids = graph.first(graph.available & graph.forall(never))[1]
     decided = jnp.where(never, avoids, jnp.where(finite, first, doomed.action))
-    open_ = _earning(graph, reward, target, graph.available) & finite
+    undecided = _earning(graph, reward, target, graph.available) & finite
     gain = dw.double_word(reward)
-    return Problem(rows, 1, gain, None, open_, finite, graph.available, None, decided, None)
+    return Problem(rows, 1, gain, None, undecided, finite, graph.available, None, decided, None)
 
 
 def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array) -> Problem:
@@ -223,14 +225,14 @@ def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.
     # The value is 0 where the target is reached almost surely without reward.
     free = allowed & ~_positive(reward)
     nothing = surely(graph, target, free)
-    open_ = finite & ~nothing.region
-    circles = components_within(graph, open_, free)
+    undecided = finite & ~nothing.region
+    circles = components_within(graph, undecided, free)
     return Problem(
         rows,
         -1,
         dw.double_word(reward),
         None,
-        open_,
+        undecided,
         finite,
         allowed & ~circles.inside,
         sure.action,
@@ -243,7 +245,7 @@ def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.
 
 
 def _backup(problem: Problem, value: jax.Array) -> _Point:
-    """A value's image under T, 0 outside of the open states."""
+    """A value's image under T, 0 outside of the undecided states."""
     ahead = problem.rows.expectation(value)
     return _chosen(problem, value, dw.plus(problem.reward, ahead))
 
@@ -262,7 +264,7 @@ def _chosen(problem: Problem, value: jax.Array, ahead: jax.Array) -> _Point:
             lambda image: (image, leaves),
             image,
         )
-    image = jnp.where(problem.open, image, 0)
+    image = jnp.where(problem.undecided, image, 0)
     return _Point(value, image if problem.sign > 0 else -image, action, leaves)
 
 
@@ -290,7 +292,7 @@ def _where_it_leaves(problem: Problem, at: _Point, x: jax.Array) -> jax.Array:
 
 
 def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
-    """``x -> P_pi x`` for the policy that attains an image, 0 outside of the open states."""
+    """``x -> P_pi x`` for the policy that attains an image, 0 outside of the undecided states."""
     model = problem.model
     if problem.policy is None and not isinstance(model, Product):
         along = policy_operator(model, at.action)
@@ -300,26 +302,26 @@ def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
         def along(x: jax.Array) -> jax.Array:
             return action_mean(weight, expectation(model, x))
 
-    return lambda x: jnp.where(problem.open, _where_it_leaves(problem, at, along(x)), 0)
+    return lambda x: jnp.where(problem.undecided, _where_it_leaves(problem, at, along(x)), 0)
 
 
 def _inverse(problem: Problem, at: _Point, known: _Inverse) -> _Inverse:
     """The inverse of the system of the policy that attains an image, unless it is known."""
     model, weight = problem.model, problem.policy
-    table, size = sweep_operator(model), problem.open.size
+    table, size = sweep_operator(model), problem.undecided.size
     if not is_small(table, size):
         return known
     if weight is None:
         weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
 
-    def found() -> jax.Array:
+    def inverted() -> jax.Array:
         columns = action_columns(model.num_actions, weight)
-        system = System(table, columns, problem.open.ravel().astype(model.dtype))
+        system = System(table, columns, problem.undecided.ravel().astype(model.dtype))
         eye = jnp.eye(size, dtype=model.dtype)
         return inverse(eye - (eye - system.matrix())[at.leaves.ravel()])
 
     same = jnp.all((at.action == known[1]) & (at.leaves == known[2]))
-    return lax.cond(same, lambda: known[0], found), at.action, at.leaves
+    return lax.cond(same, lambda: known[0], inverted), at.action, at.leaves
 
 
 def _improved(
@@ -328,7 +330,7 @@ def _improved(
     """A step of policy iteration, and its number of applications of P."""
     # If the linear system is not solved, sweeps under its policy.
     onward, size = _onward(problem, at), jnp.abs(dw.words(at.value)[0])
-    scale = jnp.where(problem.open & (size > 0), size, 1)
+    scale = jnp.where(problem.undecided & (size > 0), size, 1)
     wanted = change / scale
 
     def matvec(x: jax.Array) -> jax.Array:
@@ -346,8 +348,8 @@ def _improved(
             shadow=random_shadow(right),
         )
         x = inner.x.reshape(wanted.shape)
-    left = norm((wanted - matvec(x)).ravel())
-    solved = left <= _POOR * norm(wanted.ravel())  # false for NaN
+    residual = norm((wanted - matvec(x)).ravel())
+    solved = residual <= _POOR * norm(wanted.ravel())  # false for NaN
     x = lax.cond(
         solved,
         lambda: x,
@@ -370,10 +372,10 @@ def _solved(
         change = dw.minus(swept, at.value)
         size = jnp.maximum(*(jnp.abs(dw.words(x)[0]) for x in (swept, at.value)))
         excess = jnp.maximum(jnp.abs(change) - slack, 0)
-        found = jnp.max(excess / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
-        halved = begun & (found < best / 2)  # false for NaN
-        best, rest = jnp.where(halved, found, best), jnp.where(halved, 0, rest + wait)
-        goes_on = ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
+        error = jnp.max(excess / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
+        halved = begun & (error < best / 2)  # false for NaN
+        best, rest = jnp.where(halved, error, best), jnp.where(halved, 0, rest + wait)
+        goes_on = ~(error <= goal) & (rest < _REST) & (n < _MOST_STEPS)
 
         def improved() -> tuple[jax.Array, _Inverse, jax.Array]:
             own = _inverse(problem, at, known)
@@ -417,7 +419,7 @@ def _width(problem: Problem, gap: jax.Array, upper: jax.Array) -> jax.Array:
     """The largest width, relative unless the value has a bound."""
     scale = upper if math.isinf(problem.highest) else 1
     each = jnp.where(jnp.isfinite(upper), gap / scale, jnp.inf)
-    return jnp.max(jnp.where(problem.open, each, 0))
+    return jnp.max(jnp.where(problem.undecided, each, 0))
 
 
 def _wide(problem: Problem, k: _Search) -> jax.Array:
@@ -434,7 +436,7 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
 
     def image(at: _Point) -> jax.Array:
         swept = dw.plus(dw.product(factor, at.image), dw.double_word(sign * shift))
-        return jnp.where(problem.open, swept, 0)
+        return jnp.where(problem.undecided, swept, 0)
 
     equation = image, k.share / 4, shift / 4
     at, known, n = _solved(problem, equation, k.at, k.known, k.num_steps)
@@ -442,18 +444,18 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     slack = rows.unit * value + rows.underflow(jnp.max(value))
     gain = dw.minus(at.image, offered)
     holds = jnp.where(above, -gain >= slack, (gain >= slack) | (value == 0))
-    proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(value), True))
+    proven = jnp.all(jnp.where(problem.undecided, holds & jnp.isfinite(value), True))
 
-    def kept(new: Tree, old: Tree, where: jax.Array) -> Tree:
+    def select(new: Tree, old: Tree, where: jax.Array) -> Tree:
         result: Tree = jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
         return result
 
     below = proven & ~above & (k.share <= k.shares[0])
     over = proven & above & (k.share <= k.shares[1])
-    bounds = kept(offered, k.bounds[0], below), kept(offered, k.bounds[1], over)
-    shares = kept(k.share, k.shares[0], below), kept(k.share, k.shares[1], over)
+    bounds = select(offered, k.bounds[0], below), select(offered, k.bounds[1], over)
+    shares = select(k.share, k.shares[0], below), select(k.share, k.shares[1], over)
     safer = (below if problem.sign > 0 else over) | (k.num_steps < 0)
-    safe, residual = kept((at, jnp.max(jnp.abs(gain))), (k.safe, k.residual), safer)
+    safe, residual = select((at, jnp.max(jnp.abs(gain))), (k.safe, k.residual), safer)
     high = dw.words(bounds[1])[0]
     gap = jnp.where(jnp.isfinite(high), dw.minus(bounds[1], bounds[0]), jnp.inf)
     below_known, above_known = (x <= k.share for x in shares)
@@ -478,28 +480,28 @@ def solve_problem(
     """
     rows, model = problem.rows, problem.model
     dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
-    zero = dw.double_word(jnp.zeros(problem.open.shape, dtype))
+    zero = dw.double_word(jnp.zeros(problem.undecided.shape, dtype))
     numbers, none = state_numbers(zero.shape), jnp.int32(0)
-    # Where every policy leaves the open states, the first one is greedy for zero.
+    # Where every policy leaves the undecided states, the first one is greedy for zero.
     start, num_steps = _Point(zero, zero, problem.decided, numbers), none - 1
     if problem.start is not None:
-        gain = jnp.where(problem.open, action_mean(problem.start, problem.reward), 0)
+        gain = jnp.where(problem.undecided, action_mean(problem.start, problem.reward), 0)
         start, num_steps = _Point(zero, gain, problem.start, numbers), none
     size = zero.size if is_small(sweep_operator(model), zero.size) else 0
-    unknown = jnp.zeros((size, size), dtype), jnp.full_like(numbers, -1), numbers
+    no_inverse = jnp.zeros((size, size), dtype), jnp.full_like(numbers, -1), numbers
     never = jnp.asarray(jnp.inf, dtype)
-    far = jnp.where(problem.open, problem.highest, 0).astype(dtype)
+    highest = jnp.where(problem.undecided, problem.highest, 0).astype(dtype)
     # Rounding both ends to the dtype takes a little of the width.
     inner = jnp.maximum(tolerance - 2 * eps, tolerance / 2)
     share = jnp.maximum(2 * _ROUNDINGS * rows.unit, 1e-6 * tolerance).astype(dtype)
     residual = jnp.max(jnp.abs(dw.words(start.image)[0]))
     k = _Search(
         start,
-        unknown,
+        no_inverse,
         share,
-        (zero, far.astype(zero.dtype)),
+        (zero, highest.astype(zero.dtype)),
         (never, never),
-        far,
+        highest,
         start,
         residual,
         none,
@@ -514,11 +516,11 @@ def solve_problem(
     policy, decides = _policy(problem, k.safe)
     lower, upper = dw.outwards(k.bounds[0], -1), dw.outwards(k.bounds[1], 1)
     lower = jnp.maximum(lower, 0)
-    upper = jnp.where(problem.open, jnp.maximum(upper, jnp.finfo(dtype).tiny), upper)
+    upper = jnp.where(problem.undecided, jnp.maximum(upper, jnp.finfo(dtype).tiny), upper)
     upper = jnp.minimum(upper, problem.highest)
     if problem.sign < 0:
-        # The bound holds for a policy that leaves the open states almost surely.
-        upper = jnp.where(problem.open & ~decides, problem.highest, upper)
+        # The bound holds for a policy that leaves the undecided states almost surely.
+        upper = jnp.where(problem.undecided & ~decides, problem.highest, upper)
     both = jnp.isfinite(upper)
     middle = dw.words(k.bounds[0])[0] + k.gap / 2
     value = jnp.where(both, middle, jnp.maximum(dw.words(k.at.image)[0], lower))
@@ -532,7 +534,7 @@ def solve_problem(
 
 
 def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
-    """A point's policy in all states, and whether it leaves the open states almost surely."""
+    """A point's policy in all states, and whether it leaves the undecided states almost surely."""
     graph = TracedGraph(problem.model)
     action, always = safe.action, jnp.bool_(True)
     if problem.circles is not None:
@@ -545,6 +547,6 @@ def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
         action = jnp.where(circling & ~exits, towards, action)
     if problem.sign < 0:
         taken = jax.nn.one_hot(action, problem.model.num_actions, dtype=problem.reward.dtype)
-        goal = problem.finite & ~problem.open
-        always = jnp.all(policy_sets(graph, goal, taken).one | ~problem.open)
-    return jnp.where(problem.open, action, problem.decided), always
+        goal = problem.finite & ~problem.undecided
+        always = jnp.all(policy_sets(graph, goal, taken).one | ~problem.undecided)
+    return jnp.where(problem.undecided, action, problem.decided), always
