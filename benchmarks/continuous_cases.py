@@ -33,7 +33,7 @@ from jaxltl.core.continuous.synthesis import (
 )
 from jaxltl.core.environments import Environment, Timestep, Verdict, make_agent
 from jaxltl.core.environments.episodes import Agent
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs import continuous_worlds as worlds
 from jaxltl.envs.networks import make_network, network_agent
 

@@ -41,7 +41,7 @@ DOCUMENTED = (
     "jaxltl.core.logic.bounded",
     "jaxltl.core.models.product",
     "jaxltl.core.models.mesh.sharded",
-    "jaxltl.core.values.engine.block_sweeps",
+    "jaxltl.core.values.prepared.block_iteration",
 )
 
 

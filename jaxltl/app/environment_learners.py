@@ -19,7 +19,7 @@ from jaxltl.algos.common.schedules import Linear
 from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentFile
 from jaxltl.app.job import settings
 from jaxltl.core.environments import Agent, Box, Environment, Finite, Timestep, Verdict
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 from jaxltl.app.protocols import Algorithm
 from jaxltl.app.wording import Record

@@ -11,7 +11,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.values.undiscounted.mixture import Mixture, least_mixture
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
 from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis, Quickest
-from jaxltl.core.values.undiscounted.steps_front import meeting, steps_front
+from jaxltl.core.values.undiscounted.satisfaction_steps import meeting, steps_front
 
 _SHARES = np.linspace(0, 0.9, 7)  # of the quickest policy, in the trade-off with the likelihood
 

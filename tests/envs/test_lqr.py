@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from jaxltl.core.environments.episodes import run_episode
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs.lqr import as_environment, evaluator, lqr, optimum, simulate
 from jaxltl.envs.networks import apply, make_network, network_agent
 from tests.support import counted_traces

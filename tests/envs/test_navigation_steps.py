@@ -7,8 +7,7 @@ import pytest
 
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.environments.task_environment import task_environment
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
-from jaxltl.core.values.evaluation.evaluation import evaluate
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator, evaluate
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import network_agent

@@ -14,7 +14,7 @@ logarithm, and the weights are ``exp(objective / temperature)``, shifted against
 Only the share of feasible *samples* is controlled: the mean policy can be infeasible, and the best
 sample can be best by chance. :func:`result` evaluates both again and names a solution only if it is
 feasible. For environments see
-:func:`~jaxltl.core.values.evaluation.episode_scores.episode_evaluator`.
+:func:`~jaxltl.core.values.evaluation.evaluation.episode_evaluator`.
 
 Example: the point nearest to (1, 1) with a first coordinate of at most 0.5.
   >>> import jax, jax.numpy as jnp

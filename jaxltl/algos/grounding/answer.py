@@ -53,7 +53,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
 from jaxltl.core.values import Objective, satisfaction_probability
 from jaxltl.core.values.multi_objective.front_search import FrontSearch
-from jaxltl.core.values.multi_objective.results import Front
+from jaxltl.core.values.multi_objective.front_search import Front
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
 MOST_MEMBERS = 8  # objectives at once, see Objective
@@ -102,7 +102,7 @@ class RobustPolicy(NamedTuple):
       upper: no policy has a larger minimum over the groundings.
       share: initial probabilities of the policies of `front`, which are drawn once.
       front: policies with the memory of all groundings' automata; see
-        :class:`~jaxltl.core.values.multi_objective.results.Front`.
+        :class:`~jaxltl.core.values.multi_objective.front_search.Front`.
       initial: ``float[S]``, the initial distribution.
     """
 

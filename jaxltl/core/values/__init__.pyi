@@ -1,27 +1,27 @@
 from .average.average_reward import average_reward as average_reward
 from .average.average_reward import mean_payoff as mean_payoff
-from .discounted.boltzmann import (
-    boltzmann_fixed_points as boltzmann_fixed_points,
-    boltzmann_value as boltzmann_value,
-)
 from .discounted.discounted import optimal_value as optimal_value, policy_value as policy_value
 from .discounted.minimax import minimax_value as minimax_value, strategy_value as strategy_value
 from .discounted.occupancy import (
     feature_expectation as feature_expectation,
     occupancy_measure as occupancy_measure,
 )
-from .discounted.soft import soft_value as soft_value
+from .discounted.soft import (
+    boltzmann_fixed_points as boltzmann_fixed_points,
+    boltzmann_value as boltzmann_value,
+    soft_value as soft_value,
+)
 from .evaluation.data_guarantee import (
     DataGuarantee as DataGuarantee,
     guarantee_curve as guarantee_curve,
     learn_guarantee as learn_guarantee,
 )
-from .evaluation.episode_scores import episode_evaluator as episode_evaluator
 from .evaluation.evaluation import (
     Batch as Batch,
     EpisodeTotals as EpisodeTotals,
     Estimate as Estimate,
     Evaluation as Evaluation,
+    episode_evaluator as episode_evaluator,
     evaluate as evaluate,
 )
 from .evaluation.optimality_gap import (
@@ -86,8 +86,10 @@ from .undiscounted.satisfaction import (
 from .undiscounted.satisfaction_steps import (
     Quickest as Quickest,
     Steps as Steps,
+    Vertex as Vertex,
     quickest_policy as quickest_policy,
     satisfaction_steps as satisfaction_steps,
+    steps_front as steps_front,
 )
 from .undiscounted.sparse_satisfaction import Satisfaction as Satisfaction
 from .undiscounted.step_bounded import (
@@ -98,4 +100,3 @@ from .undiscounted.step_bounded import (
     reward_bounded_reachability as reward_bounded_reachability,
 )
 from .undiscounted.total_reward import total_reward as total_reward
-from .undiscounted.steps_front import Vertex as Vertex, steps_front as steps_front

@@ -19,7 +19,7 @@ from jaxltl.core.continuous import (
 from jaxltl.core.environments import make_agent, task_environment
 from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.core.environments.task_environment import TaskObservation
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 
 FORMULA = "!pit U goal"

@@ -19,11 +19,10 @@ from jaxltl.core.models.mesh.shard import from_mesh, shard, to_mesh
 from jaxltl.core.models.ops.successor_tables import ShardedSuccessorTable, sweep_operator
 from jaxltl.core.models.product import product
 from jaxltl.core.types import Status
-from jaxltl.core.values.discounted.boltzmann import boltzmann_value
 from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
 from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.core.values.discounted.occupancy import occupancy_measure
-from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.discounted.soft import boltzmann_value, soft_value
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,

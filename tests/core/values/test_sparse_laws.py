@@ -18,8 +18,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.types import Status
-from jaxltl.core.values.discounted.boltzmann import boltzmann_expansion
-from jaxltl.core.values.discounted.soft import soft_policy_adjoint
+from jaxltl.core.values.discounted.soft import boltzmann_expansion, soft_policy_adjoint
 from tests.sparse_models import exact_solve, random_sparse
 from tests.support import (
     assert_encloses,

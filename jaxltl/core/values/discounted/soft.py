@@ -1,36 +1,45 @@
-"""Soft (maximum-entropy) values and the derivative of their policies."""
+"""Values of softmax policies: soft (maximum-entropy) values, and Boltzmann values."""
 
 from __future__ import annotations
 
-from typing import Unpack
-
 import math
 from dataclasses import replace
+from functools import partial, reduce
+from operator import itemgetter
+from typing import NamedTuple, Unpack
 
+import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 
-from jaxltl.core.models.ops.array_namespace import jit
-from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core import validation
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
+from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
-from jaxltl.core.models.protocols import Model, PyTree
-from jaxltl.core.types import Solution
+from jaxltl.core.models.protocols import Array, Model, PyTree
+from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.discounted import (
+    action_value,
     differentiable,
     expected_reward,
     gains,
     judge,
+    optimal_value,
     parameters,
+    reward_size,
     solution_of,
 )
 from jaxltl.core.values.engine import newton
+from jaxltl.core.values.engine.certificates import backup_error, most_choices, rounding_unit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import System
+from jaxltl.core.values.engine.validated import SolverOptions, validated
+
 
 _LEAST = 0.95  # of the logarithm of the least normal number, to which probabilities may fall
 _SWEEPS_BETWEEN = 4  # sweeps between two tests of the remainder
@@ -200,3 +209,255 @@ def soft_policy_adjoint(
         lanes="mapped" if predecessors is None else "side by side",
     )
     return g + policy * over.spread((x + r).reshape(model.state_shape))
+
+
+def boltzmann_expansion(num_actions: ArrayLike) -> Array:
+    """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
+
+    The Boltzmann operator contracts for discounts below its inverse. The supremum is ``g / 2``,
+    attained where one action exceeds the equal others by g: ``g tanh((g - log(n - 1)) / 2) = 2``.
+
+    >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
+    [1.0, 1.2, 1.33, 1.42]
+    """
+    xp = jnp if isinstance(num_actions, jax.Array) else np
+    n = xp.asarray(num_actions, float)
+    others = xp.log(xp.maximum(n - 1, 1))
+
+    def halved(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) / 2
+        above = middle * xp.tanh((middle - others) / 2) >= 2
+        return xp.where(above, low, middle), xp.where(above, middle, high)
+
+    ends = (others, others + 4)  # from one to the other the left side goes from 0 to more than 2
+    if xp is jnp:
+        high = lax.fori_loop(0, 30, halved, ends)[1]
+    else:
+        high = reduce(lambda ends, i: halved(i, ends), range(30), ends)[1]
+    # Errors of the bisection and of rounding.
+    expansion = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
+    return expansion if xp is jnp else float(expansion)
+
+
+@validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
+def boltzmann_value(
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    method: str = "damped",
+    tolerance: jax.Array | float | None = None,
+    **options: Unpack[SolverOptions],
+) -> Solution:
+    """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
+
+    ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator contracts only
+    while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can have several fixed points (see
+    :func:`boltzmann_fixed_points`): damped steps of one half are polished by Newton's method, the
+    enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached.
+
+    Args:
+      model, reward, discount: as in :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
+      initial: ``float[S]``, the first iterate; default zero.
+      method: ``"damped"``, or ``"newton"`` for Newton steps only, which may also find repelling
+        fixed points.
+      tolerance: width of the enclosure where the operator contracts, of the residual elsewhere;
+        default: what the dtype allows.
+      max_steps: damped steps at most; default 5,000.
+      adjoint: ``"exact"``, or ``"approximate"``: the sensitivity (2.7), with the policy constant.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, of a sparse model ``float[R]``, the softmax.
+      Value and policy are differentiable in the reward, the discount and the probabilities.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method or adjoint.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
+      2.0
+    """
+    adjoint, max_steps = validation.options(
+        "boltzmann_value", options, adjoint="exact", max_steps=5_000
+    )
+    form, reward = compiled_form(model, reward)
+    return reshape_solution(
+        model,
+        _boltzmann_value(
+            form, reward, discount, initial, (tolerance, max_steps), options=(adjoint, method)
+        ),
+    )
+
+
+@jit("options")
+def _boltzmann_value(
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    initial: jax.Array | None,
+    limits: tuple[jax.Array | float | None, jax.Array | int],
+    *,
+    options: tuple[str, str],
+) -> Solution:
+    (tolerance, max_steps), (adjoint, method) = limits, options
+    discount = jnp.asarray(discount, model.dtype)
+    criterion = _given(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
+    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    damping = jnp.where(criterion.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    value, image, n, _ = newton.solve(
+        sweep_operator(model),
+        newton.Method(softmax_mean, _judge, monotone=False),
+        newton.Backup(gains(model, reward), discount, damping, criterion),
+        start,
+        first_sweeps=4 if method == "damped" else 0,
+        max_steps=max_steps,
+    )
+    bound = _error(value, image, criterion)
+    converged = bound <= criterion.goal
+    half = jnp.where(converged & criterion.contracts, bound, jnp.inf)
+    value, image = (x.reshape(model.state_shape) for x in (value, image))
+    solution = jax.tree.map(
+        lax.stop_gradient,
+        Solution(
+            value=value,
+            policy=value,
+            lower=value - half,
+            upper=value + half,
+            residual=jnp.max(jnp.abs(image - value)),
+            num_steps=n,
+            status=status_code(
+                converged,
+                jnp.isfinite(bound),
+                bound <= criterion.enough,
+                certified=criterion.contracts,
+            ),
+        ),
+    )
+
+    def backup(v: jax.Array) -> jax.Array:
+        policy = over.softmax(policy_logits(model, reward, discount, v))
+        if adjoint == "approximate":
+            policy = lax.stop_gradient(policy)
+        return over.mean(policy, action_value(model, reward, discount, v))
+
+    def system() -> System:
+        policy = over.softmax(policy_logits(model, reward, discount, solution.value))
+        if adjoint == "exact":
+            q = action_value(model, reward, discount, solution.value)
+            policy *= 1 + q - over.spread(over.mean(policy, q))
+        return System(sweep_operator(model), over.columns(policy), discount)
+
+    solution = differentiable(solution, backup, system)
+    return with_softmax(model, reward, discount, solution)
+
+
+class _Given(NamedTuple):
+    """Stopping criterion of Boltzmann values."""
+
+    contracts: jax.Array
+    gap: jax.Array
+    rounding: jax.Array
+    goal: jax.Array
+    enough: jax.Array  # the error below which there is little but rounding
+
+
+def _given(
+    model: Model, reward: jax.Array, discount: jax.Array, tolerance: jax.Array | float | None
+) -> _Given:
+    expansion = discount * boltzmann_expansion(most_choices(model))
+    contracts = expansion < 1
+    gap = jnp.where(contracts, 1 - expansion, 1)
+    size = reward_size(model, reward)
+    rounding = backup_error(rounding_unit(model), size, size / (1 - discount)) / gap
+    goal = 4 * rounding
+    if tolerance is not None:
+        tolerance = jnp.asarray(tolerance, model.dtype)
+        # Of the enclosure's width, less its own rounding; elsewhere of the residual.
+        goal = jnp.where(contracts, tolerance / 2 - rounding / 4, tolerance)
+    return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
+
+
+def _error(value: jax.Array, image: jax.Array, criterion: _Given) -> jax.Array:
+    """Certified where the operator contracts; elsewhere the residual."""
+    return jnp.max(jnp.abs(image - value), axis=0) / criterion.gap + criterion.rounding
+
+
+def _judge(value: jax.Array, image: jax.Array, criterion: _Given) -> tuple[jax.Array, jax.Array]:
+    error = _error(value, image, criterion)
+    return (error <= criterion.enough) | ~jnp.isfinite(error), error
+
+
+def softmax_mean(over: Layout, q: Quantity, parameters: _Given) -> tuple[jax.Array, Quantity]:
+    """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
+    _, policy = soft_maximum(over, q, parameters)
+    finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
+    value = over.mean(policy, finite)
+    return value, jax.tree.map(
+        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite)
+    )
+
+
+@validated()
+def boltzmann_fixed_points(
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    key: chex.PRNGKey,
+    *,
+    num_starts: int = 64,
+    tolerance: float = 1e-6,
+) -> list[Solution]:
+    """Distinct fixed points of the Boltzmann operator, searched from many starts.
+
+    Damped and Newton iterations from zero, from the optimal and the worst value, and from random
+    values between them. Not a proof that there are no others.
+
+    Args:
+      model, reward, discount: as in :func:`boltzmann_value`.
+      key: random key.
+      num_starts: starts for each of the two methods.
+      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a
+        tenth of it times ``1 - discount``.
+
+    Returns:
+      Solutions with status ``CONVERGED`` or ``UNCERTIFIED``, ordered by the sum of their values.
+      Not differentiable; :func:`boltzmann_value` with one of these as `initial` is.
+
+    Raises:
+      ValueError: the reward has the wrong shape.
+
+    Example:
+      >>> from jaxltl import make_mdp
+      >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
+      >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
+      >>> found = boltzmann_fixed_points(
+      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=0.1)
+      >>> [round(one.value[0].item(), 1) for one in found]
+      [0.3, 2.5, 20.0]
+    """
+    best = optimal_value(model, reward, discount).value
+    worst = -optimal_value(model, -jnp.asarray(reward), discount).value
+    weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
+    weight = weight.at[0].set(0).at[-1].set(1)
+    starts = worst + weight * (best - worst)
+    # For a contraction by the discount this residual bounds the error by the tolerance.
+    residual = tolerance * (1 - discount) / 10
+    fixed_points: list[Solution] = []
+
+    def run(method: str, v: jax.Array) -> Solution:
+        return boltzmann_value(
+            model, reward, discount, initial=v, method=method, tolerance=residual
+        )
+
+    for method in ("damped", "newton"):
+        batch = jax.vmap(partial(run, method))(starts)
+        for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
+            one = jax.tree.map(itemgetter(i), batch)
+            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in fixed_points):
+                fixed_points.append(one)
+    return sorted(fixed_points, key=lambda f: float(f.value.sum()))

@@ -1,19 +1,35 @@
-"""Implicit derivatives of fixed points."""
+"""Implicit derivatives of fixed points, and linear systems of absorbing chains for them.
+
+The condition of ``(I - P_pi) x = b`` grows with the expected number of steps, so a Krylov method
+alone stagnates. Small systems are inverted; large ones are eliminated on the host, where sparse
+elimination loses no more digits than the number of steps costs; those over a mesh are solved by
+refined BiCGSTAB.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from functools import partial
+from typing import NamedTuple, Protocol, TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.values.engine.linear import solve_linear
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.ops.array_namespace import host_callback
+from jaxltl.core.models.ops.operators import action_mean, expectation
+from jaxltl.core.models.protocols import ActionModel, PyTree
+from jaxltl.core.sparse.linear.elimination import factorize
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
+from jaxltl.core.values.engine.iterate import sequential_vmap
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, LinearSolver, inverse, norm, solve_linear
+
 
 Operator = Callable[[jax.Array], jax.Array]
-LinearSolver = Callable[[jax.Array], jax.Array]
 
 
 class LinearSystem(Protocol):
@@ -42,8 +58,8 @@ def implicit(
     operator: Operator,
     fixed_point: jax.Array,
     *,
-    solve: LinearSolver | None = None,
-    transpose_solve: LinearSolver | None = None,
+    solve: Operator | None = None,
+    transpose_solve: Operator | None = None,
     system: LinearSystem = Krylov(),  # noqa: B008
 ) -> jax.Array:
     """A fixed point ``v = operator(v)`` with its implicit derivative."""
@@ -100,3 +116,135 @@ def _traced_when_differentiated(
         )
 
     return root(closed.consts, lax.stop_gradient(system), fixed_point)
+
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+
+_FAST_STEPS = 256  # of a Krylov method, which suffice for chains that mix well
+
+
+class ChainSystem(NamedTuple):
+    """The system ``x - mask * (P_pi x)[row_of]``."""
+
+    model: ActionModel  # a padded model or a product of one
+    policy: jax.Array  # ``float[S, A]`` or ``int32[S]``
+    mask: jax.Array  # ``bool[S]``, the transient states
+    # ``int32[S]``, the flat state from which a state takes its row; None for its own
+    row_of: jax.Array | None = None
+
+    def image(
+        self, x: jax.Array, reward: jax.Array | float = 0, outside: jax.Array | float = 0
+    ) -> jax.Array:
+        """``(r + P x)_pi`` in the transient states, `outside` elsewhere."""
+        ahead = action_mean(self.policy, reward + expectation(self.model, x))
+        if self.row_of is not None:
+            ahead = ahead.ravel()[self.row_of]
+        return jnp.where(self.mask, ahead, outside)
+
+    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution of ``matvec(x) = b`` for the system itself."""
+        return self._solve(matvec, b, False)
+
+    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution for the transpose."""
+        return self._solve(matvec, b, True)
+
+    def _solve(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
+        if is_sharded(self.model):
+            return solve_linear(matvec, b, patient=True)
+        x = solve_linear(matvec, b, max_steps=_FAST_STEPS)
+        size = norm(b.ravel())
+        # The norm of the inverse, and so the relative error, is at least that of x over that of b.
+        error = norm((b - matvec(x)).ravel()) * jnp.maximum(norm(x.ravel()), size)
+        accurate = error <= float(jnp.finfo(b.dtype).eps) ** 0.7 * size**2  # false for NaN
+        return _unless(accurate, x, lambda: self._direct(matvec, b, transposed))
+
+    def _direct(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
+        """The solution by inversion if the system is small, else by elimination on the host."""
+        if b.size <= DENSE_LIMIT:
+            eye = jnp.eye(b.size, dtype=b.dtype).reshape(b.size, *b.shape)
+            matrix = lax.map(matvec, eye, batch_size=min(b.size, 32)).reshape(b.size, b.size).T
+            inverted, right = sequential_vmap(inverse, matrix), b.ravel()
+            x: jax.Array = inverted @ right
+            x += inverted @ (right - matrix @ x)
+            return x.reshape(b.shape)
+        result = jax.ShapeDtypeStruct(b.shape, b.dtype)
+        x = host_callback(_eliminated(transposed), result, self, b)
+        return _unless(jnp.all(jnp.isfinite(x)), x, lambda: solve_linear(matvec, b, patient=True))
+
+
+def with_derivative(
+    value: jax.Array,
+    chain: ChainSystem,
+    *,
+    reward: jax.Array | float = 0,
+    outside: jax.Array | float = 0,
+    inverse: LinearSolver | None = None,
+) -> jax.Array:
+    """The value of a policy, ``x = (r + P x)_pi`` in transient states, with its derivative."""
+    # That of an optimum is the derivative of the policy that attains it (Danskin).
+    image = partial(chain.image, reward=reward, outside=outside)
+    if inverse is None:
+        return implicit(image, value, system=lax.stop_gradient(chain))
+    return implicit(image, value, solve=inverse.solve, transpose_solve=inverse.transpose_solve)
+
+
+def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -> jax.Array:
+    """x if `done`, else ``otherwise()``, which a batch evaluates only if some lane needs it."""
+    # A loop of at most one step: ``lax.cond`` with a batched predicate evaluates both branches, and
+    # batches all that they close over.
+
+    def body(_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return jnp.ones_like(done), otherwise()
+
+    return lax.while_loop(lambda state: ~state[0], body, (done, x))[1]
+
+
+def _eliminated(transposed: bool) -> Callable[..., np.ndarray]:
+    def solve(system: ChainSystem, b: np.ndarray) -> np.ndarray:
+        x = _solution(_transitions(system), b.astype(np.float64).ravel(), transposed)
+        return x.reshape(b.shape)
+
+    return solve
+
+
+def _transitions(system: ChainSystem) -> csr_array | None:
+    """``float64[N, N]``, the chain on transient states, SciPy's; None if rows are invalid."""
+    from scipy.sparse import csr_array, diags_array
+
+    try:
+        sparse = to_sparse(system.model)
+    except ValueError:
+        return None
+    host, policy = sparse.host, system.policy
+    if policy.ndim == system.mask.ndim:
+        weight = policy.ravel()[host.state] == np.asarray(sparse.action)
+    else:
+        weight = policy.reshape(host.num_states, -1)[host.state, np.asarray(sparse.action)]
+    rows = np.arange(host.num_rows)
+    mix = csr_array(
+        (weight.astype(np.float64), rows, host.row_start), shape=(host.num_states, host.num_rows)
+    )
+    chain = (mix @ host.matrix).tocsr()
+    if system.row_of is not None:
+        chain = chain[system.row_of.ravel()]
+    transient = (diags_array(system.mask.ravel().astype(np.float64)) @ chain).tocsr()
+    transient.eliminate_zeros()
+    return transient
+
+
+def _solution(chain: csr_array | None, b: np.ndarray, transposed: bool) -> np.ndarray:
+    """The solution by sparse elimination, refined once; NaN where that failed."""
+    failed = np.full(b.size, np.nan)
+    if chain is None:
+        return failed
+    matrix = chain.T.tocsr() if transposed else chain
+    matrix.sort_indices()
+    label = ordered_components(Edges(matrix.indptr, matrix.indices))
+    solver = factorize(matrix, label, np.arange(b.size))
+    if solver is None:
+        return failed
+    x = solver.solve(b)
+    return x + solver.solve(b + matrix @ x - x)

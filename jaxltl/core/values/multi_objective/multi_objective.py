@@ -14,11 +14,11 @@ from jaxltl.core import validation
 from jaxltl.core.values.multi_objective.objectives import Objective
 from jaxltl.core.values.engine.state_quantities import TOLERANCE
 
-from jaxltl.core.values.multi_objective.front_search import FrontSearch
-from jaxltl.core.values.multi_objective.results import (
+from jaxltl.core.values.multi_objective.front_search import (
     Achievable,
     ConstrainedOptimum,
     Front,
+    FrontSearch,
     NearestMixture,
     Pareto,
 )

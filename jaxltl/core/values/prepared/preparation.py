@@ -20,7 +20,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
 from jaxltl.core.types import require_states
-from jaxltl.core.values.engine.block_sweeps import Blocks
+from jaxltl.core.values.prepared.block_iteration import Blocks
 from jaxltl.core.values.engine.state_quantities import nonnegative_reward
 from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval

@@ -19,12 +19,19 @@ from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
-from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, chosen_names, meets, sweep
+from jaxltl.core.values.prepared.block_iteration import (
+    Blocks,
+    Chosen,
+    Sweep,
+    chosen_names,
+    meets,
+    sweep,
+)
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import inverse
 from jaxltl.core.values.engine.validated import SolverOptions, validated
-from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, State, enclose_cycles
+from jaxltl.core.values.prepared.block_iteration import SLACK, Problem, State, enclose_cycles
 from jaxltl.core.values.prepared.preparation import Prepared, prepare
 from jaxltl.core.values.prepared.prepared_interval import (
     PreparedInterval,
@@ -56,7 +63,7 @@ def solve_prepared(
     """Solves a prepared question, with other probabilities, intervals or rewards.
 
     An acyclic system is solved by one pass, with an a priori rounding bound; a cyclic one by
-    :mod:`jaxltl.core.values.prepared.interval_iteration`.
+    :mod:`jaxltl.core.values.prepared.block_iteration`.
 
     Args:
       prepared: the question.

@@ -11,43 +11,42 @@ from typing import NamedTuple, TypedDict, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxltl.core.values.properties.answers import (
-    Answer as Answer,
-    PropertyStrategy as PropertyStrategy,
-)
-from jaxltl.core.values.properties.exact_reachability import (
-    Bounds,
-    exact_reachability,
-    exact_steps,
-)
-from jaxltl.core.values.multi_objective.multi_objective import (
-    Achievable,
-    ConstrainedOptimum,
-    Pareto,
-)
-from jaxltl.core.values.properties.nested import filtered, with_definitions
-from jaxltl.core.values.properties.multi_objective import solve_multi_objective
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core import validation
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
-from jaxltl.core.logic.ltl import TRUE, Formula
+from jaxltl.core.logic.ltl import Formula, TRUE
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.sparse import Reward, SparseMDP
+from jaxltl.core.models.protocols import Array, PyTree
+from jaxltl.core.models.sparse import Reward, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Solution, Status
-from jaxltl.core import validation
-from jaxltl.core.models.protocols import Array
 from jaxltl.core.values.average.average_reward import average_reward
-from jaxltl.core.values.interval.robust import requested_width
-from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.engine.host_solution import complement_event
+from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.interval.robust import requested_width
+from jaxltl.core.values.multi_objective.multi_objective import (
+    Achievable,
+    ConstrainedOptimum,
+    Objective,
+    Pareto,
+    multi_objective,
+)
+from jaxltl.core.values.properties.answers import (
+    Answer as Answer,
+    PropertyStrategy as PropertyStrategy,
+    filtered,
+    with_definitions,
+)
+from jaxltl.core.values.properties.exact_reachability import Bounds, exact_reachability, exact_steps
+from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import at_states, starting_states
 from jaxltl.core.values.undiscounted.total_reward import total_reward
+
 
 TOLERANCE = 1e-6
 FINER = (1.0, 1e-3, 1e-6)  # shares of the tolerance with which an open threshold is tried
@@ -497,3 +496,70 @@ class _Query(NamedTuple):
             exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
         )
         return self.exact(self.result(solution, by="steps"), tolerance, exact)
+
+
+def solve_multi_objective(
+    model: SparseMDP, prop: Property, tolerance: float
+) -> Achievable | ConstrainedOptimum | Pareto:
+    """Solution of ``multi(...)``."""
+    parts = [_objective(model, x) for x in prop.parts]
+    return multi_objective(model, parts, tolerance=tolerance)
+
+
+def _objective(model: SparseMDP, prop: Property) -> Objective:
+    direction = prop.objective
+    if prop.relation is not None:
+        if prop.relation in (">", "<"):
+            raise ValueError(
+                f"{prop.text}: strict thresholds are not supported inside multi(...); "
+                f"write {prop.relation}=."
+            )
+        wanted = "max" if prop.relation == ">=" else "min"
+        if direction not in (None, wanted):
+            raise ValueError(
+                f"{prop.text}: inside multi(...) one strategy must meet the "
+                f"threshold; write {prop.operator}{prop.relation}."
+            )
+        direction = wanted  # type: ignore[assignment]
+    if direction is None:
+        raise ValueError(
+            f"{prop.text}: inside multi(...), ask for {prop.operator}max=? or "
+            f"{prop.operator}min=?, or give a threshold."
+        )
+    quantity = _event(model, prop) if prop.operator == "P" else _sum(model, prop)
+    return Objective(direction=direction, threshold=prop.threshold, **quantity)
+
+
+def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
+    path = prop.path
+    if isinstance(path, Bounded):
+        if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
+            raise ValueError(
+                f"{prop.text}: inside multi(...) a bound must be on at most "
+                f"{MAX_UNFOLDED_STEPS} steps."
+            )
+        path = unfolded(path)
+    assert isinstance(path, Formula)
+
+    if path.operator not in ("F", "G", "U") or not all(is_boolean(f) for f in path.operands):
+        return {"formula": path}
+    stay, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))
+    if path.operator == "G":
+        return {"avoid": ~right}
+    if path.operator == "F":
+        return {"target": right}
+    return {"target": right, "stay": stay}
+
+
+def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
+    path = prop.path
+    if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
+        raise ValueError(
+            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
+            "and T are supported."
+        )
+    reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
+    if isinstance(path, Formula):
+        target = states_satisfying(model, path.operands[0], prop.text)
+        return {"reward": reward, "target": target}
+    return {"reward": reward}

@@ -36,7 +36,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
-from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
+from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
 from jaxltl.core.values.engine.linear import System, is_small, most_products, solver
 from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem

@@ -52,7 +52,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse
-from jaxltl.core.values.engine.chain_systems import ChainSystem, with_derivative
+from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import (
     System,

@@ -10,9 +10,8 @@ import pytest
 import jaxltl as jl
 from jaxltl import Status
 from jaxltl.core.models.construct.batch import stack_products
-from jaxltl.core.values.discounted.boltzmann import boltzmann_expansion
 from jaxltl.core.values.discounted.discounted import expected_reward
-from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.discounted.soft import boltzmann_expansion, soft_value
 from jaxltl.envs import temporal_gridworld as grid
 from tests import reference
 from tests.support import as_mdp, assert_encloses, mass_preserving, stack

@@ -12,7 +12,7 @@ from jaxltl.core.environments.environment import Timestep, make_box, make_enviro
 from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.task_environment import task_environment
-from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 
 NUMBER = 6
 

@@ -5,8 +5,12 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxltl as jl
-from jaxltl.core.values.undiscounted.satisfaction_steps import StepAnalysis, quickest_policy
-from jaxltl.core.values.undiscounted.steps_front import meeting, steps_front
+from jaxltl.core.values.undiscounted.satisfaction_steps import (
+    StepAnalysis,
+    meeting,
+    quickest_policy,
+    steps_front,
+)
 
 S, A, GOAL, TRAP = 7, 3, 5, 6
 
