@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -315,3 +316,31 @@ def test_nothing_is_compiled(model_file):
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("text", ['Pmax=? [ F "rich" ]', 'Pmax=? [ G F "rich" ]'])
+def test_at_most_six_files_pass_the_tolerance_on(model_file, text):
+    """From the command to the innermost solver, each file once on the stack."""
+    tolerance, package = 1.234e-5, Path(jaxltl.__file__).parent
+    paths = set()
+
+    def note(frame, event, arg):
+        if event != "call" or "sparse/solvers" not in frame.f_code.co_filename:
+            return
+        files = []
+        while frame is not None:
+            code = frame.f_code
+            names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount] + code.co_freevars
+            if tolerance in [x for n in names if type(x := frame.f_locals.get(n)) is float]:
+                files.append(code.co_filename)
+            frame = frame.f_back
+        if files and files[0].endswith("sparse/solvers/reachability.py"):
+            paths.add(tuple(str(Path(x).relative_to(package)) for x in dict.fromkeys(files)))
+
+    sys.setprofile(note)
+    try:
+        results(model_file, text, "--tolerance", tolerance)
+    finally:
+        sys.setprofile(None)
+    assert paths and all(len(path) <= 6 for path in paths), paths
+    assert all(path[-2:] == ("app/solve.py", "cli.py") for path in paths)
