@@ -63,15 +63,18 @@ from jaxltl.core.models.construct.batch import (
 from jaxltl.core.models.construct.lifting import allowed_steps, project_policy
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.policies.policy_file import save_policy
-from jaxltl.core.types import Solution, status_code
+from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
-from jaxltl.core.values.undiscounted.performance import Performance, task_performances
+from jaxltl.core.values.undiscounted.performance import (
+    Performance,
+    step_bounded_performances,
+    task_performances,
+)
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
@@ -422,42 +425,7 @@ def _probability(judged: Product, policy: jax.Array, horizon: int | None) -> Per
     if policy.ndim == 4:
         shape = (policy.shape[0], horizon, *policy.shape[1:])
         policy = jnp.broadcast_to(policy[:, None], shape)
-    return _within_each(judged, policy)
-
-
-@jax.jit
-def _within_each(judged: Product, policy: jax.Array) -> Performance:
-    return lax.map(lambda pair: _within(*pair), (judged, policy), batch_size=_BATCH)
-
-
-def _within(model: Product, policy: jax.Array) -> Performance:
-    """Probability of satisfaction (for safety, of no violation) in T steps, of ``[T, S, Q, A]``."""
-    done = model.final.astype(model.dtype)
-    limit = jnp.minimum if model.automaton.is_safety else jnp.maximum
-
-    def backup(value: jax.Array, policy: jax.Array) -> tuple[jax.Array, None]:
-        return limit(done, action_mean(policy, expectation(model, value))), None
-
-    value, _ = lax.scan(backup, done, policy, reverse=True)
-    value = jnp.take_along_axis(value, model.initial_memory[:, None], axis=1)[:, 0]
-    starts = model.mdp.initial > 0
-    # Rounding of T steps of sums of K + A products of numbers in [0, 1], to first order.
-    half = len(policy) * (model.num_successors + model.num_actions + 4) * jnp.finfo(model.dtype).eps
-    worst = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
-    mean = jnp.sum(model.mdp.initial * value)
-    finite = jnp.all(jnp.isfinite(value))
-    slack = half + 4 * jnp.finfo(model.dtype).eps * jnp.sqrt(1.0 * value.size)
-    return Performance(
-        mean=mean,
-        lower=jnp.maximum(mean - slack, 0),
-        upper=jnp.minimum(mean + slack, 1),
-        worst=value[worst],
-        worst_lower=jnp.maximum(value[worst] - half, 0),
-        worst_upper=jnp.minimum(value[worst] + half, 1),
-        worst_state=worst,
-        value=value,
-        status=status_code(finite, finite),
-    )
+    return step_bounded_performances(judged, policy)
 
 
 def save(out: Path, outcome: Outcome) -> None:

@@ -3,7 +3,6 @@
 import json
 import re
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,8 +12,6 @@ from jaxltl.app.files.scenes import cell_observations, load_automata, load_scene
 from jaxltl.app.files.task import kind_of
 from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.reports.learn_todirl import report as report_todirl
-from jaxltl.core.models.construct.batch import stack_products
-from jaxltl.core.models.mdp import from_dense
 from jaxltl.envs import temporal_gridworld
 from jaxltl.io.colored_world import save_world, write_world
 from jaxltl.io.learned_reward import load_reward, plan_in
@@ -443,20 +440,6 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
         for played in world["runs"]:
             assert {q for _, q, _ in played["steps"]} <= {0, 1, 2} and len(played["steps"]) <= 10
     assert max(len(played["steps"]) for played in data[0]["runs"][1:]) > 2
-
-
-def test_the_probability_within_a_horizon():
-    matrix = np.array([[[0.5, 0.5, 0], [0, 0, 1]], [[0, 0, 1], [1, 0, 0]], [[0, 0, 1], [0, 1, 0]]])
-    mdp = from_dense(matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
-    policy = np.random.default_rng(0).dirichlet([1, 1], (1, 4, 3, 2))
-    found = learn_todirl._within_each(stack_products([mdp], "F a"), jnp.asarray(policy))
-    value = np.zeros(3)  # of being at 1 before, on the way out of it
-    for actions in policy[0, ::-1, :, 0]:
-        value = np.where([False, True, False], 1, np.einsum("sa,sat,t->s", actions, matrix, value))
-    np.testing.assert_allclose(found.value[0], value, atol=1e-14)
-    mean = (value[0] + value[2]) / 2
-    assert float(found.lower[0]) < mean < float(found.upper[0]) < float(found.lower[0]) + 1e-13
-    assert float(found.worst[0]) == pytest.approx(min(value[0], value[2]))
 
 
 def test_the_example_is_sound():

@@ -15,8 +15,6 @@ from jaxltl.app.reports import steps
 from jaxltl.app.reports.learn_todirl import report
 from jaxltl.app.reports.page import render_text
 from jaxltl.app.todirl.results import part_of
-from jaxltl.core.models.construct.batch import stack_products
-from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.core.values.undiscounted.satisfaction_steps import quickest_policy, satisfaction_steps
@@ -206,18 +204,6 @@ def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
     with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends an episode .* has buchi"):
         prepared(write(within))
     assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).judge.acceptance == "safety"
-
-
-def test_the_probability_of_not_failing_within_a_horizon():
-    rng = np.random.default_rng(0)
-    matrix = rng.dirichlet(np.ones(3), (3, 2))
-    mdp = from_dense(matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
-    policy = rng.dirichlet([1, 1], (1, 4, 3, 2))
-    found = job._within_each(stack_products([mdp], "G !a"), jnp.asarray(policy))
-    value = np.array([1, 1, 1.0])  # of not being at 1 before, on the way out of it
-    for actions in policy[0, ::-1, :, 0]:
-        value = np.where([False, True, False], 0, np.einsum("sa,sat,t->s", actions, matrix, value))
-    np.testing.assert_allclose(found.value[0], value, atol=1e-14)
 
 
 # --- a probability -----------------------------------------------------------------------------

@@ -342,6 +342,43 @@ def _together(models: Product, policies: jax.Array, tolerance: Array) -> Perform
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
 
 
+_WORLDS = 64  # in a batch of backward inductions
+
+
+@jit()
+def step_bounded_performances(models: Product, policies: jax.Array) -> Performance:
+    """:func:`task_performance` within T steps in each of several worlds, for time-varying policies.
+
+    The probability that T steps satisfy a co-safe formula, or do not violate a safety formula, by
+    backward induction ``x_t = opt(x_T, sum_a pi_t(a) P_a x_{t+1})``, where ``opt`` is the maximum or
+    the minimum.
+
+    Args:
+      models: stacked products, see :func:`~jaxltl.core.models.construct.batch.stack_products`.
+      policies: ``float[W, T, S, Q, A]``.
+
+    Returns:
+      :class:`Performance` with a leading axis W; its status is of the default tolerance.
+    """
+    return lax.map(lambda world: _step_bounded(*world), (models, policies), batch_size=_WORLDS)
+
+
+def _step_bounded(model: Product, policy: jax.Array) -> Performance:
+    decided = model.final.astype(model.dtype)
+    optimum = jnp.minimum if model.automaton.is_safety else jnp.maximum
+
+    def backup(value: jax.Array, policy: jax.Array) -> tuple[jax.Array, None]:
+        return optimum(decided, action_mean(policy, expectation(model, value))), None
+
+    value, _ = lax.scan(backup, decided, policy, reverse=True)
+    # Rounding of T steps of sums of K + A products of numbers in [0, 1], to first order.
+    error = len(policy) * (model.num_successors + model.num_actions + 4)
+    error = error * jnp.finfo(model.dtype).eps
+    return _summarize(
+        model, value, jnp.maximum(value - error, 0), jnp.minimum(value + error, 1), None
+    )
+
+
 # --- summaries over worlds ------------------------------------------------------------------------
 
 

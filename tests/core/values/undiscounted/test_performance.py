@@ -352,3 +352,25 @@ def test_worlds_are_left_out_by_name_alone():
 def test_summaries_of_the_wrong_names_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         tp.summarize(*three_worlds(), **options)
+
+
+# --- a number of steps ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("formula", "reached"), [("F a", 1.0), ("G !a", 0.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_probabilities_within_a_number_of_steps(formula, reached, seed):
+    rng = np.random.default_rng(seed)
+    matrix = rng.dirichlet(np.ones(3), (3, 2))
+    mdp = jl.from_dense(matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
+    policy = rng.dirichlet([1, 1], (1, 4, 3, 2))
+    found = tp.step_bounded_performances(stack_products([mdp], formula), jnp.asarray(policy))
+    value = np.full(3, 1 - reached)  # of not being at 1 before, on the way out of it
+    for actions in policy[0, ::-1, :, 0]:
+        after = np.einsum("sa,sat,t->s", actions, matrix, value)
+        value = np.where([False, True, False], reached, after)
+    np.testing.assert_allclose(found.value[0], value, atol=1e-14)
+    mean, worst = (value[0] + value[2]) / 2, min(value[0], value[2])
+    assert found.lower[0] <= mean <= found.upper[0] <= found.lower[0] + 1e-13
+    assert found.worst_lower[0] <= worst <= found.worst_upper[0] <= found.worst_lower[0] + 1e-13
+    assert found.status[0] == Status.CONVERGED
