@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
@@ -16,12 +17,21 @@ from jaxltl.core.models.construct.counts import in_order, listed, place_of, plac
 from jaxltl.io.files import streamed
 
 _COUNT = re.compile(r"[0-9]{1,16}")
-_MOST = 2**53  # transitions
-_LONGEST = 2**16  # bytes of a line
+_MAX_COUNT = 2**53  # transitions
+_MAX_BYTES = 2**16  # bytes of a line
 _JUNK = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]")  # of no text; a tab may stand in one
 _BOM = b"\xef\xbb\xbf"
 
 Fields = tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Record:
+    """Equal lines of a log: the first one, its count, and how often it occurs."""
+
+    line: int
+    count: int
+    repeats: int = 0
 
 
 def read_log(
@@ -74,18 +84,24 @@ def read_log(
     if not isinstance(count, str):
         raise ValueError(f"count={validation.shorten(count)}; give the name of a column.")
     name, total = str(path), 0
-    times: Counter[Fields] = Counter()
-    line_of: dict[Fields, int] = {}  # the first line of each transition, in order
-    for line, (*transition, number) in read_columns(path, columns, count):
-        if number != "1" and (not _COUNT.fullmatch(number) or int(number) > _MOST):
-            message = f"the count is {number[:60]!r}; expected an integer from 0 to 2^53."
-            raise _error(name, line, message)
-        key = tuple(transition)
-        times[key] += int(number)
-        line_of.setdefault(key, line)
-        total += int(number)
-        if total > _MOST:
+    record_of: dict[Fields, _Record] = {}
+    for line, fields in read_columns(path, columns, count):
+        if (record := record_of.get(fields)) is None:
+            digits = fields[-1]
+            if not _COUNT.fullmatch(digits) or int(digits) > _MAX_COUNT:
+                message = f"the count is {digits[:60]!r}; expected an integer from 0 to 2^53."
+                raise _error(name, line, message)
+            record = record_of[fields] = _Record(line, int(digits))
+        record.repeats += 1
+        total += record.count
+        if total > _MAX_COUNT:
             raise _error(name, line, "counts add up to more than 2^53 up to here.")
+    times: dict[Fields, int] = {}
+    line_of: dict[Fields, int] = {}  # the first line of each transition, in order
+    for (*transition, _), record in record_of.items():
+        key = tuple(transition)
+        times[key] = times.get(key, 0) + record.count * record.repeats
+        line_of.setdefault(key, record.line)
     if not times:
         raise _error(name, 2, "there is no transition after the header.")
     columns_of_names = list(zip(*times, strict=True))
@@ -176,9 +192,10 @@ def read_columns(
     """Line numbers and fields of the requested columns of a UTF-8 CSV table with a header.
 
     Fields may be quoted, and blanks around them are removed. A column of counts is appended, of
-    ones if the table has none.
+    ones if the table has none. Lines of equal fields are checked once, and share a tuple.
     """
     name, number, empty = str(path), 0, 0
+    distinct: dict[Fields, Fields] = {}
     header: Fields = ()
     reader = csv.reader(_lines(path), strict=True, skipinitialspace=True)
     try:
@@ -189,7 +206,8 @@ def read_columns(
                 header = tuple(map(str.strip, row))
                 _check_header(name, header, columns)
                 wanted = (*columns, count) if count in header else tuple(columns)
-                place = [header.index(x) for x in wanted]
+                picked = itemgetter(*(header.index(x) for x in wanted))
+                suffix = ("1",) if count and count not in header else ()
             elif len(row) < 2 and not "".join(row).strip():
                 empty = empty or number
             elif empty:
@@ -197,14 +215,17 @@ def read_columns(
             elif len(row) != len(header):
                 message = f"has {len(row)} fields, and the header {len(header)}."
                 raise _error(name, number, message)
-            else:
-                picked = tuple([row[i].strip() for i in place])
-                if picked == wanted:
+            elif (fields := distinct.get(key := picked(row))) is None:
+                fields = tuple(map(str.strip, key))
+                if fields == wanted:
                     raise _error(name, number, "this line repeats the header; remove it.")
-                if "" in picked:
-                    column = wanted[picked.index("")]
+                if "" in fields:
+                    column = wanted[fields.index("")]
                     raise _error(name, number, f"the field of column {column!r} is empty.")
-                yield number, picked if len(picked) > len(columns) or not count else (*picked, "1")
+                distinct[key] = fields = fields + suffix
+                yield number, fields
+            else:
+                yield number, fields
     except csv.Error as error:
         raise _error(name, number + 1, f"{error}.") from None
     if not number:
@@ -232,7 +253,7 @@ def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
         *whole, held = data.split(b"\n")
         yield from _decoded(name, number, whole)
         number += len(whole)
-        if len(held) > _LONGEST:
+        if len(held) > _MAX_BYTES:
             break
     yield from _decoded(name, number, [held] if held else [])
 
@@ -245,9 +266,9 @@ def _decoded(name: str, first: int, lines: list[bytes]) -> Iterator[str]:
     def error(place: int, message: str) -> ValueError:
         return _error(name, first + data.count(b"\n", 0, place), message)
 
-    if max(map(len, lines), default=0) > _LONGEST:
-        long = next(i for i, line in enumerate(lines) if len(line) > _LONGEST)
-        raise _error(name, first + long, f"is longer than {_LONGEST} bytes.")
+    if max(map(len, lines), default=0) > _MAX_BYTES:
+        long = next(i for i, line in enumerate(lines) if len(line) > _MAX_BYTES)
+        raise _error(name, first + long, f"is longer than {_MAX_BYTES} bytes.")
     if junk := _JUNK.search(data):
         raise error(junk.start(), f"byte {junk[0][0]:#x} is not text; expected a table.")
     try:
