@@ -17,7 +17,7 @@ from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.ops import operators
-from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.protocols import (
     Arena,
@@ -159,12 +159,6 @@ def as_padded_game(model: Model) -> Game:
 def is_deterministic(model: Model) -> bool:
     """True if each available action has one successor."""
     return not bool((support(base_model(model)).sum(-1) > 1).any())
-
-
-def swap_players(game: Game) -> Game:
-    """The game in which system and environment have changed sides."""
-    xp, system = namespace(game.system)
-    return replace(game, system=to_jax(xp.logical_not(system)))
 
 
 # --- the primitives: those of the model -----------------------------------------------------

@@ -21,7 +21,7 @@ from jaxltl.core.games.objective import (
 from jaxltl.core.games.verify import verify
 from jaxltl.core.games.winning import almost_sure_buchi, winning_region
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.game import Game, make_game, swap_players
+from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.sparse.graph import attractor as host_attract
@@ -319,7 +319,7 @@ def test_exchanging_players_without_chance_exchanges_regions():
         sets = draw(rng, 6)
         one = winning_region(game, parity(game, sets["priority"], num_priorities=6))
         other = winning_region(
-            swap_players(game), parity(game, sets["priority"] + 1, num_priorities=6)
+            game.replace(system=~game.system), parity(game, sets["priority"] + 1, num_priorities=6)
         )
         np.testing.assert_array_equal(one.region, np.logical_not(other.region))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.models.game import Game, as_game, is_deterministic, make_game, swap_players
+from jaxltl.core.models.game import Game, as_game, is_deterministic, make_game
 from jaxltl.core.models.product import Product, product
 from tests import reference, reference_games
 from tests.support import as_mdp, bit_labels, random_product
@@ -103,12 +103,6 @@ def test_primitives_are_those_of_the_model():
         jl.policy_value(game, policy, jnp.ones((5, 2)), 0.9).value,
         jl.policy_value(mdp, policy, jnp.ones((5, 2)), 0.9).value,
     )
-
-
-def test_players_change_places():
-    game = make_game(small_world(), [True, False])
-    assert swap_players(game).system.tolist() == [False, True]
-    assert swap_players(swap_players(game)).system.tolist() == [True, False]
 
 
 def test_a_game_is_deterministic_if_every_move_has_one_successor():

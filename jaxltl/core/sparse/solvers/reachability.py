@@ -332,7 +332,7 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
         return Enclosure(known, known, known, reduced.known_row, 0, 0.0, "the graph")
     relative = isinstance(tolerance, RelativeTolerance) or not np.isfinite(highest)
     enclosure = solve_shortest_path(
-        problem, maximize=reduced.maximize, tolerance=tolerance, relative=relative
+        problem, maximize=reduced.maximize, tolerance=float(tolerance), relative=relative
     )
     infinite = np.isinf(known)
     value, lower, upper = (

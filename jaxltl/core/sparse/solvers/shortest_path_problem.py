@@ -23,7 +23,22 @@ TINY = 1e-290  # products that underflow: relative errors do not count them
 
 
 class RelativeTolerance(float):
-    """A width of bounds relative to the value, where a plain number would be absolute."""
+    """A width of bounds relative to the value, where a plain number would be absolute.
+
+    Scaled by a number it is relative too; with an array it is a TypeError unless converted.
+    """
+
+    __array_ufunc__ = None  # so that products from the left are not plain numbers either
+
+    def __mul__(self, factor: float) -> RelativeTolerance:
+        if not isinstance(factor, int | float):
+            return NotImplemented
+        return RelativeTolerance(float(self) * factor)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor: float) -> RelativeTolerance:
+        return self * (1 / divisor)
 
 
 def as_width(tolerance: SupportsFloat) -> float:

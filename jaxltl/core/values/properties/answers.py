@@ -192,6 +192,6 @@ def _number(
     relative = prop.operator in ("R", "T") or isinstance(tolerance, RelativeTolerance)
     scale = max(abs(numbers[0]), abs(numbers[2])) if relative else 1.0
     # Rounding of the aggregate itself is not counted.
-    narrow = width <= tolerance * scale + 1e-14 * abs(numbers[1])
+    narrow = width <= float(tolerance) * scale + 1e-14 * abs(numbers[1])
     status = answer.status if narrow else max(answer.status, Status.PRECISION)
     return answer._replace(value=value, lower=lower, upper=upper, status=status)

@@ -242,10 +242,10 @@ def _status(prop: Property, result: _Found, tolerance: float) -> Status:
         return max(status, Status.NONFINITE)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0, upper - lower)
-        limit: Array = tolerance
+        limit: Array = float(tolerance)
         relative = isinstance(tolerance, RelativeTolerance)
         if prop.operator in ("R", "T") or relative:
-            limit = tolerance * np.maximum(np.abs(lower), np.abs(upper))
+            limit = limit * np.maximum(np.abs(lower), np.abs(upper))
             limit = limit if relative else np.maximum(limit, TINY)
         narrow = (width == 0) | ((width <= limit) & np.isfinite(width))
     # An average near zero is narrow as a share of the rewards that cancel out in it.

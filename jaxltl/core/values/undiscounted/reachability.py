@@ -200,7 +200,11 @@ def _on_host(
         )
     return with_given_policy(
         solution_from_enclosure(
-            model, sparse, enclosure, requested, relative=isinstance(requested, RelativeTolerance)
+            model,
+            sparse,
+            enclosure,
+            float(requested),
+            relative=isinstance(requested, RelativeTolerance),
         ),
         policy,
     )

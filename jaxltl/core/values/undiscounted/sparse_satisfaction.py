@@ -166,7 +166,7 @@ def _best(
         whole,
         whole,
         reachability(product.host, goal, maximize=aim == "max", tolerance=requested, depth=depth),
-        requested,
+        float(requested),
         relative=isinstance(requested, RelativeTolerance),
     )
     row = np.asarray(solution.policy)
