@@ -52,7 +52,7 @@ def maze(folder: Path, modes: list[int], num_starts: int, num_steps: int) -> Non
             problem = hidden_modes.make_problem(world, shown, number, evidence=tables.left_out)
             state = hidden_modes.fit(
                 jax.random.key(fold), problem, hparams, num_starts=num_starts, num_steps=num_steps
-            )
+            ).state
             problem = hidden_modes.make_problem(world, other, number, evidence=evidence)
             found = hidden_modes.log_likelihood(state, problem, hparams)
             rows.setdefault(name, []).append(float(found.sum()) / action.size)
@@ -95,10 +95,10 @@ def learned(world, state, action, hparams, num_starts):
     """A state and posterior modes of demonstrations, with entry rewards for each of two modes."""
     shown = trajectories(world, state, action)
     problem = hidden_modes.make_problem(world, shown, 2, features=entry_features(world))
-    found = hidden_modes.fit(
+    state = hidden_modes.fit(
         jax.random.key(0), problem, hparams, num_starts=num_starts, num_steps=200
-    )
-    return found, problem, np.asarray(hidden_modes.mode_probabilities(found, problem, hparams))
+    ).state
+    return state, problem, np.asarray(hidden_modes.mode_probabilities(state, problem, hparams))
 
 
 def grid(folder: Path, discounts: list[float], num_starts: int) -> None:

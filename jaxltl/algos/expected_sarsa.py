@@ -56,7 +56,7 @@ class Hparams:
       num_transitions: in a step; static. Default 100.
     """
 
-    discount: Number = traced(Range(0, 1, open_above=True))
+    discount: Number = traced("discount")
     step_size: Number = traced(Range(0, 1, open_below=True), default=0.1)
     epsilon: Number = traced(Range(0, 1), default=0.1)
     restart: Number = traced(Range(0, 1), default=0.01)

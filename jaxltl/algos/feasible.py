@@ -270,7 +270,7 @@ class Hparams:
 
     learning_rate: Schedule = traced(Range(0, open_above=True), default=0.1, schedule=True)
     optimizer: str = static((*optimizers.NAMES, "sign"), default="adam")
-    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
+    tolerance: Number | None = traced("tolerance", default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

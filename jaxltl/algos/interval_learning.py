@@ -185,15 +185,15 @@ class Hparams:
     """
 
     intervals: str = static(INTERVALS, default="linear")
-    confidence: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.9)
+    confidence: Number = traced("confidence", default=0.9)
     least: Number = traced(Range(0, 1, open_below=True), default=1e-4)
     strength: Number = traced(Range(0, open_below=True, open_above=True), default=5.0)
     most_strength: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
     exploration: Number = traced(Range(0, 1, open_below=True), default=0.1)
     restart: Number = traced(Range(0, 1), default=0.05)
-    discount: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.99)
+    discount: Number = traced("positive_discount", default=0.99)
     sweeps: Number = traced(Range(1), default=40)
-    tolerance: Number = traced(Range(0, open_above=True), default=1e-4)
+    tolerance: Number = traced("tolerance", default=1e-4)
     num_runs: int = static(COUNT, default=4)
     length: int = static(COUNT, default=64)
 

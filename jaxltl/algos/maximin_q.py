@@ -243,7 +243,7 @@ class Hparams:
         default 1024 and 64.
     """
 
-    discount: Number = traced(Range(0, 1, open_above=True))
+    discount: Number = traced("discount")
     step_size: Number | None = traced(Range(0, 1, open_below=True), default=None)
     step_power: Number | None = traced(Range(0.5, 1, open_below=True), default=None)
     epsilon: Number | None = traced(Range(0, 1), default=None)

@@ -154,12 +154,12 @@ class Hparams:
       horizon: number of steps, for a time-dependent policy, or None; static; default None.
     """
 
-    discount: Number = traced(Range(0, 1))
+    discount: Number = traced("closed_discount")
     l2: Number = traced(Range(0, open_above=True), default=1e-3)
     learning_rate: Number = traced(Range(0, open_above=True), default=3e-3)
     patience: Number = traced(Range(1), default=50)
-    mu: Number | None = traced(Range(0, open_above=True), default=None)
-    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
+    mu: Number | None = traced("mu", default=None)
+    tolerance: Number | None = traced("tolerance", default=None)
     optimizer: str = static(("lbfgs", *optimizers.NAMES), default="adam")
     method: str = static(("newton", "value_iteration"), default="value_iteration")
     horizon: int | None = static(COUNT, default=None)

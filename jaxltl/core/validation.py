@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -63,8 +63,12 @@ class Range:
         return ("an integer of " if self.integer else "") + " and ".join(ends)
 
 
+_DISCOUNT = Range(0, 1, open_above=True)
+
 RANGES = {
-    "discount": Range(0, 1, open_above=True),
+    "discount": _DISCOUNT,
+    "positive_discount": replace(_DISCOUNT, open_below=True),
+    "closed_discount": replace(_DISCOUNT, open_above=False),  # of finite horizons and episodes
     "tolerance": Range(0, open_above=True),
     "max_steps": Range(0, integer=True),
     "evaluation_sweeps": Range(0, integer=True),

@@ -462,3 +462,13 @@ def test_an_automaton_has_two_states_at_least():
     with pytest.raises(ValueError, match=r"num_memory=1; an automaton that is learned has"):
         world, _ = world_of()
         grounding.learn_automaton(world, jl.make_trajectories(world, [[(0, 0)]]), 1)
+
+
+def test_a_discount_out_of_range_is_refused():
+    world, seen = world_of()
+    shown = jl.make_trajectories(world, [[(0, 0)]])
+    with pytest.raises(ValueError, match="discount=1.5; it must be at least 0 and below 1"):
+        grounding.learn_automaton(world, shown, 2, discount=1.5)
+    problem = grounding.make_problem(world, seen, shown, TASK)
+    with pytest.raises(ValueError, match="discount=1.5; it must be at least 0 and below 1"):
+        grounding.posterior(problem, grounding.Hparams(discount=1.5))

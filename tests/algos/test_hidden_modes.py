@@ -1,7 +1,7 @@
 """Hidden modes and tables of histories: against enumeration of mode paths, literal counts, known modes."""
 
 import itertools
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -206,14 +206,16 @@ def test_known_modes_are_recovered_up_to_their_order():
     problem = hidden_modes.make_problem(
         world, trajectories(world, state, action), 2, features=features
     )
-    found = hidden_modes.fit(jax.random.key(1), problem, hparams, num_starts=3, num_steps=200)
+    learned = jl.check(
+        hidden_modes.fit(jax.random.key(1), problem, hparams, num_starts=3, num_steps=200)
+    )
 
     def agreement(parameters):
         posterior = hidden_modes.mode_probabilities(parameters, problem, hparams)
         share = (np.asarray(posterior).argmax(-1) == mode).mean()
         return max(share, 1 - share)
 
-    assert agreement(found) > max(0.9, agreement(truth) - 0.02)
+    assert agreement(learned.state) > max(0.9, agreement(truth) - 0.02)
 
 
 @pytest.mark.parametrize(
@@ -242,3 +244,17 @@ def test_invalid_histories_and_starts_are_named():
     problem, _ = small_problem()
     with pytest.raises(ValueError, match="num_starts=0"):
         hidden_modes.fit(jax.random.key(0), problem, HPARAMS, num_starts=0)
+
+
+def test_the_best_start_has_a_status():
+    problem, _ = small_problem()
+    runs = jax.jit(partial(hidden_modes.fit, num_starts=3, num_steps=2))
+    learned = runs(jax.random.key(0), problem, HPARAMS)
+    assert (learned.status, learned.num_steps) == (jl.Status.COMPLETED, 2)
+    every = [
+        hidden_modes.train(key, problem, HPARAMS, num_steps=2)[1].loss[-1]
+        for key in jax.random.split(jax.random.key(0), 3)
+    ]
+    np.testing.assert_allclose(learned.metrics.loss, min(every), rtol=1e-9)
+    lost = problem.replace(evidence=jnp.full_like(problem.evidence, jnp.nan))
+    assert runs(jax.random.key(0), lost, HPARAMS).status == jl.Status.NONFINITE

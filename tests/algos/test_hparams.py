@@ -15,10 +15,11 @@ from jaxltl import algos
 from jaxltl.algos.common.settings import flag_invalid
 from jaxltl.core import struct
 from jaxltl.core.types import Status
+from jaxltl.core.validation import RANGES
 
 LEARNERS = {
     name: module
-    for name in algos.__all__
+    for name in (*algos.__all__, "grounding.hidden_modes")
     if hasattr(module := importlib.import_module(f"jaxltl.algos.{name}"), "Hparams")
 }
 KINDS = {name: module.Hparams for name, module in LEARNERS.items()}
@@ -110,6 +111,14 @@ def test_every_value_out_of_range_is_refused_by_name(name, field, valid):
         if isinstance(value, float | int):
             assert status(float(value)) == Status.INVALID
     assert status(0.75) == Status.COMPLETED or valid.values.low == 1
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_range_that_solvers_have_too_is_declared_once(name):
+    """A stricter discount is one line in ``validation``, for solvers and learners."""
+    for field, valid in fields(KINDS[name]).items():
+        if field in RANGES or field.endswith("discount"):
+            assert any(valid.values is x for x in RANGES.values()), f"{field}: name its range"
 
 
 @struct.dataclass

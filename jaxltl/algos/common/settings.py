@@ -4,12 +4,13 @@ A learner's ``Hparams`` declares each field with its valid values::
 
     @struct.dataclass
     class Hparams:
-        discount: Number = traced(Range(0, 1, open_above=True))
+        discount: Number = traced("discount")
         learning_rate: Schedule = traced(Range(0, open_above=True), default=1e-3, schedule=True)
         method: str = static(("trpo", "cpo"), default="cpo")
         num_envs: int = static(Range(1, integer=True), default=8)
 
-A field with default None may be None. The functions made by
+A number that solvers have too, such as a discount, names its range in ``validation.RANGES``. A field
+with default None may be None. The functions made by
 :func:`~jaxltl.algos.common.learner.bind` call :func:`require_hparams` and :func:`flag_invalid`.
 """
 
@@ -71,11 +72,14 @@ class _Valid(NamedTuple):
     may_be_schedule: bool
 
 
-def traced(valid: Range, *, default: object = dataclasses.MISSING, schedule: bool = False) -> Any:
+def traced(
+    valid: Range | str, *, default: object = dataclasses.MISSING, schedule: bool = False
+) -> Any:
     """A dataclass field with a traced number in the range `valid`, or if `schedule` a schedule of them.
 
-    A field with `default` None may be None.
+    `valid` may name one of ``validation.RANGES``; a field with `default` None may be None.
     """
+    valid = validation.RANGES[valid] if isinstance(valid, str) else valid
     return struct.field(default=default, metadata={"valid": _Valid(valid, False, schedule)})
 
 

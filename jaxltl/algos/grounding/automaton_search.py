@@ -37,6 +37,7 @@ from jaxltl.algos.grounding.problem import LinearGrounding, Problem, joined_demo
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.models import MDP, Trajectories, stack_products
 from jaxltl.core.models.product import distinct_labels
+from jaxltl.core.validation import require_in_range
 
 SCALES = (10.0, 25.0, 50.0, 100.0)
 _PENALTY = 2.0  # nats for each moving transition and each event: suppresses chance improvements
@@ -85,8 +86,9 @@ def learn_automaton(
       states are numbered by the search.
 
     Raises:
-      ValueError: fewer than 2 memory states, or demonstrations that do not fit.
+      ValueError: fewer than 2 memory states, a discount out of range, or demonstrations that do not fit.
     """
+    require_in_range("discount", discount)
     if num_memory < 2:
         raise ValueError(f"num_memory={num_memory}; an automaton that is learned has at least 2.")
     worlds = [worlds] if isinstance(worlds, MDP) else list(worlds)

@@ -24,7 +24,8 @@ Example: first the action 0 nine times, then the action 1.
   >>> shown = jl.make_trajectories(world, [[(0, t // 9) for t in range(18)]])
   >>> problem = hidden_modes.make_problem(world, shown, 2, features=[[[0.0], [1.0]]])
   >>> hparams = hidden_modes.Hparams(l2=0.01)
-  >>> state = hidden_modes.fit(jax.random.key(0), problem, hparams, num_starts=3)
+  >>> learned = jl.check(hidden_modes.fit(jax.random.key(0), problem, hparams, num_starts=3))
+  >>> state = learned.state
   >>> mode = hidden_modes.mode_probabilities(state, problem, hparams)[0].argmax(-1)  # [T]
   >>> bool((mode[:9] == mode[0]).all() & (mode[9:] == 1 - mode[0]).all())
   True
@@ -45,6 +46,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common.loops import Learned
 from jaxltl.algos.common.settings import Number, static, traced
 from jaxltl.algos.grounding.learner import State as State
 from jaxltl.algos.grounding.problem import NEVER, forward, joined_demonstrations
@@ -52,7 +54,7 @@ from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.trajectories import Trajectories, require_states
-from jaxltl.core.types import Status
+from jaxltl.core.types import Status, worst
 from jaxltl.core.validation import Range, require_in_range
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
@@ -93,7 +95,7 @@ class Hparams:
       optimizer: the name of one of optax; static; default ``"adam"``.
     """
 
-    discount: Number = traced(Range(0, 1, open_above=True), default=0.9)
+    discount: Number = traced("discount", default=0.9)
     l2: Number = traced(Range(0, open_above=True), default=1.0)
     learning_rate: Number = traced(Range(0, open_above=True), default=0.05)
     optimizer: str = static(optimizers.NAMES, default="adam")
@@ -231,19 +233,25 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 def fit(
     key: Key, problem: Problem, hparams: Hparams, *, num_starts: int = 4, num_steps: int = 300
-) -> State:
-    """The state of least loss of `num_starts` random starts from `key`, trained as a batch.
+) -> Learned:
+    """The run of least loss of `num_starts` random starts from `key`, trained as a batch.
 
-    The `problem`, `hparams` and `num_steps` are those of ``train``. The state scores other
-    demonstrations: give :func:`log_likelihood` a problem with them. Raises ValueError if a number is
-    out of range.
+    The `problem`, `hparams` and `num_steps` are those of ``train``. Returns
+    :class:`~jaxltl.algos.common.loops.Learned` with the status COMPLETED, NONFINITE if no start has a
+    finite loss, or a worse status of the solver. The state scores other demonstrations: give
+    :func:`log_likelihood` a problem with them. Raises ValueError if a number is out of range.
     """
     require_in_range("num_starts", num_starts, Range(1, integer=True))
     states, metrics = jax.vmap(partial(train, num_steps=num_steps, max_rows=1), (0, None, None))(
         jax.random.split(key, num_starts), problem, hparams
     )
-    best = jnp.nanargmin(metrics.loss[:, -1])
-    return jax.tree.map(lambda x: x[best], states)
+    loss = jnp.where(jnp.isnan(metrics.loss[:, -1]), jnp.inf, metrics.loss[:, -1])
+    best = jnp.argmin(loss)
+    state, last = jax.tree.map(
+        lambda x: x[best], (states, jax.tree.map(lambda x: x[:, -1], metrics))
+    )
+    status = learner.completion_status(jnp.bool_(True), jnp.isfinite(loss[best]))
+    return Learned(state, last, jnp.int32(num_steps), worst(status, last.status))
 
 
 @jax.jit

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxltl.algos.common.settings import Number
+from jaxltl.algos.common.settings import Number, require_hparams
 from jaxltl.algos.grounding.problem import Hparams, Problem, certain_memory, motive_log_policy
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
@@ -104,10 +104,11 @@ def posterior(
       ``M ** P`` are scored up to 20,000, else a beam search visits those with the largest weights.
 
     Raises:
-      ValueError: no candidate meaning, meanings of another shape, or a demonstration that no grounding
-        explains: at the scales that the others make likely, uniformly random actions are 10,000 times
-        as likely under each.
+      ValueError: a hyperparameter out of range; no candidate meaning, or meanings of another shape; or
+        a demonstration that no grounding explains: at the scales that the others make likely,
+        uniformly random actions are 10,000 times as likely under each.
     """
+    require_hparams(hparams)
     meaning, titles = _meanings(problem, meanings, names)
     symmetries = symbol_symmetries(automaton_of(problem))
     score = partial(_scores, problem, hparams.discount, meaning, np.asarray(scales, float))

@@ -95,7 +95,7 @@ class Hparams:
       optimizer: the name of one of optax; static; default ``"adam"``.
     """
 
-    discount: Number = traced(Range(0, 1, open_above=True), default=0.95)
+    discount: Number = traced("discount", default=0.95)
     scale: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
     l2: Number = traced(Range(0, open_above=True), default=1e-2)
     hardness: Number = traced(Range(0, open_above=True), default=0.0)

@@ -135,8 +135,8 @@ class Hparams:
         ``"lbfgs"``.
     """
 
-    discount: Number = traced(Range(0, 1, open_above=True))
-    mu: Number | None = traced(Range(0, open_above=True), default=None)
+    discount: Number = traced("discount")
+    mu: Number | None = traced("mu", default=None)
     l2: Number = traced(Range(0, open_above=True), default=1e-3)
     learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
     start_scale: Number = traced(Range(0, open_above=True), default=1.0)

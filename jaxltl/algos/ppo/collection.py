@@ -78,7 +78,7 @@ class Hparams:
         of sums; collected transitions are replicated once for each step. Default None.
     """
 
-    discount: Number = traced(Range(0, 1))
+    discount: Number = traced("closed_discount")
     gae_lambda: Number = traced(Range(0, 1), default=0.95)
     learning_rate: Schedule = traced(Range(0, open_above=True), default=2.5e-4, schedule=True)
     clip: Schedule = traced(Range(0), default=0.2, schedule=True)

@@ -232,7 +232,7 @@ class Hparams:
         default 128.
     """
 
-    discount: Number = traced(Range(0, 1, open_below=True, open_above=True))
+    discount: Number = traced("positive_discount")
     reward_bound: Number = traced(Range(0, open_below=True, open_above=True))
     epsilon: Number = traced(Range(0, open_below=True, open_above=True))
     failure: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.1)

@@ -131,8 +131,8 @@ class Hparams:
       value_batches: minibatches of each pass; static; default 8.
     """
 
-    discount: Number = traced(Range(0, 1))
-    cost_discount: Number = traced(Range(0, 1), default=1.0)
+    discount: Number = traced("closed_discount")
+    cost_discount: Number = traced("closed_discount", default=1.0)
     gae_lambda: Number = traced(Range(0, 1), default=0.97)
     cost_gae_lambda: Number = traced(Range(0, 1), default=0.97)
     delta: Number = traced(Range(0, open_above=True), default=0.01)
