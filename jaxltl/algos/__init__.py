@@ -5,11 +5,8 @@ A learner has ``Problem``, ``Hparams``, ``State`` and ``Metrics``; ``make_proble
 ``policy(state, problem, hparams)``. Steps and runs support ``jit`` and ``vmap``; they are not
 differentiable unless their documentation says so.
 
-From demonstrations: ``mlirl``, ``todirl``, ``behavioral_cloning``; of tasks with unknown labels:
-``grounding``. From interaction with a model:
-``expected_sarsa``, ``maximin_q``, ``rmax``, ``interval_learning``. From interaction with a
-simulator: ``ppo``, ``many_tasks``, ``cce``, ``trust_region``. Parameters of a parametric model:
-``feasible``, ``regions``. Shared parts are in ``common``.
+``dir(jaxltl.algos)`` lists them; the page "Which function to use" helps to choose one. Shared parts are
+in ``common``.
 """
 
 import lazy_loader

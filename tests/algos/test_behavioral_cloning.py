@@ -13,6 +13,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.algos import behavioral_cloning as bc
 from jaxltl.core.models.construct.batch import stack_products, unstack_product
+from tests.algos.cases import LearnerCase, world
 
 SMALL = bc.DensePolicy(hidden=(16,))
 
@@ -209,3 +210,21 @@ make = partial(bc.make_problem, held_out=None, network=SMALL)
 def test_what_does_not_fit_is_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def cloning():
+    mdp, demonstrations = world()
+    network = bc.DensePolicy(num_actions=2, hidden=(4,))
+    problem = bc.make_problem(
+        jl.product(mdp, "!r U g"), jnp.eye(3), demonstrations, held_out=0.5, network=network
+    )
+    setting = partial(bc.Hparams, batch=5)
+    return LearnerCase(bc, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3))
+
+
+CASES = {
+    "cloning": cloning,
+}

@@ -19,6 +19,7 @@ from jaxltl.algos.cce import exponential_family as ef
 from jaxltl.algos.cce import state as elites_of
 from jaxltl.algos.common.schedules import theorem_conditions
 from jaxltl.core.types import Status
+from tests.algos.cases import LearnerCase
 from tests.support import counted_traces, lane
 
 TARGET = jnp.array([2.0, 1.0])
@@ -653,3 +654,26 @@ def test_a_population_over_two_devices_is_the_population():
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.strip() == "equal on 2"
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def noisy_quadratic(x, key):
+    return jax.random.normal(key) - jnp.sum((x - 1.0) ** 2), jnp.sum(x)
+
+
+def cross_entropy():
+    problem = cce.make_problem(noisy_quadratic, ef.diagonal_gaussian(jnp.zeros(2), 1.0), limit=1.0)
+    setting = partial(cce.Hparams, population=10, elite_reuse=True)
+    return LearnerCase(
+        cce,
+        problem,
+        setting(rate=cce.Polynomial(0.5, -0.5)),
+        setting(rate=cce.Polynomial(0.9, -0.2), temperature=2.0),
+    )
+
+
+CASES = {
+    "cce": cross_entropy,
+}

@@ -1,5 +1,7 @@
 """Expected SARSA against policy evaluation, and its mask."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import expected_sarsa as sarsa
+from tests.algos.cases import LearnerCase, numbers, world
 
 HPARAMS = sarsa.Hparams(discount=0.6, step_size=1.0, epsilon=0.3, restart=0.1)
 
@@ -41,3 +44,17 @@ def test_mistakes_are_named():
         sarsa.make_problem(model, reward[:2])
     with pytest.raises(ValueError, match="allowed"):
         sarsa.make_problem(model, reward, allowed=np.ones((5, 2), bool))
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def temporal_difference():
+    problem = sarsa.make_problem(world()[0], numbers(3, 2))
+    setting = partial(sarsa.Hparams, num_transitions=7, restart=0.3)
+    return LearnerCase(sarsa, problem, setting(0.9), setting(0.8, step_size=0.3), reward="reward")
+
+
+CASES = {
+    "sarsa": temporal_difference,
+}

@@ -19,6 +19,7 @@ from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.io.drn.parametric import read_parametric
+from tests.algos.cases import LearnerCase
 from tests.sparse_models import exact_solve
 from tests.support import counted_traces
 
@@ -498,3 +499,26 @@ def test_a_model_without_a_box():
 def test_bad_budgets_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         Budget(**changed)
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def two_throws(x):
+    p, q = x
+    return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
+
+
+def parameters():
+    """A head, then a tail, of two coins."""
+    chain = make_sparse(
+        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1], initial=[1, 0, 0, 0]
+    )
+    model = make_parametric(chain, two_throws, [0.1, 0.2], [0.9, 0.8])
+    problem = search.make_problem(model, np.arange(4) == 2, bound=">=")
+    return LearnerCase(search, problem, search.Hparams(), search.Hparams(learning_rate=0.01))
+
+
+CASES = {
+    "feasible": parameters,
+}

@@ -1,7 +1,7 @@
 """Symbol grounding: laws of its likelihood against enumeration, differences and mlirl."""
 
 import itertools
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxltl.algos.grounding.problem import (
 )
 from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.envs.gridworld import gridworld
+from tests.algos.cases import LearnerCase, world
 
 TASK = "!c U (a & F b)"
 MAP = "a . b\n. c .\nd . ."
@@ -467,8 +468,26 @@ def test_an_automaton_has_two_states_at_least():
 def test_a_discount_out_of_range_is_refused():
     world, seen = world_of()
     shown = jl.make_trajectories(world, [[(0, 0)]])
-    with pytest.raises(ValueError, match="discount=1.5; it must be at least 0 and below 1"):
+    with pytest.raises(ValueError, match=r"discount=1\.5; it must be at least 0 and below 1"):
         grounding.learn_automaton(world, shown, 2, discount=1.5)
     problem = grounding.make_problem(world, seen, shown, TASK)
-    with pytest.raises(ValueError, match="discount=1.5; it must be at least 0 and below 1"):
+    with pytest.raises(ValueError, match=r"discount=1\.5; it must be at least 0 and below 1"):
         grounding.posterior(problem, grounding.Hparams(discount=1.5))
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def symbols():
+    """A goal without a label, and a trap."""
+    mdp, demonstrations = world()
+    problem = grounding.make_problem(mdp, np.eye(3), demonstrations, "!r U g")
+    setting = partial(grounding.Hparams, discount=0.5)
+    return LearnerCase(
+        grounding, problem, setting(), setting(l2=0.1, hardness=0.1, learning_rate=0.01)
+    )
+
+
+CASES = {
+    "grounding": symbols,
+}

@@ -14,6 +14,7 @@ from benchmarks.hidden_modes import entry_features, simulated, trajectories
 from jaxltl.algos import grounding
 from jaxltl.algos.grounding import hidden_modes
 from jaxltl.envs import gridworld
+from tests.algos.cases import LearnerCase, numbers, world
 
 HPARAMS = hidden_modes.Hparams(discount=0.7, l2=0.3)
 
@@ -258,3 +259,22 @@ def test_the_best_start_has_a_status():
     np.testing.assert_allclose(learned.metrics.loss, min(every), rtol=1e-9)
     lost = problem.replace(evidence=jnp.full_like(problem.evidence, jnp.nan))
     assert runs(jax.random.key(0), lost, HPARAMS).status == jl.Status.NONFINITE
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def modes():
+    """Two hidden modes, with a reward and evidence each."""
+    mdp, demonstrations = world()
+    features, evidence = numbers(3, 2, 2), numbers(2, 3, 2, 1)
+    problem = hidden_modes.make_problem(
+        mdp, demonstrations, 2, features=features, evidence=evidence
+    )
+    setting = partial(hidden_modes.Hparams, discount=0.5)
+    return LearnerCase(hidden_modes, problem, setting(), setting(l2=0.1, learning_rate=0.01))
+
+
+CASES = {
+    "modes": modes,
+}

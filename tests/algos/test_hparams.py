@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import re
 
@@ -11,17 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import algos
 from jaxltl.algos.common.settings import flag_invalid
 from jaxltl.core import struct
 from jaxltl.core.types import Status
 from jaxltl.core.validation import RANGES
+from tests.algos.cases import LEARNERS
 
-LEARNERS = {
-    name: module
-    for name in (*algos.__all__, "grounding.hidden_modes")
-    if hasattr(module := importlib.import_module(f"jaxltl.algos.{name}"), "Hparams")
-}
 KINDS = {name: module.Hparams for name, module in LEARNERS.items()}
 # Arrays, whose shapes depend on the problem, and shardings have no range.
 WITHOUT_RANGE = {"margin", "noise", "sharding"}

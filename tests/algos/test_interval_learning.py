@@ -19,6 +19,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 from tests import reference
+from tests.algos.cases import LearnerCase, world
 from tests.support import as_mdp, counted_traces, lane, nature_word
 
 S, A, K = 6, 2, 3
@@ -380,3 +381,18 @@ def test_what_makes_no_sense_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             learning.init(jax.random.key(0), problem, settings(**changed))
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def intervals():
+    """Slips that lose, beside tries that may be repeated."""
+    problem = learning.make_problem(world()[0], "!r U g")
+    setting = partial(learning.Hparams, num_runs=2, length=5)
+    return LearnerCase(learning, problem, setting(), setting(strength=1.0, exploration=0.5))
+
+
+CASES = {
+    "intervals": intervals,
+}

@@ -6,12 +6,13 @@ of as many rows: their number of steps is an argument.
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import pickle
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,39 +21,15 @@ import pytest
 from jax.tree_util import Partial
 
 import jaxltl as jl
-from jaxltl.algos import (
-    behavioral_cloning,
-    cce,
-    expected_sarsa,
-    feasible,
-    grounding,
-    interval_learning,
-    maximin_q,
-    mlirl,
-    ppo,
-    rmax,
-    todirl,
-    trust_region,
-)
-from jaxltl.algos.cce.exponential_family import diagonal_gaussian
+from jaxltl import algos
+from jaxltl.algos import mlirl
 from jaxltl.algos.common import checkpoint, learner, loops
 from jaxltl.algos.common.chunks import Options, run_in_chunks
 from jaxltl.core import struct
-from jaxltl.core.environments.environment import Timestep, make_box, make_environment
-from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.types import Status
+from tests.algos.cases import LEARNERS, LearnerCase
 from tests.support import counted_traces, lane
-
-
-class Case(NamedTuple):
-    """A learner, a problem for it, and two settings of the same kind."""
-
-    module: Any
-    problem: Any
-    hparams: Any
-    other: Any
 
 
 @struct.dataclass
@@ -87,291 +64,14 @@ TOY = SimpleNamespace(
 )
 
 
-def world():
-    """A start, a goal and a trap, which have one action; lists of successors with padding."""
-    mdp = jl.make_mdp(
-        [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
-        [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
-        available=[[True, True], [True, False], [True, False]],
-        initial=[1, 0, 0],
-        label=[[False, False], [True, False], [False, True]],
-        propositions=["g", "r"],
-    )
-    runs = [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]]
-    return mdp, jl.make_trajectories(mdp, runs)
+def cases_of(name):
+    """The cases in the tests of a learner."""
+    return importlib.import_module(f"tests.algos.test_{name.rpartition('.')[2]}").CASES
 
 
-def numbers(*shape):
-    return np.random.default_rng(0).normal(size=shape)
-
-
-def mlirl_world():
-    mdp, demonstrations = world()
-    setting = partial(mlirl.Hparams, optimizer="adam")
-    return Case(
-        mlirl,
-        mlirl.make_problem(mdp, numbers(3, 2, 2), demonstrations),
-        setting(discount=0.5),
-        setting(discount=0.4, l2=1e-2, learning_rate=0.01),
-    )
-
-
-def mlirl_product():
-    mdp, demonstrations = world()
-    lazy = jl.product(mdp, "!r U g")
-    features = numbers(*lazy.state_shape, 2, 2)
-    return Case(
-        mlirl,
-        mlirl.make_problem(lazy, features, demonstrations),
-        mlirl.Hparams(discount=0.5, mu=0.1),
-        mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
-    )
-
-
-def task_oriented():
-    # Plain descent: a constant reward changes nothing, and Adam would make a step of the rounding.
-    mdp, demonstrations = world()
-    setting = partial(todirl.Hparams, optimizer="sgd")
-    problem = todirl.make_problem(
-        jl.product(mdp, "!r U g", label_on="exit"),
-        np.eye(3),
-        demonstrations,
-        network=todirl.RewardNetwork((3,)),
-        held_out=0.5,
-    )
-    return Case(
-        todirl,
-        problem,
-        setting(discount=0.9, patience=3),
-        setting(discount=0.8, l2=0.1, learning_rate=0.05, patience=4),
-    )
-
-
-def alternating_game():
-    """Two of the system's states between two of the environment's, where chance plays."""
-    successor = [[[2, 0], [3, 0]], [[3, 0], [0, 0]], [[0, 1], [1, 0]], [[1, 0], [0, 1]]]
-    certain, fair = [[1, 0], [1, 0]], [[0.5, 0.5], [1, 0]]
-    mdp = jl.make_mdp(
-        successor,
-        [certain, [[1, 0], [0, 0]], fair, fair],
-        available=[[True, True], [True, False], [True, True], [True, True]],
-    )
-    reward = [[1.0, 0.0], [0.3, 0.0], [0.2, 0.0], [0.0, 0.3]]
-    return make_game(mdp, [True, True, False, False]), reward
-
-
-def q_learning(method):
-    setting = partial(
-        maximin_q.Hparams,
-        step_size=1.0,
-        step_power=0.7,
-        epsilon=0.5,
-        environment_epsilon=0.5,
-        num_chains=3,
-        moves_per_step=5,
-    )
-    return Case(
-        maximin_q,
-        maximin_q.make_problem(*alternating_game(), method=method),
-        setting(discount=0.5),
-        setting(discount=0.7, step_size=0.5, restart=0.2, epsilon=0.1),
-    )
-
-
-def pac_learning():
-    game, reward = alternating_game()
-    setting = partial(rmax.Hparams, known_after=3, epsilon=0.1, reward_bound=1.0, moves_per_step=7)
-    return Case(
-        rmax,
-        rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
-        setting(discount=0.5, restart=0.1),
-        setting(discount=0.6, restart=0.3),
-    )
-
-
-def noisy_quadratic(x, key):
-    return jax.random.normal(key) - jnp.sum((x - 1.0) ** 2), jnp.sum(x)
-
-
-def cross_entropy():
-    problem = cce.make_problem(noisy_quadratic, diagonal_gaussian(jnp.zeros(2), 1.0), limit=1.0)
-    setting = partial(cce.Hparams, population=10, elite_reuse=True)
-    return Case(
-        cce,
-        problem,
-        setting(rate=cce.Polynomial(0.5, -0.5)),
-        setting(rate=cce.Polynomial(0.9, -0.2), temperature=2.0),
-    )
-
-
-def choice_reset(key):
-    return jax.random.uniform(key, (2,), minval=-1)
-
-
-def choice_step(world, action, key):
-    """A point pushed about; the reward is for being near, the cost is the push."""
-    place = world + 0.3 * action
-    return Timestep(place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
-
-
-def choice_observe(world):
-    return world
-
-
-def trust(method, **networks):
-    setting = partial(
-        trust_region.Hparams,
-        method=method,
-        num_trajectories=6,
-        value_hidden=(),
-        cg_steps=3,
-        value_epochs=1,
-        value_batches=2,
-        **networks,
-    )
-    world = make_environment(
-        choice_reset, choice_step, choice_observe, actions=make_box(-jnp.inf, jnp.inf, (2,))
-    )
-    problem = trust_region.make_problem(world, horizon=4, limit=6.0)
-    return Case(
-        trust_region,
-        problem,
-        setting(discount=0.9),
-        setting(discount=0.8, delta=0.02, cost_discount=0.9, value_rate=0.1),
-    )
-
-
-def corridor_reset(width, key):
-    return jnp.int32(0)
-
-
-def corridor_step(width, place, action, key):
-    """To the end and back, now and then cut off; there and back earns most."""
-    place = place + jnp.array([1, -1, 0], jnp.int32)[action]
-    return Timestep(
-        place, reward=place / width, terminated=place < 0, truncated=jax.random.bernoulli(key, 0.1)
-    )
-
-
-def corridor_observe(width, place):
-    return {"place": place / width, "end": place == 3}
-
-
-def corridor_allowed(width, place):
-    return jnp.array([place < 3, True, True])
-
-
-def proximal(squash="clip", **options):
-    width = np.array(3.0)
-    if squash == "tanh":
-        world = make_environment(
-            choice_reset, choice_step, choice_observe, actions=make_box(-1, 1, (2,))
-        )
-        network = ppo.RecurrentActorCritic(shape=(2,), hidden=(), memory=2)
-        problem = ppo.make_problem(world, network=network, memory=np.array([0.1, 0.2]))
-    else:
-        world = make_environment(
-            *(Partial(f, width) for f in (corridor_reset, corridor_step, corridor_observe)),
-            actions=3,
-            allowed=Partial(corridor_allowed, width),
-        )
-        problem = ppo.make_problem(world, network=ppo.ActorCritic(3, hidden=()))
-    setting = partial(
-        ppo.Hparams,
-        num_envs=4,
-        num_steps=6,
-        num_epochs=1,
-        num_minibatches=2,
-        squash=squash,
-        **options,
-    )
-    return Case(
-        ppo,
-        problem,
-        setting(discount=0.9, learning_rate=0.01),
-        setting(discount=0.8, learning_rate=0.02, clip=0.1, gae_lambda=0.5),
-    )
-
-
-def cloning():
-    mdp, demonstrations = world()
-    network = behavioral_cloning.DensePolicy(num_actions=2, hidden=(4,))
-    problem = behavioral_cloning.make_problem(
-        jl.product(mdp, "!r U g"), jnp.eye(3), demonstrations, held_out=0.5, network=network
-    )
-    setting = partial(behavioral_cloning.Hparams, batch=5)
-    return Case(
-        behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3)
-    )
-
-
-def two_throws(x):
-    p, q = x
-    return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
-
-
-def parameters():
-    """A head, then a tail, of two coins."""
-    chain = jl.make_sparse(
-        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1], initial=[1, 0, 0, 0]
-    )
-    model = make_parametric(chain, two_throws, [0.1, 0.2], [0.9, 0.8])
-    problem = feasible.make_problem(model, np.arange(4) == 2, bound=">=")
-    return Case(feasible, problem, feasible.Hparams(), feasible.Hparams(learning_rate=0.01))
-
-
-def intervals():
-    """Slips that lose, beside tries that may be repeated."""
-    problem = interval_learning.make_problem(world()[0], "!r U g")
-    setting = partial(interval_learning.Hparams, num_runs=2, length=5)
-    return Case(interval_learning, problem, setting(), setting(strength=1.0, exploration=0.5))
-
-
-def symbols():
-    """A goal without a label, and a trap."""
-    mdp, demonstrations = world()
-    problem = grounding.make_problem(mdp, np.eye(3), demonstrations, "!r U g")
-    setting = partial(grounding.Hparams, discount=0.5)
-    return Case(grounding, problem, setting(), setting(l2=0.1, hardness=0.1, learning_rate=0.01))
-
-
-def modes():
-    """Two hidden modes, with a reward and evidence each."""
-    mdp, demonstrations = world()
-    features, evidence = numbers(3, 2, 2), numbers(2, 3, 2, 1)
-    problem = grounding.hidden_modes.make_problem(
-        mdp, demonstrations, 2, features=features, evidence=evidence
-    )
-    setting = partial(grounding.hidden_modes.Hparams, discount=0.5)
-    return Case(grounding.hidden_modes, problem, setting(), setting(l2=0.1, learning_rate=0.01))
-
-
-def temporal_difference():
-    problem = expected_sarsa.make_problem(world()[0], numbers(3, 2))
-    setting = partial(expected_sarsa.Hparams, num_transitions=7, restart=0.3)
-    return Case(expected_sarsa, problem, setting(0.9), setting(0.8, step_size=0.3))
-
-
-LEARNERS = {
-    "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
-    "mlirl-world": mlirl_world,
-    "mlirl-product": mlirl_product,
-    "todirl": task_oriented,
-    "q-generalized": partial(q_learning, "generalized"),
-    "q-maximin": partial(q_learning, "maximin"),
-    "rmax": pac_learning,
-    "trpo": partial(trust, "trpo", hidden=(), normalize=False),
-    "cpo": partial(trust, "cpo", hidden=(3,)),
-    "ppo": partial(proximal, normalize_observation=True, normalize_reward=True),
-    "ppo-memory": partial(proximal, "tanh", num_resets=3),
-    "cce": cross_entropy,
-    "cloning": cloning,
-    "feasible": parameters,
-    "grounding": symbols,
-    "intervals": intervals,
-    "modes": modes,
-    "sarsa": temporal_difference,
-}
+CASES = {"toy": lambda: LearnerCase(TOY, jnp.arange(3.0), 0.1, 0.2)}
+for learner_name in LEARNERS:
+    CASES |= cases_of(learner_name)
 
 # Two ways to write a problem of one learner down, and a network that remembers, which takes
 # longest to compile, have the laws of the others; the last is tested beside its learner, too.
@@ -384,18 +84,18 @@ def each(names):
     )
 
 
-by_learner = each(LEARNERS)
+by_learner = each(CASES)
 
 
 @cache
-def case(name: str) -> Case:
-    return LEARNERS[name]()
+def case(name: str) -> LearnerCase:
+    return CASES[name]()
 
 
 @cache
 def starts(name: str):
     """Three runs side by side; the first and the last have the same key."""
-    module, problem, hparams, _ = case(name)
+    module, problem, hparams, *_ = case(name)
     keys = jax.random.split(jax.random.key(0), 3)
     init = jax.jit(jax.vmap(module.init, (0, None, None)))
     return init(keys.at[2].set(keys[0]), problem, hparams)
@@ -407,7 +107,7 @@ def start(name: str, i: int = 0):
 
 def steps(name: str, state, num_steps, problem=None, hparams=None):
     """A run in two rows, whatever its length: one program serves all."""
-    module, own, asked, _ = case(name)
+    module, own, asked, *_ = case(name)
     return module.run(
         state,
         own if problem is None else problem,
@@ -503,7 +203,7 @@ def nudged(tree, dtype=float):
 
 @by_learner
 def test_a_saved_state_goes_on_bitwise_and_with_nothing_else(name, tmp_path):
-    _, problem, hparams, other = case(name)
+    _, problem, hparams, other, _ = case(name)
     given = checkpoint.fingerprint(problem=problem, hparams=hparams)
     state, _ = steps(name, start(name), 2)
     checkpoint.save(tmp_path / "state.npz", state, given)
@@ -517,9 +217,22 @@ def test_a_saved_state_goes_on_bitwise_and_with_nothing_else(name, tmp_path):
             checkpoint.load(tmp_path / "state.npz", start(name), now)
 
 
+def test_every_learner_is_exported_and_keeps_the_laws():
+    """A module of `algos` that binds the loops of learners is in ``algos.__all__`` and has a case."""
+    folder = Path(algos.__file__).parent
+    bound = {
+        str(path.relative_to(folder).with_suffix("")).replace("/", ".").removesuffix(".learner")
+        for path in folder.rglob("*.py")
+        if "= learner.bind(" in path.read_text() and path.parent.name != "common"
+    }
+    assert bound == set(LEARNERS)
+    assert {x.partition(".")[0] for x in bound} <= set(algos.__all__)
+    assert {case(name).module for name in CASES if name != "toy"} == set(LEARNERS.values())
+
+
 @by_learner
 def test_every_learner_is_called_alike(name):
-    module, problem, hparams, _ = case(name)
+    module, problem, hparams, *_ = case(name)
     for function, arguments in {
         "init": ["key", "problem", "hparams"],
         "step": ["state", "problem", "hparams"],
@@ -563,7 +276,7 @@ def test_every_learner_is_called_alike(name):
 
 @each(["mlirl-product", "rmax", "q-maximin", "cce", "ppo"])
 def test_a_traced_hyperparameter_out_of_range_is_invalid(name):
-    module, problem, hparams, _ = case(name)
+    module, problem, hparams, *_ = case(name)
     field = "temperature" if name == "cce" else "discount"
 
     @jax.jit
@@ -595,27 +308,18 @@ def disturbed(tree):
     return jax.tree.map(model, tree, is_leaf=lambda x: isinstance(x, MDP))
 
 
-REWARDS = {
-    "mlirl-world": "features",
-    "mlirl-product": "features",
-    "rmax": "reward",
-    "sarsa": "reward",
-    "q-generalized": "reward",
-    "q-maximin": "reward",
-}
-
-
-@each([*REWARDS, "todirl", "grounding", "intervals", "modes"])
+@by_learner
 def test_what_is_not_available_changes_nothing(name):
     """Bit for bit: what was learned, and all figures."""
-    module, problem, hparams, _ = case(name)
+    module, problem, hparams, _, reward = case(name)
     other = disturbed(problem)
-    if name in REWARDS:
+    if reward is not None:
         model = problem.model if hasattr(problem, "model") else problem.game
-        values = np.array(getattr(problem, REWARDS[name]))
+        values = np.array(getattr(problem, reward))
         values[~np.asarray(model.available)] = -1e9
-        other = other.replace(**{REWARDS[name]: jnp.asarray(values)})
-    assert differ(other, problem)
+        other = other.replace(**{reward: jnp.asarray(values)})
+    if not differ(other, problem):
+        pytest.skip("the problem has no actions that are not available, and no padding")
     assert_bitwise(steps(name, start(name), 4, problem=other)[1], four_steps(name)[1])
     state, policy = four_steps(name)[0], jax.jit(module.policy)
     found = steps(name, start(name), 4, problem=other)[0]
@@ -629,7 +333,7 @@ def test_what_is_not_available_changes_nothing(name):
     ("num_steps", "max_rows"), [(1, 1), (6, 6), (10, 4), (7, 3), (9, 1), (12, 5)]
 )
 def test_metrics_are_thinned_and_end_with_the_last_step(num_steps, max_rows):
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     state, metrics = module.run(
         start("toy"), problem, hparams, num_steps=num_steps, max_rows=max_rows
     )
@@ -644,7 +348,7 @@ def test_metrics_are_thinned_and_end_with_the_last_step(num_steps, max_rows):
 
 @pytest.mark.parametrize("limits", [{"num_steps": 0}, {"num_steps": 5, "max_rows": 0}])
 def test_runs_have_at_least_one_step_and_row(limits):
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     with pytest.raises(ValueError, match="must be at least 1"):
         module.run(start("toy"), problem, hparams, **limits)
 
@@ -660,7 +364,7 @@ def reaches(number, before, after, metrics):
 
 
 def test_a_run_ends_with_the_step_that_meets_the_condition():
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     run = partial(module.run_until, start("toy"), problem, hparams)
     found = jl.check(run(until=Partial(reaches, 5), num_steps=20))
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=6, max_rows=1)
@@ -685,7 +389,7 @@ def test_a_run_ends_with_the_step_that_meets_the_condition():
 
 
 def test_lanes_end_each_for_itself():
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     most = jnp.array([3, 50, 7])
     found = jax.vmap(
         lambda state, n: module.run_until(
@@ -709,7 +413,7 @@ def test_lanes_end_each_for_itself():
     ],
 )
 def test_runs_that_make_no_sense_are_refused(options, message):
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     given = (problem, hparams, Partial(reaches, 1), options.get("num_steps", 3))
     options = {k: x for k, x in options.items() if k != "num_steps"}
     with pytest.raises(ValueError, match=message):
@@ -747,7 +451,7 @@ def test_a_loop_of_lanes_is_a_while_loop():
 
 
 def test_a_run_in_chunks_is_the_run():
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
     reports = []
     found = run_in_chunks(
         module.step,
@@ -768,7 +472,7 @@ def test_a_run_in_chunks_is_the_run():
 
 def test_runs_side_by_side_in_chunks():
     """Each with its own number and its own end."""
-    module, problem, _, _ = case("toy")
+    module, problem, *_ = case("toy")
     given = np.array([0.1, 0.2, 0.3])
     chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9)
     options = Options(
@@ -794,7 +498,7 @@ def test_runs_side_by_side_in_chunks():
 
 @pytest.mark.parametrize("name", ["toy", "cloning"])
 def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
-    module, problem, hparams, other = case(name)
+    module, problem, hparams, other, _ = case(name)
     path = tmp_path / "run.npz"
     seen = []
 

@@ -19,6 +19,7 @@ from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.envs.robots import diagonal_reward, robots
+from tests.algos.cases import LearnerCase, alternating_game
 from tests.support import counted_traces
 
 
@@ -578,3 +579,31 @@ def test_bad_settings_are_refused(model, settings, message):
     hparams = maximin_q.Hparams(discount=0.9, **settings)
     with pytest.raises(ValueError, match=message):
         maximin_q.train(jax.random.key(0), problem, hparams, num_steps=1)
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def q_learning(method):
+    setting = partial(
+        maximin_q.Hparams,
+        step_size=1.0,
+        step_power=0.7,
+        epsilon=0.5,
+        environment_epsilon=0.5,
+        num_chains=3,
+        moves_per_step=5,
+    )
+    return LearnerCase(
+        maximin_q,
+        maximin_q.make_problem(*alternating_game(), method=method),
+        setting(discount=0.5),
+        setting(discount=0.7, step_size=0.5, restart=0.2, epsilon=0.1),
+        reward="reward",
+    )
+
+
+CASES = {
+    "q-generalized": partial(q_learning, "generalized"),
+    "q-maximin": partial(q_learning, "maximin"),
+}

@@ -14,6 +14,7 @@ import jaxltl as jl
 from jaxltl.algos import mlirl
 from jaxltl.algos.mlirl import features as irl_features
 from jaxltl.core.models.construct.lifting import allowed_steps
+from tests.algos.cases import LearnerCase, numbers, world
 from tests.support import assert_gradients
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -445,3 +446,37 @@ def test_by_construction_whatever_was_learned(dtype):
                 assert ((policy > 0) == allowed).all()
                 done = jl.satisfaction_probability(lazy, policy)
                 assert (done.lower[jl.optimal_satisfaction(lazy).lower == 1] == 1).all()
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def mlirl_world():
+    mdp, demonstrations = world()
+    setting = partial(mlirl.Hparams, optimizer="adam")
+    return LearnerCase(
+        mlirl,
+        mlirl.make_problem(mdp, numbers(3, 2, 2), demonstrations),
+        setting(discount=0.5),
+        setting(discount=0.4, l2=1e-2, learning_rate=0.01),
+        reward="features",
+    )
+
+
+def mlirl_product():
+    mdp, demonstrations = world()
+    lazy = jl.product(mdp, "!r U g")
+    features = numbers(*lazy.state_shape, 2, 2)
+    return LearnerCase(
+        mlirl,
+        mlirl.make_problem(lazy, features, demonstrations),
+        mlirl.Hparams(discount=0.5, mu=0.1),
+        mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
+        reward="features",
+    )
+
+
+CASES = {
+    "mlirl-world": mlirl_world,
+    "mlirl-product": mlirl_product,
+}

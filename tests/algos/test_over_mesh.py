@@ -17,17 +17,13 @@ from jax.tree_util import Partial
 
 import jaxltl as jl
 from jaxltl.algos import many_tasks, ppo
-from tests.algos.test_learner import (
-    LEARNERS,
-    assert_bitwise,
-    case,
+from tests.algos.test_learner import CASES, assert_bitwise, case, leaves, reaches
+from tests.algos.test_ppo import (
     corridor_allowed,
     corridor_observe,
     corridor_reset,
     corridor_step,
-    leaves,
     proximal,
-    reaches,
 )
 from tests.several import ended, start
 from tests.support import stack
@@ -65,7 +61,7 @@ def mesh_of(*sizes):
 @cache
 def given(name: str):
     """Keys and settings of eight lanes, of two kinds."""
-    _, problem, hparams, other = case(name)
+    _, problem, hparams, other, _ = case(name)
     return (
         jax.random.split(jax.random.key(0), LANES),
         problem,
@@ -95,7 +91,7 @@ def on_one(name: str) -> Any:
 
 
 def cases():
-    for name in LEARNERS:
+    for name in CASES:
         for number in (1, 2, 4):
             quick = name in QUICK and number == 2
             yield pytest.param(name, number, marks=() if quick else pytest.mark.exhaustive)
@@ -116,7 +112,7 @@ def test_eight_lanes_on_several_devices_are_those_on_one(name, number):
 
 
 def test_lanes_end_each_for_itself_on_each_device():
-    module, problem, _, _ = case("toy")
+    module, problem, *_ = case("toy")
     most = np.array([3, 50, 7, 1, 2, 30, 9])
 
     def until(key, rate, most):
@@ -254,7 +250,7 @@ def test_stages_of_seeds_over_devices_are_those_of_vmap():
 
 @pytest.mark.exhaustive
 def test_two_processes_make_the_lanes_of_one():
-    names = (*LEARNERS, "environments", "episodes")
+    names = (*CASES, "environments", "episodes")
     found = ended(start(2, "-m", "tests.algos.test_over_mesh", ",".join(names)), 900)
     assert [x.status for x in found] == [0, 0], [x.err[-2000:] for x in found]
     assert [x.out.splitlines()[-1] for x in found] == [f"as on one: {len(names)}"] * 2

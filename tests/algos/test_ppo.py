@@ -24,6 +24,7 @@ from jaxltl.algos.ppo import learner as updating
 from jaxltl.core.environments.environment import Finite, Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.types import Status
+from tests.algos.cases import LearnerCase, choice_observe, choice_reset, choice_step
 
 
 class Table(nn.Module):
@@ -608,3 +609,64 @@ def test_minibatches_of_a_network_with_memory_are_whole_environments():
         ppo.init(
             jax.random.key(0), problem, ppo.Hparams(discount=0.9, num_envs=6, num_minibatches=4)
         )
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def corridor_reset(width, key):
+    return jnp.int32(0)
+
+
+def corridor_step(width, place, action, key):
+    """To the end and back, now and then cut off; there and back earns most."""
+    place = place + jnp.array([1, -1, 0], jnp.int32)[action]
+    return Timestep(
+        place, reward=place / width, terminated=place < 0, truncated=jax.random.bernoulli(key, 0.1)
+    )
+
+
+def corridor_observe(width, place):
+    return {"place": place / width, "end": place == 3}
+
+
+def corridor_allowed(width, place):
+    return jnp.array([place < 3, True, True])
+
+
+def proximal(squash="clip", **options):
+    width = np.array(3.0)
+    if squash == "tanh":
+        world = make_environment(
+            choice_reset, choice_step, choice_observe, actions=make_box(-1, 1, (2,))
+        )
+        network = ppo.RecurrentActorCritic(shape=(2,), hidden=(), memory=2)
+        problem = ppo.make_problem(world, network=network, memory=np.array([0.1, 0.2]))
+    else:
+        world = make_environment(
+            *(Partial(f, width) for f in (corridor_reset, corridor_step, corridor_observe)),
+            actions=3,
+            allowed=Partial(corridor_allowed, width),
+        )
+        problem = ppo.make_problem(world, network=ppo.ActorCritic(3, hidden=()))
+    setting = partial(
+        ppo.Hparams,
+        num_envs=4,
+        num_steps=6,
+        num_epochs=1,
+        num_minibatches=2,
+        squash=squash,
+        **options,
+    )
+    return LearnerCase(
+        ppo,
+        problem,
+        setting(discount=0.9, learning_rate=0.01),
+        setting(discount=0.8, learning_rate=0.02, clip=0.1, gae_lambda=0.5),
+    )
+
+
+CASES = {
+    "ppo": partial(proximal, normalize_observation=True, normalize_reward=True),
+    "ppo-memory": partial(proximal, "tanh", num_resets=3),
+}

@@ -16,6 +16,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.post_offices import patrol, post_offices
 from tests import reference_games
+from tests.algos.cases import LearnerCase, alternating_game
 from tests.support import as_mdp, counted_traces, lane, stack
 
 
@@ -524,3 +525,23 @@ def test_the_evidence_has_the_expected_moves_between_accepting_states():
     first = 2 / float(found.strategy[0, 0])
     np.testing.assert_allclose(found.steps.value, [first, first + 1], rtol=1e-9)
     assert found.steps.lower[0] <= first <= found.steps.upper[0]
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def pac_learning():
+    game, reward = alternating_game()
+    setting = partial(rmax.Hparams, known_after=3, epsilon=0.1, reward_bound=1.0, moves_per_step=7)
+    return LearnerCase(
+        rmax,
+        rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
+        setting(discount=0.5, restart=0.1),
+        setting(discount=0.6, restart=0.3),
+        reward="reward",
+    )
+
+
+CASES = {
+    "rmax": pac_learning,
+}

@@ -15,6 +15,7 @@ from jaxltl.algos import todirl
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import predecessor_table, successor_table
 from tests import reference
+from tests.algos.cases import LearnerCase, world
 from tests.algos.test_guaranteed import evaluate as probability
 from tests.support import random_representation, stack
 
@@ -482,3 +483,30 @@ def test_trajectories_of_the_product_are_refused():
     lifted = jl.models.lift_trajectories(lazy(), demonstrated())
     with pytest.raises(ValueError, match="demonstrations in world 0: the trajectories belong to a"):
         todirl.make_problem(lazy(), seen(lazy()), lifted)
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def task_oriented():
+    # Plain descent: a constant reward changes nothing, and Adam would make a step of the rounding.
+    mdp, demonstrations = world()
+    setting = partial(todirl.Hparams, optimizer="sgd")
+    problem = todirl.make_problem(
+        jl.product(mdp, "!r U g", label_on="exit"),
+        np.eye(3),
+        demonstrations,
+        network=todirl.RewardNetwork((3,)),
+        held_out=0.5,
+    )
+    return LearnerCase(
+        todirl,
+        problem,
+        setting(discount=0.9, patience=3),
+        setting(discount=0.8, l2=0.1, learning_rate=0.05, patience=4),
+    )
+
+
+CASES = {
+    "todirl": task_oriented,
+}

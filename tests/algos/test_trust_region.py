@@ -30,6 +30,7 @@ from jaxltl.algos.trust_region.learner import (
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode, with_time_limit
 from jaxltl.core.types import Status
+from tests.algos.cases import LearnerCase, choice_observe, choice_reset, choice_step
 from tests.support import counted_traces
 
 # --- worlds -----------------------------------------------------------------------------------
@@ -963,3 +964,35 @@ def test_actions_that_a_gaussian_cannot_draw_are_refused(actions):
     world = make_environment(lq_reset, step, identity, actions=actions)
     with pytest.raises(ValueError, match="give a box of floats"):
         trust_region.make_problem(world, horizon=3)
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def trust(method, **networks):
+    setting = partial(
+        trust_region.Hparams,
+        method=method,
+        num_trajectories=6,
+        value_hidden=(),
+        cg_steps=3,
+        value_epochs=1,
+        value_batches=2,
+        **networks,
+    )
+    world = make_environment(
+        choice_reset, choice_step, choice_observe, actions=make_box(-jnp.inf, jnp.inf, (2,))
+    )
+    problem = trust_region.make_problem(world, horizon=4, limit=6.0)
+    return LearnerCase(
+        trust_region,
+        problem,
+        setting(discount=0.9),
+        setting(discount=0.8, delta=0.02, cost_discount=0.9, value_rate=0.1),
+    )
+
+
+CASES = {
+    "trpo": partial(trust, "trpo", hidden=(), normalize=False),
+    "cpo": partial(trust, "cpo", hidden=(3,)),
+}

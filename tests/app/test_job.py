@@ -23,7 +23,7 @@ def same(one, other):
 
 @pytest.fixture(scope="module")
 def seeds():
-    module, problem, hparams, _ = case("toy")
+    module, problem, hparams, *_ = case("toy")
 
     def run(seeds=3, num_steps=6, **options):
         training = Training(3, seeds, **options)
