@@ -508,10 +508,10 @@ def _certify_policy(
 ) -> None:
     """Proves a saved policy in its dynamics."""
     from jaxltl.app.learn_environment import certify_policy_file
-    from jaxltl.app.reports import proof
+    from jaxltl.app.reports.learn_environment import proof_entry, proof_sentence
 
-    result = proof.entry(certify_policy_file(policy, formula, say))
-    click.echo(f"{result['formula']}\n{proof.sentence(result)}")
+    result = proof_entry(certify_policy_file(policy, formula, say))
+    click.echo(f"{result['formula']}\n{proof_sentence(result)}")
     if as_json:
         _print_json(result)
     if result["status"] != "CONVERGED":

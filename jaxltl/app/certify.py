@@ -13,12 +13,10 @@ from typing import Any, Literal
 import click
 import numpy as np
 
-from jaxltl.core import validation
-from jaxltl.core.pretty_print import rounded_outward
-from jaxltl.core.statistics.confidence_sets import Graph, LeastProbability
-from jaxltl.core.validation import Range
 from jaxltl.app.files.models import padded
 from jaxltl.app.files.task_mlirl import WorldTable
+from jaxltl.app.wording import Record
+from jaxltl.core import validation
 from jaxltl.core.models import (
     MDP,
     Product,
@@ -28,17 +26,18 @@ from jaxltl.core.models import (
     model_from_counts,
     product,
 )
-from jaxltl.core.statistics.confidence_sets import check_confidence
+from jaxltl.core.pretty_print import rounded_outward
+from jaxltl.core.statistics.confidence_sets import Graph, LeastProbability, check_confidence
 from jaxltl.core.types import Status
-from jaxltl.core.values.evaluation.data_guarantee import (
+from jaxltl.core.validation import Range
+from jaxltl.core.values import (
     DataGuarantee,
     guarantee_curve,
     learn_guarantee,
+    satisfaction_probability,
 )
 from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.mixture import from_starts
-from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
-from jaxltl.app.wording import Record
 from jaxltl.io.templates import render
 
 SHOWN = 5  # choices for which more samples are recommended

@@ -14,8 +14,25 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.validation import errors_in
 from jaxltl.algos import mlirl
+from jaxltl.algos.common.chunks import Options
+from jaxltl.algos.mlirl.constrained import Point, constrained_points
+from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
+from jaxltl.app.files.task_mlirl import MlirlFile
+from jaxltl.app.files.worlds import World, load_world
+from jaxltl.app.guarantee import (
+    Attempt,
+    Guarantee,
+    ask,
+    Search,
+    check_formula,
+    guarantee_entry,
+    StepBound,
+    about_steps,
+    neg_log_likelihood,
+    step_bound,
+)
+from jaxltl.app.job import about, one_seed, plain, postfix as postfix, run_seeds, settings
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import (
     live as live,
@@ -23,32 +40,18 @@ from jaxltl.app.reports.learn import (
     report as report,
     task_pictures as task_pictures,
 )
-from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
-
-from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.files.worlds import World, load_world
-from jaxltl.algos.mlirl.constrained import Point, constrained_points
-from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, guarantee_entry
-from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, step_bound
-from jaxltl.algos.common.chunks import Options
-from jaxltl.app.job import (
-    about,
-    one_seed,
-    plain,
-    postfix as postfix,
-    run_seeds,
-    settings,
-)
+from jaxltl.app.wording import Record, enclosure, many
 from jaxltl.core.models import Product, Trajectories, lift_policy, product, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.discounted.soft import softmax_policy
-from jaxltl.core.values.undiscounted.mixture import at_starts, certified, from_starts
-from jaxltl.core.values import optimal_actions, optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
-from jaxltl.app.wording import Record, enclosure, many
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.policies.policy_file import save_policy
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.validation import errors_in
+from jaxltl.core.values import optimal_actions, optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.discounted.soft import softmax_policy
+from jaxltl.core.values.undiscounted.mixture import at_starts, certified, from_starts
+from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
+
 
 DOUBLE, FILE = True, MlirlFile
 

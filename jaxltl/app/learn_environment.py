@@ -21,8 +21,7 @@ from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.environment_loading import load_environment, load_world
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import proof as proofs
-from jaxltl.app.reports.learn_environment import report as report
+from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
 from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.app.guarantee import check_formula
@@ -97,7 +96,7 @@ class Outcome:
     evaluations: list[Evaluation]  # of every seed, from fresh episodes
     episodes: list[Episode]  # some of the kept policy, for pictures
     seed: int  # the first seed
-    proof: proofs.Proof | str | None = None  # or the reason for which there is none
+    proof: Proof | str | None = None  # or the reason for which there is none
 
 
 def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | None = None) -> Setup:
@@ -219,7 +218,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     return Outcome(setup, chunks.state, history, chosen, each, episodes, seed, proof)
 
 
-def _proven(setup: Setup, state: PyTree, say: Report) -> proofs.Proof | str | None:
+def _proven(setup: Setup, state: PyTree, say: Report) -> Proof | str | None:
     """The proof of the kept policy, without random actions; None in a simulator."""
     if setup.dynamics is None:
         return None
@@ -229,7 +228,7 @@ def _proven(setup: Setup, state: PyTree, say: Report) -> proofs.Proof | str | No
         return str(reason)
 
 
-def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> proofs.Proof:
+def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> Proof:
     """The certificate of an agent that was learned in dynamics, and a run if it is refuted."""
     assert setup.dynamics is not None
     table = setup.task.proof
@@ -237,11 +236,11 @@ def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> proofs.Proof
     policy = state_policy(agent, setup.environment)
     certificate = certify_policy(setup.dynamics, policy, formula, **options)
     if certificate.initial_bounds[1] >= (table.threshold or 1 - (table.tolerance or 1e-3)):
-        return proofs.Proof(certificate)
+        return Proof(certificate)
     say("searching a run that violates the formula")
     key, steps = jax.random.key(0), setup.num_steps
     run = counterexample(setup.dynamics, policy, formula, key, certificate, steps)
-    return proofs.Proof(certificate, run)
+    return Proof(certificate, run)
 
 
 def _acting(setup: Setup, state: PyTree) -> Agent:
@@ -325,7 +324,7 @@ def summary(outcome: Outcome) -> Record:
                 "evaluations": [_as_numbers(x) for x in outcome.evaluations],
             },
             "drawn": _pictured(outcome) is not None,
-            "proof": None if outcome.proof is None else proofs.entry(outcome.proof),
+            "proof": None if outcome.proof is None else proof_entry(outcome.proof),
         }
     )
 
@@ -362,9 +361,9 @@ def pictures(outcome: Outcome) -> list[Picture]:
     drawn = _pictured(outcome)
     drawings = drawings if drawn is None else [drawn, *drawings]
     dynamics, proof = outcome.setup.dynamics, outcome.proof
-    if dynamics is None or not isinstance(proof, proofs.Proof):
+    if dynamics is None or not isinstance(proof, Proof):
         return drawings
-    return [proofs.picture(proof, dynamics, outcome.episodes), *drawings]
+    return [proof_picture(proof, dynamics, outcome.episodes), *drawings]
 
 
 def live(outcome: Outcome) -> list[Curves]:
@@ -499,7 +498,7 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
     return EnvironmentFile.read((there or [path.parent])[0] / path.name, raw)
 
 
-def certify_policy_file(policy: Path, formula: str | None, say: Report) -> proofs.Proof:
+def certify_policy_file(policy: Path, formula: str | None, say: Report) -> Proof:
     """Proves a policy that ``jaxltl learn`` wrote in dynamics; by default for its task's formula."""
     setup, agent = load_policy(policy)
     if setup.dynamics is None:

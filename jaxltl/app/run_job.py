@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
 _JOBS = {
     "environment": "jaxltl.app.learn_environment",
-    "grounding": "jaxltl.app.grounding.job",
+    "grounding": "jaxltl.app.learn_grounding",
     "todirl": "jaxltl.app.learn_todirl",
     "mlirl": "jaxltl.app.learn",
 }

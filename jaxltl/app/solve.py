@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
@@ -23,13 +24,14 @@ from jaxltl.core.models import Game, IntervalMDP, SparseMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
-from jaxltl.core.values.multi_objective.multi_objective import (
+from jaxltl.core.values import (
     Achievable,
     ConstrainedOptimum,
     Pareto,
+    Answer,
+    PropertyStrategy,
+    solve_property,
 )
-from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
-from jaxltl.app.wording import Record
 from jaxltl.io.templates import render
 
 AnyAnswer = Answer | Achievable | ConstrainedOptimum | Pareto

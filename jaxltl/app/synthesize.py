@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.validation import errors_in
 from jaxltl.app.files.game import (
     GameFile,
     StrategyTable,
@@ -17,16 +16,25 @@ from jaxltl.app.files.game import (
     load_game,
     load_objective,
 )
-
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.environments.monitor import Verdict, make_monitor
-from jaxltl.core.games.objective import GR1, Parity
-from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy
-from jaxltl.core.games.verify import Verification, verify
-from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at, winning_region
+from jaxltl.core.automata import Automaton
+from jaxltl.core.environments import Verdict, make_monitor
+from jaxltl.core.games import (
+    GR1,
+    Parity,
+    Permissive,
+    apply_strategy,
+    permissive_strategy,
+    Verification,
+    verify,
+    Winning,
+    winning_region,
+)
+from jaxltl.core.games.winning import adversarial_chance, objective_at
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models import Game, Restriction, restrict
+from jaxltl.core.validation import errors_in
 from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
+
 
 Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")

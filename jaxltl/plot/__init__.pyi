@@ -8,7 +8,6 @@ from .curves import (
     paths as paths,
     sweep as sweep,
 )
-from .alt_text import described as described
 from .episodes import (
     draw_episode as draw_episode,
     draw_episodes as draw_episodes,
@@ -20,9 +19,16 @@ from .games import (
     game_region as game_region,
     game_values as game_values,
 )
-from .live import live_automaton as live_automaton, live_curve as live_curve, live_map as live_map
-from .maps import grid as grid, strategies as strategies
+from .live import (
+    live_automaton as live_automaton,
+    live_curve as live_curve,
+    live_map as live_map,
+    playback as playback,
+)
+from .maps import (
+    grid as grid,
+    strategies as strategies,
+    temporal_gridworld as temporal_gridworld,
+)
 from .models import model as model, solution as solution
-from .playback import playback as playback
-from .style import to_bytes as to_bytes
-from .worlds import temporal_gridworld as temporal_gridworld
+from .style import described as described, to_bytes as to_bytes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxltl.app import learn as job
-from jaxltl.app.practical import neg_log_likelihood, step_bound
+from jaxltl.app.guarantee import neg_log_likelihood, step_bound
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps as report
 from jaxltl.app.reports.learn import report as learn_report

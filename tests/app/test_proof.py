@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from jaxltl.app import learn_environment as job
 from jaxltl.app.files.task_environment import EnvironmentFile
-from jaxltl.app.reports import proof
+from jaxltl.app.reports import learn_environment as report
 from jaxltl.cli import main
 from jaxltl.core.environments import make_agent
 
@@ -45,23 +45,23 @@ def test_a_refuted_policy_comes_with_a_run():
     upwards = make_agent(lambda seen, key: jnp.array([0.0, 1.0]) + 0 * seen.world)
     lines = []
     found = job.prove(setup, upwards, "G !rock", lines.append)
-    result = proof.entry(found)
+    result = report.proof_entry(found)
     assert result["upper"] < 0.999 and result["status"] == "CONVERGED"
     run = np.array(result["counterexample"])
     start, end = setup.dynamics.initial.contains(run[:1]), run[-1]
     rock = setup.dynamics.labels["rock"].contains(end)
     assert start.all() and (rock or (np.abs(end) > 1).any())
-    assert f"a run violates it after {len(run) - 1} steps: from " in proof.sentence(result)
-    drawn = proof.picture(found, setup.dynamics, [])
+    assert f"a run violates it after {len(run) - 1} steps: from " in report.proof_sentence(result)
+    drawn = report.proof_picture(found, setup.dynamics, [])
     assert "a run that violates it" in drawn.caption and b"<svg" in drawn.drawing
 
 
 def test_bounds_are_printed_rounded_outward():
     entry = {"lower": 0.99999996, "upper": 0.99999996, "status": "CONVERGED", "cells": 4}
     entry |= {"initial_cells": 1, "how": {"surely": 1}, "seconds": {}, "counterexample": None}
-    assert "at least 0.9999999 from" in proof.sentence(entry)
-    assert "at most 1 from" in proof.sentence(entry)
-    assert proof.bounds(entry) == ["0.9999999", "1"]
+    assert "at least 0.9999999 from" in report.proof_sentence(entry)
+    assert "at most 1 from" in report.proof_sentence(entry)
+    assert report.proof_bounds(entry) == ["0.9999999", "1"]
 
 
 def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():

@@ -14,7 +14,7 @@ from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.learn_todirl import report
 from jaxltl.app.reports.page import render_text
-from jaxltl.app.todirl.results import part_of
+from jaxltl.app.todirl_results import part_of
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.core.values.undiscounted.satisfaction_steps import quickest_policy, satisfaction_steps

@@ -6,7 +6,7 @@ import html
 import pytest
 from matplotlib.figure import Figure
 
-from jaxltl.plot.alt_text import described
+from jaxltl.plot.style import described
 
 TEXT = 'Two paths, "short" & long.'
 

@@ -6,8 +6,7 @@ from xml.etree import ElementTree
 import pytest
 
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.plot.live import CELL
-from jaxltl.plot.playback import playback
+from jaxltl.plot.live import CELL, playback
 
 MAP = "a . #\n. . b\n"
 RUN = [0, 1, 1, 4, 5]

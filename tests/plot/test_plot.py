@@ -20,9 +20,8 @@ from jaxltl.envs.temporal_gridworld import random_world, training_world
 from jaxltl.plot import layout as drawing
 from jaxltl.plot.automata import edge_texts
 from jaxltl.plot.board import WALL
-from jaxltl.plot.maps import MARKED, NEVER
+from jaxltl.plot.maps import MARKED, NEVER, TINTS
 from jaxltl.plot.style import ACCENT, INK, MUTED, PAPER
-from jaxltl.plot.worlds import TINTS
 
 MAP = "b . r\n. # y"
 GOOD = [

@@ -29,8 +29,8 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.todirl.results import Outcome, Setup, counted_worlds, part_of
-from jaxltl.app.todirl.results import summary
+from jaxltl.app.todirl_results import Outcome, Setup, counted_worlds, part_of
+from jaxltl.app.todirl_results import summary
 from jaxltl.app.wording import Record, Result, many
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories

@@ -12,12 +12,11 @@ import numpy as np
 
 from jaxltl.app.files.scenes import Scene
 from jaxltl.app.files.task_todirl import TodirlFile
+from jaxltl.app.guarantee import StepBound, front
 from jaxltl.app.job import about, plain
-from jaxltl.app.practical import StepBound, front
 from jaxltl.app.wording import Record, enclosure
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models import Product, Trajectories
-from jaxltl.core.models.product import product
+from jaxltl.core.automata import Automaton
+from jaxltl.core.models import Product, Trajectories, product
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Status
 from jaxltl.core.values import OptimalActions, Performance

@@ -16,22 +16,27 @@ from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file
-from jaxltl.app.files.worlds import World, grid_options
+from jaxltl.app.files.worlds import grid_options, World
 from jaxltl.app.job import about, automaton_picture, plain
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports.learn_grounding import report as report
-from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.drawing import drawing, Picture
 from jaxltl.app.reports.explorer import Explorer
-from jaxltl.app.wording import Record, enclosure, many
-from jaxltl.core.models.construct.lifting import project_policy, project_trajectories
-from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
+from jaxltl.app.wording import enclosure, many, Record, Result
+from jaxltl.core.models import (
+    project_policy,
+    project_trajectories,
+    with_allowed,
+    Product,
+    product,
+    rollout,
+    Trajectories,
+)
 from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import errors_in
-from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values import optimal_actions, satisfaction_probability
+from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 
@@ -321,3 +326,64 @@ def pictures(outcome: Outcome) -> list[Picture]:
 def live(outcome: Outcome) -> list[Explorer]:
     """There are no interactive parts."""
     return []
+
+
+# --- the report ---------------------------------------------------------------------------
+
+
+_HEADER = ("symbol", "meaning", "weight", "alternatives", "decisive steps")
+_WORLDS = ("map", "probability", "certified", "maximum", "robust policy, at least")
+
+
+def _sentence(result: Result) -> str:
+    demonstrations = result["demonstrations"]
+    kind = "synthetic demonstration" if demonstrations["synthetic"] else "demonstration"
+    return (
+        f"{many(len(result['grounding']), 'symbol')} of {many(len(result['meanings']), 'possible meaning')}, "
+        f"{many(demonstrations['number'], kind)} ({many(demonstrations['pairs'], 'step')}) in "
+        f"{many(result['num_demonstrated'], 'map')}"
+    )
+
+
+def _rows(result: Result) -> list[tuple[str, ...]]:
+    return [
+        (
+            row["symbol"],
+            row["meaning"],
+            probability(row["weight"]),
+            ", ".join(f"{x} {probability(w)}" for x, w in row["alternatives"][:2]) or "none",
+            "; ".join(
+                f"map {x['map']} demonstration {x['demonstration']} step {x['step']} (+{number(x['gain'])})"
+                for x in row["steps"]
+            )
+            or "none",
+        )
+        for row in result["grounding"]
+    ]
+
+
+def _worlds(result: Result) -> list[tuple[str, ...]]:
+    return [
+        (
+            str(w),
+            probability(world["attained"]["value"]),
+            certified(world["attained"]),
+            probability(world["best_achievable"]["value"]),
+            "the same" if world["robust"] is None else rounded_down(world["robust"]["worst"]),
+        )
+        for w, world in enumerate(result["worlds"], start=1)
+    ]
+
+
+def _values(result: Result) -> Record:
+    return {
+        "sentence": _sentence(result),
+        "tables": (
+            ("Grounding", _HEADER, _rows(result)),
+            ("Satisfaction probability", _WORLDS, _worlds(result)),
+        ),
+        "aligned": aligned,
+    }
+
+
+report = Report("grounding", _values)

@@ -1,1 +1,0 @@
-"""Jobs of task files with a table ``[grounding]``."""

@@ -1,1 +1,0 @@
-"""Parts of todirl jobs: results, guarantees, and the summary."""
