@@ -360,7 +360,10 @@ def step_bounded_performances(models: Product, policies: jax.Array) -> Performan
     Returns:
       :class:`Performance` with a leading axis W; its status is of the default tolerance.
     """
-    return lax.map(lambda world: _step_bounded(*world), (models, policies), batch_size=_WORLDS)
+    result: Performance = lax.map(
+        lambda world: _step_bounded(*world), (models, policies), batch_size=_WORLDS
+    )
+    return result
 
 
 def _step_bounded(model: Product, policy: jax.Array) -> Performance:
@@ -372,8 +375,8 @@ def _step_bounded(model: Product, policy: jax.Array) -> Performance:
 
     value, _ = lax.scan(backup, decided, policy, reverse=True)
     # Rounding of T steps of sums of K + A products of numbers in [0, 1], to first order.
-    error = len(policy) * (model.num_successors + model.num_actions + 4)
-    error = error * jnp.finfo(model.dtype).eps
+    num_roundings = len(policy) * (model.num_successors + model.num_actions + 4)
+    error = num_roundings * jnp.finfo(model.dtype).eps
     return _summarize(
         model, value, jnp.maximum(value - error, 0), jnp.minimum(value + error, 1), None
     )
