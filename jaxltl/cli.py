@@ -528,7 +528,7 @@ _EXPERIMENTS = {
 
 
 @main.command(epilog="\n\n".join(f"{k}: {v}." for k, v in _EXPERIMENTS.items()))
-@click.argument("what", type=click.Choice(list(_EXPERIMENTS)))
+@click.argument("experiment", type=click.Choice(list(_EXPERIMENTS)))
 @click.option("--out", type=_PATH, help="Directory of the pictures. [default: out/reproduce]")
 @click.option(
     "--seeds",
@@ -539,17 +539,17 @@ _EXPERIMENTS = {
 @_as_json
 @compiling(fast=False)
 @plain_errors
-def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
+def reproduce(experiment: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published and measured numbers side by side."""
-    say = _begin(f"reproducing {what}")
-    experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
+    say = _begin(f"reproducing {experiment}")
+    module = importlib.import_module(f"jaxltl.reproduce.{experiment}")
     options = {} if seeds is None else {"seeds": seeds}
-    if seeds is not None and "seeds" not in inspect.signature(experiment.measure).parameters:
-        raise ValueError(f"reproduce {what} has no seeds; leave --seeds out.")
+    if seeds is not None and "seeds" not in inspect.signature(module.measure).parameters:
+        raise ValueError(f"reproduce {experiment} has no seeds; leave --seeds out.")
     with float64():
-        result = experiment.measure(say, **options)
-        pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else {}
-    click.echo(experiment.table(result))
+        result = module.measure(say, **options)
+        pictures = module.pictures(result) if hasattr(module, "pictures") else {}
+    click.echo(module.table(result))
     if pictures:
         out = run_job.make_directory(out or Path("out") / "reproduce")
         from jaxltl import plot

@@ -41,3 +41,18 @@ def test_modules_and_functions_are_short():
             if size.body_lines(function) > BODY_LINES:
                 long.append(f"{path}: {function.name} has {size.body_lines(function)} lines")
     assert not long
+
+
+NOT_NAMES = {"found", "told", "what", "given", "near", "far", "shown", "spread"}
+
+
+def test_names_are_nouns_of_the_field():
+    """Variables, parameters and fields are named for what they hold, not for where it is from."""
+    wrong = []
+    for path, text in size.sources(PACKAGE).items():
+        for node in ast.walk(ast.parse(text)):
+            stored = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+            name = node.id if stored else node.arg if isinstance(node, ast.arg) else None
+            if name in NOT_NAMES:
+                wrong.append(f"{path}:{node.lineno}: {name}")
+    assert not wrong

@@ -495,9 +495,10 @@ def log_density(action: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax
 
 def kl_divergence(old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Array]) -> jax.Array:
     """``KL(old || new)`` of Gaussians with independent entries."""
-    (mean, deviation), (other, spread) = old, new
-    ratio = deviation / spread
-    return jnp.sum((ratio**2 + ((mean - other) / spread) ** 2 - 1) / 2 - jnp.log(ratio), -1)
+    (old_mean, old_deviation), (mean, deviation) = old, new
+    ratio = old_deviation / deviation
+    shift = (old_mean - mean) / deviation
+    return jnp.sum((ratio**2 + shift**2 - 1) / 2 - jnp.log(ratio), -1)
 
 
 def surrogate(

@@ -517,7 +517,7 @@ def _twice(
 ) -> tuple[ClosedJaxpr, ClosedJaxpr, PyTree]:
     first, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     # Another object, so that the second trace is not the first, remembered.
-    return first, jax.make_jaxpr(lambda *given: function(*given))(*arguments), shapes
+    return first, jax.make_jaxpr(lambda *args: function(*args))(*arguments), shapes
 
 
 def _kept_by_jax(problem: Exception) -> bool:

@@ -165,7 +165,7 @@ def is_deterministic(model: Model) -> bool:
 
 
 def _register_on_base(primitive: PyTree) -> None:
-    primitive.register(Game, lambda game, *given, **named: primitive(game.mdp, *given, **named))
+    primitive.register(Game, lambda game, *args, **options: primitive(game.mdp, *args, **options))
 
 
 for _primitive in (
