@@ -20,9 +20,10 @@ from jaxltl.core.automata.text import edge_guards
 from jaxltl.plot import layout as drawing
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, write
 
-_NOTES = {
-    "buchi": "●: accepting; a word is accepted if its run takes such arrows infinitely often",
-    "parity": "a word is accepted if the least number that its run meets infinitely often is even",
+_EVEN = "a word is accepted if the least number that its run meets infinitely often is even"
+_MARKED = {  # by the parity of the marked transitions
+    0: "●: accepting; a word is accepted if its run takes such arrows infinitely often",
+    1: "●: rejecting; a word is accepted if its run takes such arrows finitely often",
 }
 
 
@@ -152,10 +153,11 @@ def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key,
         if len(mine) > 1 and len(texts[longest]) > 8:
             texts[longest] = "else"
     curves: dict[drawing.Key, drawing.Rows] = {}
+    marked = table.marked_priority
     for (source, target, number), text in texts.items():
         mark, curve = "", 0
-        if table.is_buchi:
-            mark, curve = ("●", 0) if number == 0 else ("", 1)
+        if marked is not None:
+            mark, curve = ("●", 0) if number == marked else ("", 1)
         elif table.is_parity and not doomed[target]:
             mark = str(number)
         key = (source, target, curve)
@@ -166,8 +168,10 @@ def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key,
 def _notes(table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], width: float) -> list[str]:
     """Lines of text below the graph."""
     lines = _state_lines(table, width)
-    if table.acceptance in _NOTES:
-        lines += textwrap.wrap(_NOTES[table.acceptance], max(44, int(width * 13.5)))
+    if not table.has_final_states:
+        marked = table.marked_priority
+        note = _EVEN if marked is None else _MARKED[marked % 2]
+        lines += textwrap.wrap(note, max(44, int(width * 13.5)))
     if any(text == "else" for rows in texts.values() for _, text in rows):
         lines.append("else: every letter that no other arrow of the state reads")
     return lines
@@ -188,7 +192,7 @@ def _edge_color(table: Automaton, key: drawing.Key, doomed: NDArray[np.bool_]) -
         return FAINT
     if doomed[target]:
         return MUTED
-    return ACCENT if table.is_buchi and curve == 0 else INK
+    return ACCENT if table.marked_priority is not None and curve == 0 else INK
 
 
 def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:

@@ -61,7 +61,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     edges = []
     for edge in graph.edges:
         source, target, number = edge.key
-        accepting = table.is_buchi and number == 0
+        accepting = table.marked_priority is not None and number == 0  # the first of two curves
         lines = _lines(labels[edge.key], at) if edge.key in labels else []
         kind = f"edge{' doomed' * bool(doomed[target])}{' accepting' * accepting}"
         edges.append((kind, source, target, _arrow(at(edge.curve)), lines))

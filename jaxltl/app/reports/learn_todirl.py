@@ -138,10 +138,6 @@ report = Report("todirl", _values)
 
 _PICTURES = 3  # worlds that are drawn, of each kind
 
-_END = {
-    "cosafe": "is satisfied or violated",
-    **dict.fromkeys(("safety", "buchi", "parity"), f"is violated, or for {LONGEST_RUN} steps"),
-}
 _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
@@ -311,13 +307,15 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
     if one.policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
+        satisfied = setup.judge.is_cosafe  # by a finite prefix
+        end = "satisfied or violated" if satisfied else f"violated, or for {LONGEST_RUN} steps"
         drawings.append(
             Picture(
                 f"{one.stem}_runs.svg",
                 f"Trajectories in {scene.name}" if one.arrows else one.title,
                 drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
                 f"{len(walks.length)} trajectories of the learned policy from random initial states, "
-                f"each until the formula {_END[setup.judge.acceptance]}.",
+                f"each until the formula is {end}.",
                 one.live,
             )
         )

@@ -18,17 +18,20 @@ from jaxltl.core.pretty_print import brief, truncate, batch_text, propositions_t
 
 
 class Condition(NamedTuple):
-    """An acceptance condition: the table that determines it, and the condition of complements."""
+    """An acceptance condition: what differs from the other ones in tables, files and pictures."""
 
-    table: Literal["final", "accepting", "priority"]
-    complement: str | None = None  # None: that of the priorities of the complement
+    table: Literal["final", "accepting", "priority"]  # the argument of `make_automaton`
+    priorities: tuple[int, int] | None  # where the table is True and False; None: any
+    complement: str | None  # None: that of the priorities of the complement
+    reward: str  # the name of the default reward of tasks
 
 
+# The first condition that has all priorities of an automaton is its own, see `condition_of`.
 CONDITIONS = {
-    "cosafe": Condition("final", "safety"),
-    "safety": Condition("final", "cosafe"),
-    "buchi": Condition("accepting"),
-    "parity": Condition("priority"),
+    "cosafe": Condition("final", (0, 1), "safety", "reach"),
+    "safety": Condition("final", (0, 1), "cosafe", "keep"),
+    "buchi": Condition("accepting", (0, 1), None, "eventual"),
+    "parity": Condition("priority", None, None, "parity"),
 }
 ACCEPTANCES = tuple(CONDITIONS)
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
@@ -106,6 +109,14 @@ class Automaton:
     def is_parity(self) -> bool:
         """True if the parity of the least priority taken infinitely often decides acceptance."""
         return self.acceptance == "parity"
+
+    @property
+    def marked_priority(self) -> int | None:
+        """Priority of the transitions that files and pictures mark; None for marks on states, and
+        for parity, where each transition has its number."""
+        condition = CONDITIONS[self.acceptance]
+        on_states = condition.table == "final"
+        return None if on_states or condition.priorities is None else min(condition.priorities)
 
     @property
     def final(self) -> NDArray[np.bool_]:
@@ -215,11 +226,12 @@ def _priorities(
         raise ValueError("make_automaton: give exactly one of final, accepting and priority.")
     kinds = [kind for kind, condition in CONDITIONS.items() if condition.table == name]
     kind = kinds[0] if acceptance is None and name != "final" else acceptance
-    if kind not in kinds:
+    if kind is None or kind not in kinds:
         raise ValueError(
             f"make_automaton: acceptance = {acceptance!r} with {name}. "
             f"Pass one of {', '.join(kinds)}."
         )
+    numbers = CONDITIONS[kind].priorities or (0, 1)
     if name == "priority":
         table = np.asarray(priority)
         if table.dtype.kind not in "iu" or table.shape not in (delta.shape, delta.shape[:1]):
@@ -231,7 +243,7 @@ def _priorities(
             raise ValueError(f"make_automaton: priority {table.min()} is negative. Count from 0.")
     elif name == "accepting":
         shape = delta.shape[:1] if np.ndim(accepting) == 1 else delta.shape  # type: ignore[arg-type]
-        table = 1 - _booleans(accepting, "accepting", shape).astype(np.int32)
+        table = np.where(_booleans(accepting, "accepting", shape), *numbers)
     else:
         is_final = _booleans(final, "final", delta.shape[:1])
         absorbing = is_final if kind == "cosafe" else ~is_final
@@ -241,11 +253,20 @@ def _priorities(
                 f"make_automaton: delta[{q}, {letter}] = {delta[q, letter]} leaves the {inside} "
                 f"states, which {kind!r} acceptance has absorbing. Redirect it, or change final."
             )
-        table = 1 - is_final.astype(np.int32)
+        table = np.where(is_final, *numbers)
     if table.ndim == 1:
         table = np.repeat(table[:, None], delta.shape[1], axis=1)
-    assert kind is not None
     return kind, table
+
+
+def condition_of(priority: Integers) -> str:
+    """The acceptance on transitions of an automaton with some priorities."""
+    numbers = set(np.unique(priority).tolist())
+    return next(
+        kind
+        for kind, condition in CONDITIONS.items()
+        if condition.table != "final" and numbers.issubset(condition.priorities or numbers)
+    )
 
 
 def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
@@ -403,11 +424,10 @@ def complement(automaton: Automaton) -> Automaton:
         priority = 1 - automaton.priority
     elif automaton.priority.min() > 0:
         priority = automaton.priority - 1
-    derived = "buchi" if priority.max() <= 1 else "parity"
     return replace(
         automaton,
         priority=priority,
-        acceptance=CONDITIONS[automaton.acceptance].complement or derived,
+        acceptance=CONDITIONS[automaton.acceptance].complement or condition_of(priority),
         state_names=tuple(constants.get(name, f"!({name})") for name in automaton.state_names),
     )
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import Automaton, condition_of
 from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
 from jaxltl.core.automata.merging import MERGE_WORK, language_classes, merged
 from jaxltl.core.automata.products import EVEN, ODD, states_that_may
@@ -92,7 +92,7 @@ def _acceptance(table: ParityTable) -> str:
             return "cosafe"
         if not final[delta[~final]].any():
             return "safety"
-    return "buchi" if priority.max() <= 1 else "parity"
+    return condition_of(priority)
 
 
 # --- Steps that keep the language: the new table, and an old state of each new one -----------

@@ -124,11 +124,11 @@ def _final_states(automaton: Automaton) -> NDArray[np.bool_]:
     return np.zeros(len(automaton.delta), bool)
 
 
-def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
+def _mark(automaton: Automaton, priority: int, sign: str) -> str:
     """Acceptance marks of a transition, for acceptance on transitions."""
     if automaton.is_parity:
         return f" {{{priority}}}"
-    return accepting if automaton.is_buchi and priority == 0 else ""
+    return sign if priority == automaton.marked_priority else ""
 
 
 def to_dot(automaton: Automaton) -> str:
@@ -140,7 +140,7 @@ def to_dot(automaton: Automaton) -> str:
         lines.append(f"{q} [shape={shape}, label={_dot_string(label)}];")
     for (q, successor, priority), text in edge_guards(automaton).items():
         label = _dot_string(text + _mark(automaton, priority, " ●"))
-        bold = automaton.is_buchi and priority == 0
+        bold = priority == automaton.marked_priority
         style = ', style=bold, color="#1f6f8b"' if bold else ""
         lines.append(f"{q} -> {successor} [label={label}{style}];")
     return "\n".join(["digraph automaton {", *(f"  {line}" for line in lines), "}"])

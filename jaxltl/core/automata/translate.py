@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import Automaton, make_alphabet
+from jaxltl.core.automata.automaton import Automaton, condition_of, make_alphabet
 from jaxltl.core.automata.parity import is_weak, reduce_table
 from jaxltl.core.automata.products import EVEN, ODD
 from jaxltl.core.automata.runs import find_lasso, live_states, universal_states
@@ -304,7 +304,7 @@ def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Accepta
             '  Ask for acceptance="auto", or bound the formula by an event.'
         )
     if acceptance == "buchi":
-        if automaton.is_parity:
+        if condition_of(automaton.priority) != "buchi":
             raise ValueError(
                 f"to_automaton: {formula} has no deterministic Buchi automaton: some word is "
                 "accepted because certain letters stop occurring, which a deterministic run "

@@ -58,25 +58,16 @@ class Limits:
 @brief
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Bounds of the satisfaction probability of product states, after refinement.
+    """Bounds of the satisfaction probability of product states, after refinement."""
 
-    Attributes:
-      grid, task: the cells and the memory.
-      lower, upper: ``float[Q, C]``.
-      how: ``int8[Q, C]``, how the lower bound was found.
-      action: ``int[Q, C]``, which attains the lower bound.
-      initial: ``bool[C]``, cells that meet the initial states.
-      needed: ``bool[C]``, cells on whose bounds those of the initial cells may depend.
-    """
-
-    grid: Grid
+    grid: Grid  # the cells and the memory
     task: TaskProduct
-    lower: Floats
+    lower: Floats  # float[Q, C]
     upper: Floats
-    how: Integers
-    action: Integers
-    initial: Booleans
-    needed: Booleans
+    how: Integers  # int8[Q, C], how the lower bound was found
+    action: Integers  # int[Q, C], which attains the lower bound
+    initial: Booleans  # bool[C], cells that meet the initial states
+    needed: Booleans  # bool[C], cells on whose bounds those of the initial cells may depend
 
     def initial_bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds ``float[C]`` of beginning in each cell.
@@ -138,23 +129,16 @@ def _finite_support(noise: Distribution) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Abstraction:
-    """Bounds of the satisfaction probability of the cells of a grid, refined for the initial states.
+    """Bounds of the satisfaction probability of the cells of a grid, refined for the initial states."""
 
-    Attributes:
-      dynamics, formula: the world and its task.
-      step: the next state of state, row of `actions` and noise.
-      actions: ``float[A, m]``, over which lower bounds are maximised; one row of any numbers for the
-        step of a policy.
-      limits: when refinement stops.
-      seconds: wall time by stage.
-    """
-
-    dynamics: Dynamics
+    dynamics: Dynamics  # the world and its task
     formula: str | Formula
-    step: Step
+    step: Step  # the next state of state, row of `actions` and noise
+    # float[A, m], over which lower bounds are maximised; one row of any numbers for the step
+    # of a policy
     actions: Floats
-    limits: Limits
-    seconds: dict[str, float] = field(default_factory=dict)
+    limits: Limits  # when refinement stops
+    seconds: dict[str, float] = field(default_factory=dict)  # wall time by stage
 
     def bounds(self, grid: Grid) -> Bounds:
         """Bounds after refinement; an interrupt leaves those of the last finished grid."""

@@ -25,25 +25,17 @@ from jaxltl.core.pretty_print import brief
 @brief
 @dataclass(frozen=True)
 class Successors:
-    """Boxes of cells that rows may and must meet; rows are pairs of cells and actions.
+    """Boxes of cells that rows may and must meet; rows are pairs of cells and actions."""
 
-    Attributes:
-      cells: ``int[M]``, the cells of the rows.
-      num_actions: A.
-      start, stop: ``int[M A, n]``, the cells that are possible.
-      outside: ``bool[M A]``, True if the domain may be left.
-      certain: ``int[M A, n]`` twice, boxes of cells of positive probability, and ``bool[M A]``, True if
-        leaving the domain has one; None: noise is an adversary.
-      shape: of the grid.
-    """
-
-    cells: Integers
-    num_actions: int
-    start: Integers
+    cells: Integers  # int[M], the cells of the rows
+    num_actions: int  # A
+    start: Integers  # int[M A, n], the cells that are possible
     stop: Integers
-    outside: Booleans
+    outside: Booleans  # bool[M A], True if the domain may be left
+    # int[M A, n] twice, boxes of cells of positive probability, and bool[M A], True if leaving
+    # the domain has one; None: noise is an adversary
     certain: tuple[Integers, Integers, Booleans] | None
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # of the grid
 
 
 def winning_cells(

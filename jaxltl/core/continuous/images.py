@@ -122,23 +122,17 @@ class Images:
 
     Coordinate i of the next state is in `[low_i, high_i] + gain_i w_i` with the noise `w_i` that
     `noise_of` assigns to it.
-
-    Attributes:
-      cells: ``int[M]``, the cells of the rows.
-      low, high: ``float[M * A, n]``.
-      gain: ``float[M * A, n]``, not negative; 0 without noise.
-      noise_of: for each coordinate the index of its noise, or -1.
-      varying: ``float[M * A, n]``, the part of the box that may depend on `w_i` itself; None: 0.
-      order: the coordinates in an order in which each box depends on noises of earlier ones alone;
-        () for any order.
     """
 
-    cells: Integers
-    low: Floats
+    cells: Integers  # int[M], the cells of the rows
+    low: Floats  # float[M * A, n]
     high: Floats
-    gain: Floats
-    noise_of: tuple[int, ...]
+    gain: Floats  # float[M * A, n], not negative; 0 without noise
+    noise_of: tuple[int, ...]  # for each coordinate the index of its noise, or -1
+    # float[M * A, n], the part of the box that may depend on `w_i` itself; None: 0
     varying: Floats | None = None
+    # the coordinates in an order in which each box depends on noises of earlier ones alone; ()
+    # for any order
     order: tuple[int, ...] = ()
 
     def columns(self, axis: int, rows: Integers | None) -> list[Floats]:

@@ -26,25 +26,16 @@ class TaskProduct:
 
     Memory state q is an automaton state with the priority of the transition into it. A cell whose
     labels are uncertain allows several letters, among which an adversary chooses.
-
-    Attributes:
-      label_class: ``int[C]``, the set of letters that is possible in each cell.
-      moves: ``bool[Q, D, Q]``, memory states after entering a cell of each label class.
-      start: ``bool[D, Q]``, memory states after the initial cell.
-      priority: ``int[Q]``.
-      decided: ``int[Q]``, 1 or 0 where every continuation is accepted or rejected, else -1.
-      outside: ``int[Q]``, 1 if the task is satisfied after leaving the domain, else 0.
-      automaton: of the formula.
-      states: its states and the priorities of the transitions into them, one pair a memory state.
     """
 
-    label_class: Integers
-    moves: Booleans
-    start: Booleans
-    priority: Integers
-    decided: Integers
-    outside: Integers
-    automaton: Automaton
+    label_class: Integers  # int[C], the set of letters that is possible in each cell
+    moves: Booleans  # bool[Q, D, Q], memory states after entering a cell of each label class
+    start: Booleans  # bool[D, Q], memory states after the initial cell
+    priority: Integers  # int[Q]
+    decided: Integers  # int[Q], 1 or 0 where every continuation is accepted or rejected, else -1
+    outside: Integers  # int[Q], 1 if the task is satisfied after leaving the domain, else 0
+    automaton: Automaton  # of the formula
+    # its states and the priorities of the transitions into them, one pair a memory state
     states: tuple[tuple[int, int], ...]
 
     @property

@@ -29,20 +29,13 @@ _UNIT = float(np.finfo(np.float64).eps)
 @brief
 @dataclass(frozen=True)
 class Factors:
-    """Interval probabilities of one coordinate, for U different images.
+    """Interval probabilities of one coordinate, for U different images."""
 
-    Attributes:
-      start: ``int[U]``, first interval of the window.
-      low, gap: ``float[U, K]``, lower probabilities in the window, and upper minus lower ones.
-      outside: ``float[U, 2]``, lower probability and gap of leaving the grid.
-      rest: ``float[U]``, at least the probability of intervals that are not in the window.
-    """
-
-    start: Integers
-    low: Floats
+    start: Integers  # int[U], first interval of the window
+    low: Floats  # float[U, K], lower probabilities in the window, and upper minus lower ones
     gap: Floats
-    outside: Floats
-    rest: Floats
+    outside: Floats  # float[U, 2], lower probability and gap of leaving the grid
+    rest: Floats  # float[U], at least the probability of intervals that are not in the window
 
 
 @dataclass(frozen=True)
@@ -60,23 +53,14 @@ class _Stage:
 @brief
 @dataclass(frozen=True)
 class TransitionBounds:
-    """Interval transition probabilities of rows, as factors.
+    """Interval transition probabilities of rows, as factors."""
 
-    Attributes:
-      factors: for each coordinate of the state, in their order.
-      ids: for each coordinate, ``int[R]``, the factors of each row.
-      stages: order of the contraction.
-      shape: of the grid, with its axes in that order.
-      order: of the coordinates.
-      lost: probability of noise for which nothing is known.
-    """
-
-    factors: tuple[Factors, ...]
-    ids: tuple[Integers, ...]
-    stages: tuple[_Stage, ...]
-    shape: tuple[int, ...]
-    order: tuple[int, ...]
-    lost: float
+    factors: tuple[Factors, ...]  # for each coordinate of the state, in their order
+    ids: tuple[Integers, ...]  # for each coordinate, int[R], the factors of each row
+    stages: tuple[_Stage, ...]  # order of the contraction
+    shape: tuple[int, ...]  # of the grid, with its axes in that order
+    order: tuple[int, ...]  # of the coordinates
+    lost: float  # probability of noise for which nothing is known
 
     def least(self, value: Floats, outside: float) -> Floats:
         """Least expectation ``float[R]`` of ``value[*shape]`` over all transition probabilities.

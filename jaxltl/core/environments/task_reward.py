@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import CONDITIONS, Automaton
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.pretty_print import brief
 
 REWARDS = ("auto", "reach", "keep", "eventual", "two-discount", "parity")
-_BY_KIND = {"cosafe": "reach", "safety": "keep", "buchi": "eventual", "parity": "parity"}
 _DEFAULT = 0.99
 
 
@@ -104,7 +103,7 @@ def make_task_reward(
     discount, shaping = options.get("discount"), options.get("shaping")
     learner_discount = options.get("learner_discount", 1.0)
     reward = validation.choice("reward", reward, REWARDS)
-    name = _BY_KIND[automaton.acceptance] if reward == "auto" else reward
+    name = CONDITIONS[automaton.acceptance].reward if reward == "auto" else reward
     _require_fit(automaton, name)
     shaped = shaping is not None
     final = name in ("reach", "keep")
@@ -136,11 +135,12 @@ def make_task_reward(
 
 def _require_fit(automaton: Automaton, name: str) -> None:
     kind = automaton.acceptance
-    needed = {"reach": "cosafe", "keep": "safety"}.get(name, kind)
+    finite = {c.reward: other for other, c in CONDITIONS.items() if c.table == "final"}
+    needed = finite.get(name, kind)
     if kind != needed:
         raise ValueError(
             f"reward={name!r} is for {needed} tasks, and this one has {kind} acceptance; "
-            f"its own is {_BY_KIND[kind]!r}, and 'auto' takes it."
+            f"its own is {CONDITIONS[kind].reward!r}, and 'auto' takes it."
         )
     if name in ("eventual", "two-discount") and np.max(_ranks(automaton)) > 1:
         raise ValueError(

@@ -363,17 +363,12 @@ _UNDEFINED = -(2**30)  # a value beyond the ranges of variables, which updates r
 
 @dataclass(frozen=True)
 class Compiled:
-    """Expressions as instructions without repeated subexpressions; :func:`compile_expressions`.
+    """Expressions as instructions without repeated subexpressions; :func:`compile_expressions`."""
 
-    Attributes:
-      names: the variables that are read, of the first slots.
-      code: operator, slots of the operands, and the value of a literal, of each further slot.
-      outputs: the slot of each expression.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # the variables that are read, of the first slots
+    # operator, slots of the operands, and the value of a literal, of each further slot
     code: tuple[tuple[str, tuple[int, ...], Any], ...]
-    outputs: tuple[int, ...]
+    outputs: tuple[int, ...]  # the slot of each expression
 
     @np.errstate(all="ignore")
     def __call__(self, values: Mapping[str, Any] | Callable[[str], Any], xp: Any = np) -> list[Any]:

@@ -145,24 +145,15 @@ class Syntax:
 
 @dataclass(frozen=True)
 class Variable:
-    """A bounded variable of a resolved program.
+    """A bounded variable of a resolved program."""
 
-    Attributes:
-      name: its name.
-      type: ``"int"`` or ``"bool"``.
-      low, high: the range, 0 and 1 of a Boolean.
-      initial: the initial value, which an ``init`` block overrides.
-      module: the number of its module; None for a global variable.
-      place: offset in the source.
-    """
-
-    name: str
-    type: Type
-    low: int
+    name: str  # its name
+    type: Type  # "int" or "bool"
+    low: int  # the range, 0 and 1 of a Boolean
     high: int
-    initial: int
-    module: int | None
-    place: int
+    initial: int  # the initial value, which an init block overrides
+    module: int | None  # the number of its module; None for a global variable
+    place: int  # offset in the source
 
     @property
     def bits(self) -> int:

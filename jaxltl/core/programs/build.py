@@ -28,25 +28,19 @@ _PART = 2**17  # states on which labels and rewards are evaluated together
 
 @dataclass(frozen=True)
 class Rows:
-    """Arrays of a model before its probabilities are numbers.
+    """Arrays of a model before its probabilities are numbers."""
 
-    Attributes:
-      row_start, entry_start, successor, weight: as of :func:`~jaxltl.core.models.sparse.make_sparse`;
-        `weight` has probabilities, their intervals ``[T, 2]``, or numbers of functions.
-      annotations: keyword arguments of ``make_sparse`` other than rewards.
-      rewards: by name the parts on states and choices, None where they are zero.
-      functions: of a program with parameters, expressions by number.
-      owner: ``int32[S]``, the number of the player of each state of a game.
-    """
-
+    # as of `~jaxltl.core.models.sparse.make_sparse`; `weight` has probabilities, their
+    # intervals [T, 2], or numbers of functions
     row_start: Integers
     entry_start: Integers
     successor: Integers
     weight: Weight
-    annotations: dict[str, Any]
+    annotations: dict[str, Any]  # keyword arguments of make_sparse other than rewards
+    # by name the parts on states and choices, None where they are zero
     rewards: dict[str, RewardParts]
-    functions: tuple[Expression, ...]
-    owner: Integers | None
+    functions: tuple[Expression, ...]  # of a program with parameters, expressions by number
+    owner: Integers | None  # int32[S], the number of the player of each state of a game
 
 
 def build_model(

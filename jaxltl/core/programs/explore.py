@@ -29,31 +29,19 @@ _TRANSITIONS = 100  # the most transitions per allowed state
 
 @dataclass(frozen=True)
 class Explored:
-    """The reachable part of a program.
+    """The reachable part of a program."""
 
-    Attributes:
-      layout, words: the states as packed words.
-      actions: names of actions, the first of which is ``""``.
-      num_initial: the initial states are the first ones.
-      row_count: ``int32[S]``, choices of each state; 0 of a deadlock.
-      action: ``int32[R]``, index in `actions`.
-      owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
-      entry_count: ``int64[R]``.
-      successor: ``int32[T]``.
-      weight: ``[T]``, see :mod:`~jaxltl.core.programs.local_choices`.
-      rewards: by name the parts on states and choices.
-    """
-
-    layout: Layout
+    layout: Layout  # the states as packed words
     words: Words
-    actions: tuple[str, ...]
-    num_initial: int
-    row_count: NDArray[np.int32]
-    action: NDArray[np.int32]
-    owner: NDArray[np.int32]
-    entry_count: Integers
-    successor: NDArray[np.int32]
-    weight: Weight
+    actions: tuple[str, ...]  # names of actions, the first of which is ""
+    num_initial: int  # the initial states are the first ones
+    row_count: NDArray[np.int32]  # int32[S], choices of each state; 0 of a deadlock
+    action: NDArray[np.int32]  # int32[R], index in `actions`
+    owner: NDArray[np.int32]  # int32[R], the module of a choice without synchronisation, else -1
+    entry_count: Integers  # int64[R]
+    successor: NDArray[np.int32]  # int32[T]
+    weight: Weight  # [T], see :mod:`~jaxltl.core.programs.local_choices`
+    # by name the parts on states and choices
     rewards: dict[str, RewardParts] = field(default_factory=dict)
 
     @property

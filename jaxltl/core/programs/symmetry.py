@@ -18,15 +18,10 @@ _COMMUTATIVE = frozenset(("&", "|", "+", "*", "=", "!=", "<=>", "min", "max"))
 
 @dataclass(frozen=True)
 class Orbit:
-    """Slots, groups of variables whose order does not matter, and variables that name a slot.
+    """Slots, groups of variables whose order does not matter, and variables that name a slot."""
 
-    Attributes:
-      slots: the variables of each slot.
-      selectors: by variable the value that names each slot.
-    """
-
-    slots: tuple[tuple[str, ...], ...]
-    selectors: dict[str, tuple[int, ...]]
+    slots: tuple[tuple[str, ...], ...]  # the variables of each slot
+    selectors: dict[str, tuple[int, ...]]  # by variable the value that names each slot
 
     def sort(self, layout: Layout, words: Words) -> None:
         """Sorts the slots of some states, in place."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
+from jaxltl.core.automata.automaton import condition_of
 from jaxltl.core.automata.emerson_lei import MAX_COLORS, members, polarities, residual
 from jaxltl.io.hoa.grammar import FALSE, KNOWN_HEADERS, TRUE, Item, Tree, error_at, unquoted
 
@@ -144,14 +145,15 @@ def set_number(number: Token, sets: int) -> int:
 def acceptance_of(header: Header, delta: Integers, priority: Integers) -> str:
     """Acceptance type that the priorities allow and the `write_hoa` header names."""
     own = header.tool == "jaxltl"
-    if priority.max() > 1 or (own and header.acceptance_name == "parity"):
+    if own and header.acceptance_name == "parity":
         return "parity"
-    final = priority[:, 0] == 0
-    if own and "weak" in header.properties and (priority == priority[:, :1]).all():
+    kind, final = condition_of(priority), priority[:, 0] == 0
+    weak = kind == "buchi" and (priority == priority[:, :1]).all()
+    if own and weak and "weak" in header.properties:
         if header.properties & {"terminal", "cosafe"}:
-            return "cosafe" if final[delta[final]].all() else "buchi"
-        return "safety" if not final[delta[~final]].any() else "buchi"
-    return "buchi"
+            return "cosafe" if final[delta[final]].all() else kind
+        return "safety" if not final[delta[~final]].any() else kind
+    return kind
 
 
 def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None:

@@ -113,8 +113,10 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     if automaton.is_parity:
         count = int(automaton.priority.max()) + 1
         lines += [f"acc-name: parity min even {count}", f"Acceptance: {count} {parity_text(count)}"]
-    else:
+    elif (automaton.marked_priority or 0) % 2 == 0:
         lines += ["acc-name: Buchi", "Acceptance: 1 Inf(0)"]
+    else:
+        lines += ["acc-name: co-Buchi", "Acceptance: 1 Fin(0)"]
     lines.append("properties: " + " ".join(_properties(automaton)))
     lines.append("--BODY--")
     for q in range(len(automaton.delta)):
@@ -170,8 +172,10 @@ def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
         label = " | ".join(
             "&".join(f"{p}" if value else f"!{p}" for p, value in cube) for cube in chosen
         )
-        marked = not on_state and (automaton.is_parity or priority == 0)
-        yield f"[{label or 't'}] {successor}" + (f" {{{priority}}}" if marked else "")
+        mark = f" {{{priority}}}" if automaton.is_parity else ""
+        if priority == automaton.marked_priority:
+            mark = " {0}"
+        yield f"[{label or 't'}] {successor}{mark}"
 
 
 def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]]:
