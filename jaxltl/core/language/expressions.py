@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator as op
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, reduce
-from operator import is_ as operator_is
 from typing import Any, Literal
 
 import numpy as np
@@ -235,6 +235,7 @@ def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
     """The node with new operands, folded where these decide it."""
     operator = e.operator
     if operator in ("&", "|"):
+        _require(e, [value_type(x.value) if x.is_literal else "bool" for x in parts], "bool")
         neutral = operator == "&"
         rest = []
         for part in parts:
@@ -247,10 +248,11 @@ def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
             return rest[0] if rest else literal(neutral, e.place)
         parts = tuple(rest)
     elif all(x.is_literal for x in parts):
+        _node_type(e, [value_type(x.value) for x in parts], {})
         return literal(apply(operator, [x.value for x in parts], e.place), e.place)
     elif operator == "?:" and isinstance(parts[0].value, bool):
         return parts[1] if parts[0].value else parts[2]
-    if len(parts) == len(e.operands) and all(map(operator_is, parts, e.operands)):
+    if len(parts) == len(e.operands) and all(map(op.is_, parts, e.operands)):
         return e
     return Expression(operator, parts, e.value, e.place)
 
@@ -329,22 +331,29 @@ def _numbers(*values: Any) -> tuple[Any, ...]:
     return tuple(float(x) for x in values) if float in map(type, values) else values
 
 
+def _folded(operation: Callable[[Any, Any], Any]) -> Callable[..., Any]:
+    return lambda *x: reduce(operation, x)
+
+
+_COMMON: dict[str, Callable[..., Any]] = {  # of Python's numbers and of arrays
+    "!": lambda a: a ^ True,
+    "neg": op.neg,
+    "&": _folded(op.and_),
+    "|": _folded(op.or_),
+    "=>": op.le,  # of Booleans
+    "<=>": op.eq,
+    "=": op.eq,
+    "!=": op.ne,
+    "<": op.lt,
+    "<=": op.le,
+    ">": op.gt,
+    ">=": op.ge,
+    "+": _folded(op.add),
+    "-": op.sub,
+    "*": _folded(op.mul),
+}
 SCALAR: dict[str, Callable[..., Any]] = {
-    "!": lambda a: not a,
-    "neg": lambda a: -a,
-    "&": lambda *x: all(x),
-    "|": lambda *x: any(x),
-    "=>": lambda a, b: not a or b,
-    "<=>": lambda a, b: a == b,
-    "=": lambda a, b: a == b,
-    "!=": lambda a, b: a != b,
-    "<": lambda a, b: a < b,
-    "<=": lambda a, b: a <= b,
-    ">": lambda a, b: a > b,
-    ">=": lambda a, b: a >= b,
-    "+": lambda *x: reduce(lambda a, b: a + b, x),
-    "-": lambda a, b: a - b,
-    "*": lambda *x: reduce(lambda a, b: a * b, x),
+    **_COMMON,
     "/": _divide,
     "?:": lambda a, b, c: _numbers(b, c)[0 if a else 1],
     "min": lambda *x: min(_numbers(*x)),
@@ -456,29 +465,12 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
 
         return rounded
 
-    def folded(operation: Callable[[Any, Any], Any]) -> Callable[..., Any]:
-        return lambda *x: reduce(operation, x)
-
     return {
-        "!": xp.logical_not,
-        "neg": xp.negative,
-        "&": folded(xp.logical_and),
-        "|": folded(xp.logical_or),
-        "=>": lambda a, b: xp.logical_or(xp.logical_not(a), b),
-        "<=>": xp.equal,
-        "=": xp.equal,
-        "!=": xp.not_equal,
-        "<": xp.less,
-        "<=": xp.less_equal,
-        ">": xp.greater,
-        ">=": xp.greater_equal,
-        "+": folded(xp.add),
-        "-": xp.subtract,
-        "*": folded(xp.multiply),
+        **_COMMON,
         "/": divide,
         "?:": xp.where,
-        "min": folded(xp.minimum),
-        "max": folded(xp.maximum),
+        "min": _folded(xp.minimum),
+        "max": _folded(xp.maximum),
         "floor": whole(xp.floor),
         "ceil": whole(xp.ceil),
         "round": whole(lambda a: xp.floor(a + 0.5)),

@@ -230,3 +230,20 @@ def test_renamed_formulas_must_mean_their_renamed_variables():
     assert str(read_program(text.format("y > 0")).modules[1].commands[0].guard) == "(y > 0)"
     with pytest.raises(ValueError, match="line 2, column 57: the formula f with renamed variables"):
         read_program(text.format("y = 0"))
+
+
+@pytest.mark.parametrize(
+    "constant, message",
+    [
+        ("const bool b = 1 = true;", "line 1, column 21: .* compares a Boolean with a number"),
+        ("const int k = min(true, 1);", "column 24: true is a Boolean; min takes a number"),
+        ("const bool b = true | 1;", "column 28: 1 is an integer; | takes a Boolean"),
+        ("const int k = mod(5, 2.0);", "column 27: 2.0 is a double; mod takes an integer"),
+        ("formula f = !1; const bool b = f;", "column 19: 1 is an integer; ! takes a Boolean"),
+        ("const int k = true ? 1 : false;", "is a Boolean in one case and a number in the other"),
+    ],
+)
+def test_operators_of_literals_are_checked_before_they_are_folded(constant, message):
+    text = f"dtmc {constant} module m x : [0..1]; [] x=0 -> (x'=1); endmodule"
+    with pytest.raises(ValueError, match=message.replace("|", r"\|")):
+        read_program(text)
