@@ -152,13 +152,7 @@ class Dynamics:
     ) -> jax.Array:
         """``float[n]``: a sampled successor; clipped to the domain if `outside` is ``"clip"``.
 
-        Args:
-          key: random key.
-          state, action: ``float[n]`` and ``float[m]``.
-          disturbance: that of the adversary, ``float[...]``; default: uniform.
-
-        Returns:
-          The successor; differentiable in state, action and disturbance.
+        Differentiable in state, action and disturbance; the latter is uniform by default.
         """
         noise = self.sample_noise(key, disturbance).astype(state.dtype)
         successor = jnp.asarray(self.step(state, action, noise), state.dtype)

@@ -97,15 +97,8 @@ class Distribution:
         convolution with a uniform density, Ibragimov 1956): its minimum is at an end of [low, high].
         For symmetric densities, the maximum is at the shift nearest to ``(a + b) / 2 - scale mean``.
         Otherwise the bounds are ``F(b - high) - F(a - low)`` below, for a distribution function of
-        the user, and ``F(b - low) - F(a - high)`` above.
-
-        Args:
-          a, b: ends of the interval, ``a <= b``; may be infinite.
-          low, high: least and greatest shift.
-          scale: positive gains; all five broadcast.
-
-        Returns:
-          ``(lower, upper)``, float64, in [0, 1]; 0 and 1 are exact for bounded support.
+        the user, and ``F(b - low) - F(a - high)`` above. Ends ``a <= b`` may be infinite; gains
+        `scale` are positive; all broadcast. 0 and 1 are exact for bounded support.
 
         Example:
           >>> lower, upper = uniform(0.0, 1.0).probability_bounds(0.0, 1.0, 0.0, 0.25)

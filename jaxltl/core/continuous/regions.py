@@ -86,15 +86,9 @@ class Region:
     def membership(self, low: ArrayLike, high: ArrayLike) -> tuple[Booleans, Booleans]:
         """Cells inside the region, and cells that meet it.
 
-        Exact for boxes and half-open cells. For half-spaces and functions, the bounds of the linear
-        form or of the function over the closed cell are rounded outward.
-
-        Args:
-          low, high: ``float64[C, n]``, the cells ``low <= x < high``.
-
-        Returns:
-          ``(certain, possible)``, ``bool[C]``: True only if all states of a cell, and false only if
-          none, belong to the region. A cell that is covered by two boxes together is not certain.
+        Certain cells ``bool[C]`` have all their states ``low <= x < high`` in the region, and only
+        possible ones have any. Exact for boxes, but a cell covered by two boxes together is not
+        certain; bounds of half-spaces and functions over the closed cell are rounded outward.
 
         Example:
           >>> certain, possible = box([0.0], [1.0]).membership([[0.0], [0.5], [1.0]], [[1.0], [1.5], [2.0]])

@@ -125,18 +125,10 @@ def value_type(value: object) -> Type:
 
 
 def type_of(expression: Expression, types: Mapping[str, Type]) -> Type:
-    """The type of an expression over typed names.
+    """The type of an expression; LanguageError for an unknown name or an operand of a wrong type.
 
-    Args:
-      expression: the tree.
-      types: the type of each variable and constant.
-
-    Raises:
-      LanguageError: an unknown name, or an operand of a wrong type.
-
-    Example:
-      >>> type_of(Expression("/", (literal(4), literal(2))), {})
-      'double'
+    >>> type_of(Expression("/", (literal(4), literal(2))), {})
+    'double'
     """
     return _type(expression, types, {})
 
@@ -204,18 +196,12 @@ def substitute(
 ) -> Expression:
     """Replaces names by expressions, and folds operators of literals.
 
-    Args:
-      expression: the tree.
-      names: the expression of each replaced name; others stay.
-      memory: results by node, shared between calls with the same names and trees that stay alive.
+    `memory` has results by node, for calls with the same names and trees that stay alive. Raises
+    LanguageError for an operation on literals that is ill-typed, undefined or too large.
 
-    Raises:
-      LanguageError: an operation on literals that is undefined or too large.
-
-    Example:
-      >>> e = Expression("+", (Expression("name", value="N"), literal(1)))
-      >>> str(substitute(e, {"N": literal(2)}))
-      '3'
+    >>> e = Expression("+", (Expression("name", value="N"), literal(1)))
+    >>> str(substitute(e, {"N": literal(2)}))
+    '3'
     """
     memory = {} if memory is None else memory
     if (result := memory.get(id(expression))) is not None:
@@ -381,15 +367,10 @@ class Compiled:
 
     @np.errstate(all="ignore")
     def __call__(self, values: Mapping[str, Any] | Callable[[str], Any], xp: Any = np) -> list[Any]:
-        """Values of the expressions.
+        """Values of the expressions, from an array or a scalar of each variable.
 
-        Args:
-          values: an array, or a scalar, of each variable: integers, or Booleans.
-          xp: the array namespace, ``numpy`` or ``jax.numpy``.
-
-        Returns:
-          An array for each expression; those without variables are scalars. Division by zero is
-          infinite or NaN, and a modulus by a number that is not positive is -2^30.
+        Those without variables are scalars. Division by zero is infinite or NaN, and a modulus by a
+        number that is not positive is -2^30.
         """
         slots: list[Any] = list(map(values if callable(values) else values.__getitem__, self.names))
         table = _operations(xp)

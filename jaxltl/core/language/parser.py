@@ -266,17 +266,10 @@ class ExpressionParser(TokenReader):
 
 
 def parse_expression(text: str) -> Expression:
-    """The expression that a text writes.
+    """The expression of a text; ValueError with line and column.
 
-    Args:
-      text: an expression over constants, variables, formulas and labels in quotes.
-
-    Raises:
-      ValueError: with line and column.
-
-    Example:
-      >>> str(parse_expression("!x = 1 | a => b"))
-      '((!(x = 1) | a) => b)'
+    >>> str(parse_expression("!x = 1 | a => b"))
+    '((!(x = 1) | a) => b)'
     """
     try:
         return ExpressionParser(text).whole()
@@ -287,18 +280,12 @@ def parse_expression(text: str) -> Expression:
 def parse_program(text: str, name: str = "model") -> Syntax:
     """The syntax tree of a program in the PRISM language.
 
-    Args:
-      text: the program.
-      name: of the file, for errors.
+    Raises ValueError with file, line and column: a syntax error, or a feature that is not supported
+    (continuous time, clocks, partial observability, concurrent games, ``system`` blocks, unbounded
+    integers).
 
-    Raises:
-      ValueError: with file, line and column: a syntax error, or a feature that is not supported
-        (continuous time, clocks, partial observability, concurrent games, ``system`` blocks,
-        unbounded integers).
-
-    Example:
-      >>> parse_program("mdp module m x : [0..1]; [a] x=0 -> (x'=1); endmodule").kind
-      'mdp'
+    >>> parse_program("mdp module m x : [0..1]; [a] x=0 -> (x'=1); endmodule").kind
+    'mdp'
     """
     source = Source(text, name)
     try:

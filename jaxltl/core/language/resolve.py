@@ -42,25 +42,15 @@ def read_program(
 ) -> Program:
     """Parses and resolves a program in the PRISM language.
 
-    Args:
-      text: the program.
-      constants: values of constants, as numbers, Booleans or texts such as ``"1/3"``. Those that
-        the program defines cannot be given.
-      name: of the file, for errors.
+    `constants` are numbers, Booleans or texts such as ``"1/3"``, of constants that the program does not
+    define. Those of type double without a value become `parameters` if only probabilities and rewards
+    depend on them. Raises ValueError with file, line and column: errors of syntax, names and types,
+    unsupported features, and constants without a value.
 
-    Returns:
-      :class:`~jaxltl.core.language.syntax.Program`. Constants of type double without a value become
-      its `parameters` if only probabilities and rewards depend on them.
-
-    Raises:
-      ValueError: with file, line and column: errors of syntax, names and types, unsupported
-        features, and constants without a value.
-
-    Example:
-      >>> p = read_program("dtmc const int N; module m x : [0..N]; [] true -> (x'=0); endmodule",
-      ...                  {"N": "2 * 3"})
-      >>> p.constants, p.variables[0].high
-      ({'N': 6}, 6)
+    >>> p = read_program("dtmc const int N; module m x : [0..N]; [] true -> (x'=0); endmodule",
+    ...                  {"N": "2 * 3"})
+    >>> p.constants, p.variables[0].high
+    ({'N': 6}, 6)
     """
     return resolve(parse_program(text, name), constants)
 

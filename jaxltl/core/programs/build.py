@@ -18,7 +18,7 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
-from jaxltl.core.programs.packed_states import Layout, Reader, Words, initial_states, make_layout
+from jaxltl.core.programs.packed_states import Layout, Reader, Words, initial_columns, make_layout
 from jaxltl.core.programs.local_choices import Functions, Intervals, Numbers, Weight, state_text
 from jaxltl.core.sparse.rows import offsets_from_counts
 
@@ -106,7 +106,7 @@ def build_rows(
         Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()
     )
     try:
-        initial = initial_states(program, layout, max_states)
+        initial = layout.packed(*initial_columns(program, max_states))
         explored = Search(program, layout, weights, max_states).run(initial, progress)
         return _rows(program, explored, weights)
     except LanguageError as error:

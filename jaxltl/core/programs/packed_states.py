@@ -198,19 +198,12 @@ class HashTable:
 _CANDIDATES = 2**24  # partial assignments that are held at once
 
 
-def initial_states(program: Program, layout: Layout, max_states: int) -> Words:
-    """The initial states as packed words; errors as of :func:`initial_columns`."""
-    return layout.packed(*initial_columns(program, max_states))
-
-
 def initial_columns(program: Program, max_states: int) -> tuple[dict[str, Integers], int]:
     """Values of the variables in the initial states, and the number of these.
 
     There is one, or those that satisfy the ``init`` block: variables are assigned one after the
-    other, and each conjunct of the condition is evaluated as soon as its variables are.
-
-    Raises:
-      LanguageError: no state satisfies the condition, or too many do.
+    other, and each conjunct of the condition is evaluated as soon as its variables are. Raises
+    LanguageError if no state satisfies the condition, or too many do.
     """
     if program.initial is None:
         return {v.name: np.array([v.initial]) for v in program.variables}, 1

@@ -21,7 +21,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
 from jaxltl.core.programs.explore import Search
-from jaxltl.core.programs.packed_states import Reader, initial_states, make_layout
+from jaxltl.core.programs.packed_states import Reader, initial_columns, make_layout
 from jaxltl.core.programs.symmetry import find_orbits
 from jaxltl.core.programs.local_choices import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
@@ -249,7 +249,7 @@ class _Part:
         self.search = Search(program, self.layout, Numbers(), 2**31 - 2)
         if "init" not in self.conditions.names:
             self.search.orbits = find_orbits(program, self.conditions.expressions)
-        initial = initial_states(program, self.layout, max_states)
+        initial = self.layout.packed(*initial_columns(program, max_states))
         self.num_initial = initial[0].size
         self.search.known.fill(initial)
         self.order: list[Integers] = []  # expanded states

@@ -38,11 +38,8 @@ class Unsupported(Exception):
 
 
 def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
-    """A function of packed states to the enabled commands of a module, for each of its actions.
-
-    Raises:
-      Unsupported: the module is too large or too deep for Python's compiler.
-    """
+    """A function of packed states to the enabled commands of a module, for each of its actions;
+    raises Unsupported for a module that is too large or too deep for Python's compiler."""
     if sum(e.size for c in module.commands for e in c.expressions) > _MAX_SIZE:
         raise Unsupported
     local = {name: f"v{i}" for i, name in enumerate(sorted(module.names))}
@@ -151,11 +148,8 @@ def search_narrow(
 ) -> Narrow:
     """Expands levels of few states, up to the first larger one.
 
-    A level is not expanded, and the search ends, if it has a state that is left to the vectorised
-    search: one with very many successors or an invalid update.
-
-    Args:
-      parts: of each column (synchronisation) the modules and their columns.
+    The search ends before a level with a state for the vectorised search: one with very many
+    successors or an invalid update. `parts` are the modules of each synchronisation, and their columns.
     """
     keys = [0] * initial[0].size
     for w, word in enumerate(initial):

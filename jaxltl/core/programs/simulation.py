@@ -18,7 +18,6 @@ from jax.tree_util import Partial
 from jaxltl.core.array_types import Booleans
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.language.expressions import (
-    Compiled,
     Expression,
     FALSE,
     LanguageError,
@@ -55,13 +54,10 @@ class Choice:
 
 
 def list_choices(program: Program) -> tuple[tuple[Group, ...], tuple[Choice, ...]]:
-    """Groups of commands, and the choices that they form.
+    """Groups of commands, and the choices that they form; ValueError for more than 4096 choices.
 
     Two commands are in one group if their guards exclude each other, by the values of at most a few
     variables. Choices without an action come first, by module, then those of each action.
-
-    Raises:
-      ValueError: more than 4096 choices.
     """
     groups: list[Group] = []
     choices: list[Choice] = []
@@ -194,7 +190,7 @@ def program_environment(
         _require_name(program, "label", name, {*program.labels, "deadlock"})
     try:
         _check_integers(program)
-        simulation = _simulation(program, () if reward is None else rewards[reward], names)
+        simulation = _Simulation(program, () if reward is None else rewards[reward], names)
         values, size = initial_columns(program, _MAX_STARTS)
     except LanguageError as error:
         raise program.source.located(error) from None
@@ -274,19 +270,24 @@ def _starts(columns: World, probability: jax.Array) -> tuple[World, jax.Array]:
     return columns, probability
 
 
-@dataclass(frozen=True, eq=False)
 class _Simulation:
     """A program as functions of one state."""
 
-    variables: tuple[Variable, ...]
-    groups: tuple[Group, ...]
-    choices: tuple[Choice, ...]
-    chain: bool
-    guards: Compiled  # by group and command
-    updates: Compiled  # guards; by command probabilities and assigned values; rewards
-    earned: tuple[str | None, ...]  # action of each reward
-    conditions: Compiled  # labels
-    deadlock: int  # the label of states without choices, or -1
+    def __init__(
+        self, program: Program, rewards: Sequence[RewardItem], labels: Sequence[str]
+    ) -> None:
+        self.variables, self.chain = program.variables, program.kind == "dtmc"
+        self.groups, self.choices = list_choices(program)
+        commands = [c for g in self.groups for c in g.commands]
+        guards = [c.guard for c in commands]
+        updates = [e for c in commands for e in _command_expressions(c)]
+        earned = [e for i in rewards for e in (i.guard, i.value)]
+        self.guards = compile_expressions(guards)  # by group and command
+        self.updates = compile_expressions([*guards, *updates, *earned])
+        self.earned = tuple(i.action for i in rewards)  # action of each reward
+        self.conditions = compile_expressions([program.labels.get(n, FALSE) for n in labels])
+        implicit = "deadlock" in labels and "deadlock" not in program.labels
+        self.deadlock = labels.index("deadlock") if implicit else -1
 
     def step(self, world: World, action: jax.Array, key: chex.PRNGKey) -> Timestep:
         values = map(jnp.asarray, self.updates(world, jnp))
@@ -352,27 +353,6 @@ class _Simulation:
     def observe(self, world: World) -> jax.Array:
         scaled = [(world[v.name] - v.low) / max(1, v.high - v.low) for v in self.variables]
         return jnp.stack(scaled).astype(jnp.result_type(float))
-
-
-def _simulation(
-    program: Program, rewards: Sequence[RewardItem], labels: Sequence[str]
-) -> _Simulation:
-    groups, choices = list_choices(program)
-    commands = [c for g in groups for c in g.commands]
-    guards = [c.guard for c in commands]
-    updates = [e for c in commands for e in _command_expressions(c)]
-    implicit = "deadlock" in labels and "deadlock" not in program.labels
-    return _Simulation(
-        program.variables,
-        groups,
-        choices,
-        program.kind == "dtmc",
-        compile_expressions(guards),
-        compile_expressions([*guards, *updates, *(e for i in rewards for e in (i.guard, i.value))]),
-        tuple(i.action for i in rewards),
-        compile_expressions([program.labels.get(name, FALSE) for name in labels]),
-        labels.index("deadlock") if implicit else -1,
-    )
 
 
 def _command_expressions(command: Command) -> list[Expression]:
