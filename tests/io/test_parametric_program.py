@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.programs import scalar_search
+from jaxltl.core.programs import explore
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*deadlocks", "ignore:.*several commands")
 
@@ -29,7 +29,7 @@ endmodule rewards x=0 : 1/p; endrewards"""
 @pytest.fixture(autouse=True)
 def in_one_order(monkeypatch):
     """Both models are built by levels, and have their states in the same order."""
-    monkeypatch.setattr(scalar_search, "LEVEL", 0)
+    monkeypatch.setattr(explore, "LEVEL", 0)
 
 
 def written(tmp_path, text):

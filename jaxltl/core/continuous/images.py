@@ -28,6 +28,11 @@ from jaxltl.core.pretty_print import brief
 
 
 Step = Callable[[PyTree, PyTree, PyTree], PyTree]
+# Coordinate i of the next state is `m_i + g_i w_i`. Its interval probabilities hold for every value of
+# `m_i` that does not depend on `w_i`; products of them over the coordinates hold if each `m_i` depends
+# on noises of earlier coordinates alone, given which the next one is bounded. Bounds of the
+# derivatives in the noise decide both: by the mean value theorem `m_i` varies with a noise at most as
+# much as the derivative differs from the gain that was taken out.
 _UNDERFLOW = 1e-200  # of products with 0 that are rounded outward
 # Functions that may jump: their derivatives do not bound their variation.
 _JUMPS = {"sign", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne", "atan2", "pow"}

@@ -9,8 +9,13 @@ import pytest
 
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton
 from jaxltl.core.automata.language import find_difference, is_equivalent
-from jaxltl.core.automata.merging import ParityTable, language_classes
-from jaxltl.core.automata.parity import components, reduce_table, simplify
+from jaxltl.core.automata.parity import (
+    ParityTable,
+    components,
+    language_classes,
+    reduce_table,
+    simplify,
+)
 from jaxltl.core.automata.translate import to_automaton
 from tests.reference_logic import random_formula, random_lasso, subsets
 

@@ -21,7 +21,7 @@ from jaxltl.core.continuous import (
     truncated_gaussian,
     uniform,
 )
-from jaxltl.core.continuous.cell_solvers import Successors, winning_cells
+from jaxltl.core.continuous.abstraction import Successors, winning_cells
 from jaxltl.core.continuous.task_product import task_product
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from tests.reference_logic import random_formula

@@ -8,7 +8,7 @@ from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.programs import local_choices, packed_states, scalar_search
+from jaxltl.core.programs import explore, local_choices, packed_states
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
 
@@ -18,7 +18,7 @@ def search(request, monkeypatch):
     """Levels are expanded state by state, as arrays, or first in one way and then in the other."""
     level = {"single states": 10**9, "arrays": 0, "both": 3}[request.param]
     for name in ("LEVEL", "PER_COMMAND"):
-        monkeypatch.setattr(scalar_search, name, level)
+        monkeypatch.setattr(explore, name, level)
     return request.param
 
 
