@@ -19,7 +19,7 @@ from .core import (
 )
 from .core.automata.automaton import Automaton as Automaton
 from .core.automata.translate import to_automaton as to_automaton
-from .core.enclosures.enclose import enclose as enclose
+from .core.enclosures.linear_bounds import enclose as enclose
 from .core.environments.environment import (
     Environment as Environment,
     make_environment as make_environment,

@@ -1,7 +1,7 @@
 """Interval transition probabilities between cells as factors of each coordinate.
 
 Each coordinate of the next state has an interval probability for each interval of the grid, given the
-state and the coordinates before it in an order (see :mod:`.noise_gains`). The least expectation over
+state and the coordinates before it in an order (see :mod:`.images`). The least expectation over
 all such products is at least that over the joint intervals, and is computed coordinate by coordinate
 (orthogonally decoupled abstractions, Mathiesen et al. 2024, arXiv 2411.11803): no array has a row and
 a column for each cell.
