@@ -4,22 +4,29 @@ Policy iteration (Howard 1960) over rows and distributions together, each round 
 The bounds rest on one application of the operator. With a small extra reward for every step that
 leaves a node, the solution satisfies ``x >= c_r + p x`` for all rows and distributions with room
 for rounding, so it is an upper bound; with a small extra cost it is attained. Where runs take so
-long that these extras cost more than the tolerance, values are refined beyond double precision
-(:mod:`jaxltl.core.sparse.interval.refinement`).
+long that these extras cost more than the tolerance, values are refined beyond double precision:
+
+A value in one float satisfies no optimality equation more accurately than its own rounding
+``u |x|``, so a proof by one application of the operator needs an extra of at least ``u |x|`` in
+each step, which costs ``u |x| T`` in a run of T steps. Refined values are kept in two floats (as in
+:mod:`jaxltl.core.sparse.linear.extended_precision`), found by iterative refinement (Wilkinson 1963).
+Their differences are right to two roundings, so the operator errs only by a share of the flows
+``p_t |x_t - x_s|``, and these are small wherever a run lingers. The extra of a step is a multiple of
+that error, plus a tiny share of the distance from the largest possible value.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.interval.refinement import Refinement
 from jaxltl.core.sparse.interval.row_operator import PolicyPair, RowOperator
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.linear.system_sequence import SystemSequence
+from jaxltl.core.sparse.linear.elimination import SystemSequence
+from jaxltl.core.sparse.linear.extended_precision import Solver, TwoFloats, refine, two_sum
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
@@ -39,6 +46,13 @@ _STILL = 1e-2  # and of the change since the last improvement
 _ROUNDS = 200
 _ATTEMPTS = 20  # improvements for the attained bound
 _PATIENCE = 30  # rounds after which the extra grows
+_REFINED_ROUNDS = 30  # policies with refined values
+_SHARE = 0.05  # of the tolerance that the proportional extras of all steps take
+_MAX_SHARE = 0.3  # and that they may take before their share is reduced
+_MIN_SHARE = 2.0**-80  # smallest share of a proportional extra
+_ERRORS = 4  # extra of a refined step, in rounding errors of its row
+_NARROW = 0.4  # share of the tolerance that a refined bound may be from the value
+_FLOOR = 1e-8  # of the distance from the ceiling, as a share of the largest value
 _KILLED = 1e-6  # probability that a step is the last one, for policies that leave soon
 
 
@@ -378,15 +392,14 @@ class _Search:
         self, beyond: PolicyPair | None, attained: PolicyPair | None
     ) -> tuple[PolicyPair | None, PolicyPair | None]:
         """Bounds of long runs: refinement in two floats, then a pair with a chance to stop."""
-        operator, last = self.operator, attained or self.last
+        last = attained or self.last
         tolerance = self.accuracy.tolerance * self.scale(
             np.zeros(0) if last is None else last.value
         )
-        refinement = Refinement(self.systems.solve_directly, tolerance)
         if last is not None and not self._is_near(beyond):
-            beyond = refinement.bound(operator, last, 1) or beyond
+            beyond = self.refined_bound(last, 1, tolerance) or beyond
         if last is not None and not self._is_near(attained):
-            attained = refinement.bound(operator, last, -1) or attained
+            attained = self.refined_bound(last, -1, tolerance) or attained
         if self.is_narrow(beyond, attained):
             return beyond, attained
         if beyond is None or self.accuracy.relative or self.operator.adversarial:
@@ -426,3 +439,72 @@ class _Search:
             if change <= 1e-3 * _KILLED:
                 break
         return pair
+
+    # --- bounds beyond double precision -------------------------------------------------------
+
+    def refined_bound(self, pair: PolicyPair, side: int, tolerance: float) -> PolicyPair | None:
+        """A pair with an upper bound of all pairs (side 1), or with one that it attains (-1).
+
+        The bound is at most the tolerance from the other one.
+        """
+        operator, share = self.operator, np.inf
+
+        def residual(x: TwoFloats) -> Floats:
+            return operator.residual(pair, x)
+
+        for _ in range(_REFINED_ROUNDS):
+            system = operator.system(pair)
+            if system is None:
+                return None
+            solve = partial(self.systems.solve_directly, system.matrix)
+            value = refine(solve, system.earned, residual)
+            extra = (
+                None if value is None else self._refined_extra(pair, solve, value, share, tolerance)
+            )
+            if value is None or extra is None:
+                return None
+            share, step, cost = extra
+            high, lost = two_sum(value.high, side * cost)
+            z = TwoFloats(*two_sum(high, lost + value.low))
+            proven = self._proven(pair, z, side)
+            if proven is not None:
+                narrow = cost.max(initial=0) <= _NARROW * tolerance
+                return replace(proven, value=value.high) if narrow else None
+            better, _ = operator.improve(pair, z, side * step)
+            if (better.chosen == pair.chosen).all() and all(map(np.array_equal, better.p, pair.p)):
+                return None
+            pair = better
+        return None
+
+    def _refined_extra(
+        self, pair: PolicyPair, solve: Solver, value: TwoFloats, share: float, tolerance: float
+    ) -> tuple[float, Floats, Floats] | None:
+        """Proportional extra of a step, its share, and extras of whole runs; None if unknown."""
+        operator = self.operator
+        size = max(np.abs(value.high).max(initial=0), np.abs(operator.known).max(initial=0))
+        weight = np.full(operator.size, size)
+        if np.isfinite(operator.ceiling):
+            weight = np.maximum(operator.ceiling - value.high, _FLOOR * size)
+        steps = solve(weight)
+        if steps is None or not (steps >= 0).all():
+            return None
+        # A smaller extra lets the next pair linger longer, so it shrinks only where it has to.
+        if share * steps.max() > _MAX_SHARE * tolerance:
+            share = max(_SHARE * tolerance / steps.max(), _MIN_SHARE)
+        errors, leaving = operator.row_errors(pair, value)
+        cost = solve(share * weight + _ERRORS * errors / leaving)
+        if cost is None or not (cost >= 0).all():
+            return None
+        return share, share * weight, cost
+
+    def _proven(self, pair: PolicyPair, z: TwoFloats, side: int) -> PolicyPair | None:
+        if side < 0:
+            if not self.operator.proves_attained(z, pair):
+                return None
+        else:
+            p = self.operator.proves_upper_bound(z)
+            if p is None:
+                return None
+            if self.operator.adversarial:
+                pair = replace(pair, p=p)
+        return replace(pair, bound=np.nextafter(z.high + z.low, side * np.inf))

@@ -17,7 +17,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import shortest_path_rows
 from jaxltl.core.sparse.interval.row_table import RowTable
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, scatter
-from jaxltl.core.sparse.linear.extended_precision import two_float_difference
+from jaxltl.core.sparse.linear.extended_precision import TwoFloats, two_float_difference
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
@@ -50,13 +50,6 @@ class PairSystem(NamedTuple):
 
     matrix: csr_array
     earned: Floats
-
-
-class TwoFloats(NamedTuple):
-    """Values ``high + low`` of the nodes, ``float64[M]`` each."""
-
-    high: Floats
-    low: Floats
 
 
 class TargetValues(NamedTuple):

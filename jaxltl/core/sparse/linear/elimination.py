@@ -8,12 +8,14 @@ much, large components are eliminated one after the other. Where a component its
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers, SparseMatrix
-from jaxltl.core.sparse.linear.krylov import iterate
+from jaxltl.core.sparse.linear.krylov import bicgstab, iterate
 
 # Limits of elimination; measured on the models of benchmarks.real_models and on random graphs.
 _SMALL = 3000  # states of a component up to which it may fill
@@ -35,6 +37,9 @@ _KRYLOV = 500  # steps of each
 _SWEEPS = 20_000  # and sweeps after it
 _ROUNDED = 4 * float(np.finfo(np.float64).eps)  # smallest residual relative to the solution
 _LEFT = 1e-14  # residual relative to the right side
+_DIRECT = 2000  # unknowns up to which each system of a sequence is eliminated
+_MAX_OLD_STEPS = 10  # steps after which old factors are given up
+_MAX_STEPS = 200  # of BiCGSTAB without factors
 
 
 class _Block(NamedTuple):
@@ -348,3 +353,53 @@ def _swept(matrix: SparseMatrix, b: Floats) -> Floats:
         x = x + residual
         residual = matrix @ residual
     return np.full(b.size, np.nan)
+
+
+# --- sequences of systems ------------------------------------------------------------------------
+
+
+@dataclass
+class SystemSequence:
+    """Solver of systems of one size, each different from the last one in a few rows.
+
+    Where few steps lead to many states, BiCGSTAB from the last solution converges fast. Elsewhere
+    the factors of an earlier system precondition it, until they are too old and are computed anew.
+    """
+
+    label: Callable[[], Integers]  # SCCs int[M] in topological order
+    mixes: bool  # True if few steps lead to many unknowns
+    factors: Factors | None = None  # of the earlier system `matrix`
+    matrix: SparseMatrix | None = None
+
+    def solve(
+        self, matrix: SparseMatrix, b: Floats, start: Floats, residual: float
+    ) -> Floats | None:
+        """The solution up to a residual, or up to rounding if that is more; None if singular."""
+        if self.mixes:
+            solution = bicgstab(matrix, b, start, residual, steps=_MAX_STEPS)
+            if solution is not None:
+                return solution
+            self.mixes = False
+        if self.factors is not None and self.matrix is not matrix and b.size > _DIRECT:
+            old = self.factors.solve
+            solution = bicgstab(matrix, b, start, residual, steps=_MAX_OLD_STEPS, precondition=old)
+            if solution is not None:
+                return solution
+        return self.solve_directly(matrix, b)
+
+    def solve_directly(self, matrix: SparseMatrix, b: Floats) -> Floats | None:
+        """The solution by factors of this system; None if it is singular."""
+        if self.matrix is not matrix and not self._factor(matrix):
+            return None
+        assert self.factors is not None
+        x = self.factors.solve(b)
+        return x if np.isfinite(x).all() else None
+
+    def _factor(self, matrix: SparseMatrix) -> bool:
+        rows = np.arange(matrix.shape[0])
+        if self.factors is None:
+            self.factors = factorize(matrix, self.label(), rows)
+        else:
+            self.factors = self.factors._replace(rows=matrix).other(rows)
+        self.matrix = matrix
+        return self.factors is not None

@@ -1,4 +1,4 @@
-"""Optimality equations beyond double precision: two-float iterative refinement, and fractions.
+"""Optimality equations beyond double precision: iterative refinement, GTH elimination, fractions.
 
 Written as ``sum_j w_j (x_i - x_j) + l_i x_i = c_i``, without self-loops, an equation subtracts no
 weights, and each policy's solution is a quotient of sums of products of the weights w, l and costs
@@ -17,27 +17,29 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.graph.components import forward_search
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation
 from jaxltl.core.sparse.linear.topological_order import Edges
 
 _POLICIES = 30  # policies at most
-_STEPS = 12  # refinements of one policy
+_STEPS = 16  # refinements of one policy
 _TIES = 0.0, 1e-10, 1e-5, 1.0, 16.0  # of the last step: values that differ by less may be equal
 _NOISE = 8  # times the residual of a policy's own rows: smaller gains are rounding
 _TRUSTED = 1e-9  # residual up to which gains are believed
 _MAX_SHARE = 1e-3  # up to which second-order terms are covered by `perturbation_bound`
 
+_MAX_BAND, _MAX_WORK = 2**27, 4e9  # entries of a band, and its multiplications
 MAX_FRACTIONS = 1000  # unknowns of a system in fractions
 _OPERATIONS = 150_000  # on fractions, in one elimination
 _BITS = 1024  # of a number, beyond which an operation counts as several
 _FRACTION_POLICIES = 50
 
-Solver = Callable[[Floats], Floats]
+Solver = Callable[[Floats], Floats | None]
 
 
 def perturbation_bound(share: float, num_unknowns: int) -> float:
@@ -67,6 +69,33 @@ def two_float_difference(high: Floats, low: Floats, other: Floats, other_low: Fl
     return large + (lost + (rest + more))
 
 
+class TwoFloats(NamedTuple):
+    """Values ``high + low``, ``float64[M]`` each, and the size of their last refinement."""
+
+    high: Floats
+    low: Floats
+    step: float = 0.0
+
+
+def refine(
+    solve: Solver, right: Floats, residual: Callable[[TwoFloats], Floats]
+) -> TwoFloats | None:
+    """Solution of a linear system in two floats, by iterative refinement (Wilkinson 1963)."""
+    with np.errstate(all="ignore"):
+        high = solve(right)
+        if high is None:
+            return None
+        value = TwoFloats(high, np.zeros_like(high), float(np.abs(high).max(initial=0)))
+        for _ in range(_STEPS):
+            more = solve(residual(value))
+            step = np.inf if more is None else float(np.abs(more).max(initial=0))
+            if more is None or not step < value.step / 2:  # also if NaN
+                break
+            high, lost = two_sum(value.high, more)
+            value = TwoFloats(*two_sum(high, value.low + lost), step)
+    return value if np.isfinite(value.high).all() else None
+
+
 @dataclass(frozen=True)
 class RefinedOptimum:
     """Values ``float64[M]``, their relative error, and the policy, found after some policies."""
@@ -86,9 +115,15 @@ def refined_optimum(
 ) -> RefinedOptimum | None:
     """Optimum by policy iteration on two-float values; None if it is not found."""
     rows = _Rows(equation)
+
+    def residual_of_policy(x: TwoFloats) -> Floats:
+        return rows.balance(x.high, x.low)[0][policy]
+
     for round_ in range(1, _POLICIES + 1):
         solve = solver_of(policy)
-        pair = None if solve is None else _solution(rows, policy, solve)
+        if solve is None:
+            return None
+        pair = refine(solve, rows.cost[policy], residual_of_policy)
         if pair is None:
             return None
         best: RefinedOptimum | None = None
@@ -158,31 +193,7 @@ class _Rows:
         return gap, np.bincount(self.row, np.abs(flow), count) + (self.cost + end)
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """Values ``high + low``, and the size of the last refinement."""
-
-    high: Floats
-    low: Floats
-    step: float
-
-
-def _solution(rows: _Rows, policy: Integers, solve: Solver) -> _Pair | None:
-    """A policy's value in two floats, by iterative refinement (Wilkinson 1963)."""
-    with np.errstate(all="ignore"):
-        high = solve(rows.cost[policy])
-        value = _Pair(high, np.zeros_like(high), float(np.abs(high).max(initial=0)))
-        for _ in range(_STEPS):
-            more = solve(rows.balance(value.high, value.low)[0][policy])
-            step = float(np.abs(more).max(initial=0))
-            if not step < value.step / 2:  # also where it is NaN
-                break
-            high, lost = two_sum(value.high, more)
-            value = _Pair(*two_sum(high, value.low + lost), step)
-    return value if np.isfinite(value.high).all() else None
-
-
-def _with_ties(pair: _Pair, level: float) -> tuple[Floats, Floats]:
+def _with_ties(pair: TwoFloats, level: float) -> tuple[Floats, Floats]:
     """The values, made equal where they differ by less than a level of the last refinement."""
     high, low = pair.high, pair.low
     if not level:
@@ -194,6 +205,58 @@ def _with_ties(pair: _Pair, level: float) -> tuple[Floats, Floats]:
     same = np.empty_like(order)
     same[order] = order[np.repeat(begin, np.diff(begin, append=order.size))]
     return high[same], low[same]
+
+
+# --- elimination without subtractions -----------------------------------------------------------
+
+
+def gth_solver(matrix: SparseMatrix, leaving: Floats) -> Solver | None:
+    """Solver of ``(D - W) x = b`` for ``D = sum_j W_ij + l_i`` in a band; None if that is too large.
+
+    Each pivot is the sum of the weights that remain (Grassmann, Taksar and Heyman 1985), so that its
+    relative error does not grow with the length of episodes. None also if some state is never left.
+    """
+    from scipy.sparse import csgraph
+
+    size = leaving.size
+    both = (matrix + matrix.T).tocsr()
+    order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
+    place = np.empty(size, np.int64)
+    place[order] = np.arange(size)
+    row = place[np.repeat(np.arange(size), np.diff(matrix.indptr))]
+    column = place[matrix.indices]
+    width = max(int(np.abs(row - column).max(initial=0)), 1)
+    if size * (2 * width + 1) > _MAX_BAND or size * float(width) ** 2 > _MAX_WORK:
+        return None
+    # Row i of the band holds the columns from i - width to i + width.
+    flat = np.zeros(size * (2 * width + 1))
+    flat[width + 2 * width * row + column] = matrix.data
+    step = flat.itemsize
+    band = np.lib.stride_tricks.as_strided(
+        flat[width:], (size, size), (2 * width * step, step), writeable=True
+    )
+    total, out = np.empty(size), leaving[order].astype(np.float64)
+    first = np.maximum(np.arange(size) - width, 0).tolist()
+    for k in reversed(range(size)):
+        earlier = slice(first[k], k)
+        total[k] = band[k, earlier].sum() + out[k]
+        if not total[k] > 0:
+            return None
+        share = band[earlier, k]
+        share /= total[k]
+        band[earlier, earlier] += share[:, None] * band[k, earlier]
+        out[earlier] += share * out[k]
+
+    def solve(b: Floats) -> Floats:
+        x = b[order]
+        for k in reversed(range(size)):
+            x[first[k] : k] += band[first[k] : k, k] * x[k]
+        for k in range(size):
+            x[k] = (x[k] + band[k, first[k] : k] @ x[first[k] : k]) / total[k]
+        result: Floats = x[place]
+        return result
+
+    return solve
 
 
 # --- fractions ----------------------------------------------------------------------------------

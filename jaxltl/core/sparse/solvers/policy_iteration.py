@@ -30,10 +30,10 @@ from jaxltl.core.sparse.linear.extended_precision import (
     MAX_FRACTIONS,
     Solver,
     exact_optimum,
+    gth_solver,
     perturbation_bound,
     refined_optimum,
 )
-from jaxltl.core.sparse.linear.gth_elimination import gth_solver
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation, propagate_improvements
 from jaxltl.core.sparse.linear.topological_order import (
     Edges,

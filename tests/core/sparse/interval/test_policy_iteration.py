@@ -10,11 +10,10 @@ from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.sparse.interval import policy_iteration as interval_optimum
 from jaxltl.core.sparse.interval import reachability as interval_values
 from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem
-from jaxltl.core.sparse.interval.refinement import Refinement
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.row_operator import PolicyPair
-from jaxltl.core.sparse.linear import system_sequence
-from jaxltl.core.sparse.linear.system_sequence import SystemSequence
+from jaxltl.core.sparse.linear import elimination
+from jaxltl.core.sparse.linear.elimination import SystemSequence
 
 
 def walks(size, rng, drift):
@@ -62,7 +61,7 @@ def test_who_could_go_round_where_nothing_is_lost(maximize, monkeypatch):
 
 @pytest.mark.parametrize("mixes", (True, False))
 def test_systems_of_changing_choices(mixes, monkeypatch):
-    monkeypatch.setattr(system_sequence, "_DIRECT", 0)
+    monkeypatch.setattr(elimination, "_DIRECT", 0)
     rng = np.random.default_rng(7)
     dense = rng.random((60, 60)) * (rng.random((60, 60)) < 0.1)
     dense = 0.95 * dense / np.maximum(dense.sum(1), 1)[:, None]
@@ -227,9 +226,8 @@ def test_refined_bounds_are_narrower_and_agree(maximize, adversarial):
             np.zeros(operator.size),
             np.ones(operator.size),
         )
-        refinement = Refinement(search.systems.solve_directly, 1e-10)
         pair = search.approximate(begin)
-        upper, attained = (refinement.bound(operator, pair, side) for side in (1, -1))
+        upper, attained = (search.refined_bound(pair, side, 1e-10) for side in (1, -1))
         assert upper is not None and attained is not None
         assert (attained.bound <= upper.bound).all()
         assert (upper.bound - attained.bound).max() <= 1e-10

@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.sparse.linear import elimination, gth_elimination
+from jaxltl.core.sparse.linear import elimination
 from jaxltl.core.sparse.linear import extended_precision as exact
 from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.linear.elimination import factorize
@@ -120,7 +120,7 @@ def test_what_would_fill_is_swept(converges, monkeypatch):
     if not converges:
         monkeypatch.setattr(elimination, "_KRYLOV", 1)
         monkeypatch.setattr(elimination, "_SWEEPS", 10)
-        monkeypatch.setattr(gth_elimination, "_MOST", 0)
+        monkeypatch.setattr(exact, "_MAX_BAND", 0)
         monkeypatch.setattr(exact, "_OPERATIONS", 0)
     host = rings(30, np.random.default_rng(0))
     host.probability[2:90:3] -= 0.005  # the first ring may end in the goal's rival
@@ -170,7 +170,7 @@ def test_elimination_without_subtractions_has_the_digits_of_its_weights():
         for i, out in enumerate(leaving.tolist()):
             rows[i][i] = Fraction(out) - sum(rows[i])
         expected = exact_solve(rows, [Fraction(x) for x in b.tolist()])
-        solve = gth_elimination.gth_solver(sparse.csr_array(weight), leaving)
+        solve = exact.gth_solver(sparse.csr_array(weight), leaving)
         for x, y in zip(solve(b).tolist(), expected, strict=True):
             assert abs(Fraction(x) - y) <= Fraction(1e-13) * y
-    assert gth_elimination.gth_solver(sparse.csr_array(weight), 0 * leaving) is None
+    assert exact.gth_solver(sparse.csr_array(weight), 0 * leaving) is None
