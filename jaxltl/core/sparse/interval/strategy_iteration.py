@@ -53,55 +53,53 @@ def under_nature(
     )
 
 
-def improve_policy(
-    model: UncertainMDP, row: Integers, solve: Subproblems, *, maximize: bool
+def improve_strategies(
+    model: UncertainMDP,
+    pair: tuple[Integers, Floats],
+    solve: Subproblems,
+    *,
+    policy_leads: bool,
+    maximize: bool,
 ) -> RobustValues:
-    """Strategy iteration led by the policy."""
-    mdp, sign, rounds = model.mdp, 1 if maximize else -1, 0
+    """Strategy iteration from the choices of the leader in `pair`; `maximize` is its direction."""
+    (row, p), mdp, sign, rounds = pair, model.mdp, 1 if maximize else -1, 0
+
+    def policy_fixed(row: Integers, maximize: bool) -> Enclosure:
+        return solve.joint(model.under_policy(row)[0], solve.cost[row], maximize)
+
+    def nature_fixed(p: Floats, maximize: bool) -> Enclosure:
+        return under_nature(solve.fixed_nature, model, p, solve.cost, maximize)
+
     while True:
         rounds += 1
-        inner = solve.joint(model.under_policy(row)[0], solve.cost[row], not maximize)
-        gain, p = row_gains(model, inner.value, solve.cost, nature_maximizes=not maximize)
-        best = mdp.over_choices(np.maximum, sign * gain)
-        better = best > gain_noise(inner.value)
+        answered = (
+            policy_fixed(row, not maximize) if policy_leads else nature_fixed(p, not maximize)
+        )
+        gain, q = row_gains(
+            model, answered.value, solve.cost, nature_maximizes=maximize != policy_leads
+        )
+        noise = gain_noise(answered.value)
+        best = mdp.over_choices(np.maximum if policy_leads else np.minimum, sign * gain)
+        first = mdp.first_choice(sign * gain == best[mdp.state])[1].astype(np.int64)
+        if policy_leads:
+            more, better, p = best, best > noise, q
+        else:
+            now = model.sum_rows(p * differences(model, answered.value)) + solve.cost
+            more, row = sign * (gain - now), first
+            better = more > noise[mdp.state]
         last = rounds == _ROUNDS or not better.any()
         if last or _tests_bounds(rounds):
-            other = under_nature(solve.fixed_nature, model, p, solve.cost, maximize)
-            low, high = (inner.lower, other.upper) if maximize else (other.lower, inner.upper)
+            other = nature_fixed(p, maximize) if policy_leads else policy_fixed(row, maximize)
+            below, above = (answered, other) if maximize else (other, answered)
+            low, high = below.lower, above.upper
             if last or solve.accuracy.accepts(low, high):
                 break
-        new = mdp.first_choice(sign * gain == best[mdp.state])[1]
-        row = np.where(better, new, row)
-    return enclosed_values(
-        inner.value, (low, high), row, p, rounds=rounds + other.rounds, residual=float(best.max())
-    )
-
-
-def improve_nature(
-    model: UncertainMDP, p: Floats, solve: Subproblems, *, nature_maximizes: bool
-) -> RobustValues:
-    """Strategy iteration led by nature."""
-    mdp, up, rounds = model.mdp, nature_maximizes, 0
-    sign = 1 if up else -1
-    while True:
-        rounds += 1
-        outer = under_nature(solve.fixed_nature, model, p, solve.cost, not up)
-        gain, q = row_gains(model, outer.value, solve.cost, nature_maximizes=up)
-        now = model.sum_rows(p * differences(model, outer.value)) + solve.cost
-        more = sign * (gain - now)
-        better = more > gain_noise(outer.value)[mdp.state]
-        last = rounds == _ROUNDS or not better.any()
-        if last or _tests_bounds(rounds):
-            best = mdp.over_choices(np.minimum, sign * gain)
-            row = mdp.first_choice(sign * gain == best[mdp.state])[1].astype(np.int64)
-            inner = solve.joint(model.under_policy(row)[0], solve.cost[row], up)
-            low, high = (outer.lower, inner.upper) if up else (inner.lower, outer.upper)
-            if last or solve.accuracy.accepts(low, high):
-                break
-        p = np.where(better[mdp.row], q, p)
-    return enclosed_values(
-        outer.value, (low, high), row, p, rounds=rounds + inner.rounds, residual=float(more.max())
-    )
+        if policy_leads:
+            row = np.where(better, first, row)
+        else:
+            p = np.where(better[mdp.row], q, p)
+    rounds, residual = rounds + other.rounds, float(more.max())
+    return enclosed_values(answered.value, (low, high), row, p, rounds=rounds, residual=residual)
 
 
 def _tests_bounds(rounds: int) -> bool:

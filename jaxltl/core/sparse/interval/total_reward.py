@@ -24,8 +24,7 @@ from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distr
 from jaxltl.core.sparse.interval.strategy_iteration import (
     MDPSolver,
     Subproblems,
-    improve_nature,
-    improve_policy,
+    improve_strategies,
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
@@ -80,11 +79,13 @@ def _total_reward(
     solve = Subproblems(fixed_nature, joint, cost, Accuracy(query.tolerance, relative=True))
     if query.cooperative:
         values = joint(part, cost, query.maximize)
-    elif query.maximize:
-        p = part.interior_distributions(np.ones(part.mdp.num_transitions, bool))
-        values = improve_nature(part, p, solve, nature_maximizes=False)
     else:
-        values = improve_policy(part, _first_policy(part, ends, solve), solve, maximize=False)
+        p = part.interior_distributions(np.ones(part.mdp.num_transitions, bool))
+        first = part.mdp.row_start[:-1] if query.maximize else _first_policy(part, ends, solve)
+        pair = first.astype(np.int64), p
+        values = improve_strategies(
+            part, pair, solve, policy_leads=not query.maximize, maximize=False
+        )
     value, lower, upper = (
         np.where(finite, x, np.inf) for x in (values.value, values.lower, values.upper)
     )
