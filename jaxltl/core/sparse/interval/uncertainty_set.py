@@ -54,9 +54,6 @@ class UncertainMDP:
     def _ones(self) -> Floats:
         return np.ones(self.mdp.num_rows)
 
-    def _is_nonnegative(self, excess: Floats) -> Booleans:
-        return excess >= (-self.rounding if self.tolerant else 0)
-
     @cached_property
     def has_fixed_support(self) -> bool:
         """True if nature must give every successor some mass."""
@@ -119,17 +116,7 @@ class UncertainMDP:
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
         """Tests if nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
-        start = self.mdp.entry_start
-        if self.has_fixed_support:
-            return np.logical_and.reduceat(entries, start[:-1])
-        every = np.logical_and.reduceat(entries | (self.upper == 0), start[:-1])
-        needed = np.logical_or.reduceat(~entries & (self.lower > 0), start[:-1])
-        room = row_sums(np.where(entries, self.upper, 0), start, -self._ones)
-        able = self._is_nonnegative(room)
-        if self.ball is not None:
-            center, gain = np.where(entries, self.ball.center, 0), self.ball.gain
-            able &= self._is_nonnegative(row_sums(center, start, gain, -self._ones))
-        return every | (able & ~needed)
+        return self._can_stay(entries, self.mdp.entry_start, slice(None), slice(None))
 
     def can_stay_in(self, region: Booleans) -> Booleans:
         """Tests if nature may keep to a set of states: ``bool[R]`` from ``bool[S]``."""
@@ -137,21 +124,27 @@ class UncertainMDP:
 
     def must_enter(self, row: Integers, region: Booleans) -> Booleans:
         """Tests if every distribution of some rows enters a region: ``bool[N]``."""
-        if not row.size:
+        entry, count = row_entries(self.mdp.entry_start, row)
+        outside = ~region[self.mdp.successor[entry]]
+        return ~self._can_stay(outside, offsets_from_counts(count), entry, row)
+
+    def _can_stay(
+        self, inside: Booleans, start: Integers, entry: Integers | slice, row: Integers | slice
+    ) -> Booleans:
+        """Tests if nature may put all mass of some rows on the marked ones of their entries."""
+        if start.size == 1:
             return np.zeros(0, bool)
-        mdp = self.mdp
-        entry, count = row_entries(mdp.entry_start, row)
-        start = count.cumsum() - count
-        inside = region[mdp.successor[entry]]
-        start, one = np.append(start, entry.size), np.ones(row.size)
-        least = -self.rounding[row] if self.tolerant else np.zeros(row.size)
-        room = row_sums(np.where(inside, 0, self.upper[entry]), start, -one) >= least
-        forced = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start[:-1])
-        possible = np.logical_or.reduceat(inside & (self.upper[entry] > 0), start[:-1])
+        if self.has_fixed_support:
+            return np.logical_and.reduceat(inside, start[:-1])
+        upper, one = self.upper[entry], self._ones[row]
+        every = np.logical_and.reduceat(inside | (upper == 0), start[:-1])
+        needed = np.logical_or.reduceat(~inside & (self.lower[entry] > 0), start[:-1])
+        least = -self.rounding[row] if self.tolerant else 0
+        able = row_sums(np.where(inside, upper, 0), start, -one) >= least
         if self.ball is not None:
-            center, gain = self.ball.center[entry], self.ball.gain[row]
-            room &= row_sums(np.where(inside, 0, center), start, gain, -one) >= least
-        return possible & (forced | ~room)
+            center = np.where(inside, self.ball.center[entry], 0)
+            able &= row_sums(center, start, self.ball.gain[row], -one) >= least
+        return every | (able & ~needed)
 
     def interior_distributions(self, entries: Booleans) -> Floats:
         """Distributions with support `entries` where nature may keep to these; full elsewhere."""
