@@ -30,8 +30,7 @@ from jaxltl.core.sparse.interval.strategy_iteration import (
     MDPSolver,
     Subproblems,
     enclosed_values,
-    improve_nature,
-    improve_policy,
+    improve_strategies,
     under_nature,
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
@@ -95,11 +94,9 @@ def _reachability(
     elif (both := _opposed(absorbing, target, query)) is not None:
         values = both
     else:
-        start, p = _first_choices(absorbing, target, maximize=query.maximize)
-        values = (
-            improve_policy(absorbing, start, solve, maximize=True)
-            if query.maximize
-            else improve_nature(absorbing, p, solve, nature_maximizes=True)
+        first = _first_choices(absorbing, target, maximize=query.maximize)
+        values = improve_strategies(
+            absorbing, first, solve, policy_leads=query.maximize, maximize=True
         )
     return without_absorbing(model, absorbing, row, stop, values)
 
@@ -162,7 +159,7 @@ def joint_optimum(
     if not up:
         low, high = np.minimum(bound, best.upper), np.minimum(best.upper, highest)
     return RobustValues(
-        best.value, low, high, row, chance, rounds + best.rounds, best.residual, METHOD
+        best.value, low, high, row, rounds + best.rounds, best.residual, METHOD, chance
     )
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Floats
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -34,17 +35,10 @@ class Query:
 
 
 @dataclass(frozen=True)
-class RobustValues:
+class RobustValues(Enclosure):
     """Certified values of an uncertain MDP, with choices of both sides."""
 
-    value: Floats  # float64[S] (value, lower, upper)
-    lower: Floats
-    upper: Floats
-    row: Integers  # int64[S], a policy
     probability: Floats  # float64[T], nature's distributions
-    rounds: int  # linear systems solved
-    residual: float  # by how much the value violates its optimality equation
-    method: str  # name of the algorithm
 
     def hull(self, other: RobustValues) -> RobustValues:
         """The same values with bounds that enclose both enclosures."""

@@ -34,9 +34,10 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.reachability import quotient_policy
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
-from jaxltl.core.sparse.solvers.shortest_path_problem import ShortestPathProblem
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
+_METHOD = "value iteration and policy iteration"
 _LAZY = 0.5  # the step of value iteration: with self-loops no chain is periodic
 _SWEEPS = 400  # of value iteration before policy iteration
 _JUDGED = 32  # sweeps between two estimates of the rate of convergence
@@ -56,18 +57,6 @@ _LOOSEST = 1e-3  # share up to which second-order terms are negligible
 _FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolved further
 
 
-@dataclass(frozen=True)
-class AverageReward:
-    """Enclosed long-run averages."""
-
-    value: Floats  # float64[S] (value, lower, upper)
-    lower: Floats
-    upper: Floats
-    row: Integers  # int64[S], a policy that attains the bound on the safe side
-    residual: float  # half the width of the widest gain's enclosure
-    rounds: int  # sweeps, and linear systems
-
-
 def average(
     mdp: HostMDP,
     reward: Floats,
@@ -76,8 +65,8 @@ def average(
     tolerance: float,
     max_steps: int,
     sign: int = 1,
-) -> AverageReward:
-    """Largest long-run average reward per step."""
+) -> Enclosure:
+    """Largest long-run average reward per step; the residual is half the widest gain's enclosure."""
     components = end_components(mdp)
     states = np.flatnonzero(components.region(mdp))
     states = states[np.argsort(components.component[states], kind="stable")]
@@ -94,7 +83,7 @@ def average(
         if not inside.all():
             onward = shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool))
             row = np.where(inside, row, onward)
-        return AverageReward(value, value - half, value + half, row, half, gains.rounds)
+        return Enclosure(value, value - half, value + half, row, gains.rounds, half, _METHOD)
     stopping = _stopping_problem(mdp, components, leaders)
     least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
     width = tolerance / 4 * least
@@ -104,13 +93,14 @@ def average(
         # The error of large gains would be too much for small ones: both sides separately.
         low, _, taken, rounds = stopping.solve(gains.lower, tolerance, width, sign)
         high, slack = stopping.solve(gains.upper, tolerance, width, sign)[1], 0.0
-    return AverageReward(
+    return Enclosure(
         value=(low + high) / 2,
         lower=low - slack,
         upper=high + slack,
         row=quotient_policy(mdp, components, taken, row),
-        residual=half,
         rounds=gains.rounds + rounds,
+        residual=half,
+        method=_METHOD,
     )
 
 

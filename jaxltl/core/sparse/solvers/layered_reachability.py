@@ -31,7 +31,7 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.reachability import expands_fast, quotient_policy
-from jaxltl.core.sparse.solvers.shortest_path_problem import TINY
+from jaxltl.core.sparse.solvers.shortest_path_problem import TINY, Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _STARTS = 8  # states from one of which few steps
@@ -49,15 +49,6 @@ class PaddedProduct(NamedTuple):
     delta: Integers  # int[Q, L]
     letter: Integers  # int[S]
     allowed: Booleans | None = None  # bool[S, Q, A], or None for all
-
-
-class LayeredBounds(NamedTuple):
-    """Bounds of a reachability probability."""
-
-    lower: Floats  # float64[S, Q], exactly 0 or 1 where the graph decides
-    upper: Floats
-    action: Integers  # int32[S, Q], a policy that attains the bound on the safe side
-    sweeps: int  # over the model
 
 
 class _Rows:
@@ -99,8 +90,8 @@ class _Rows:
 
 def layered_reachability(
     world: PaddedProduct, target: Booleans, *, maximize: bool, tolerance: float
-) -> LayeredBounds | None:
-    """Bounds of reaching ``bool[S, Q]`` of width `tolerance`; None if slow or unproven."""
+) -> Enclosure | None:
+    """Probability of reaching ``bool[S, Q]``, with actions as rows; None if slow or unproven."""
     num_memory = world.delta.shape[0]
     if num_memory > LARGEST or not _mixes(world):
         return None
@@ -202,14 +193,19 @@ class _Search:
         """The relative rounding of one backup."""
         return (4 * int(self.world.used.shape[2]) + 16) * _EPS
 
-    def bounds(self) -> LayeredBounds:
+    def bounds(self) -> Enclosure:
         """The final bounds."""
         low, high = (self.attained, self.outer) if self.sign > 0 else (self.outer, self.attained)
         # Products too small for a float to hold are lost; relative errors do not count them.
         open_ = low != high
         low = np.where(open_, np.clip(low - TINY, 0, 1), low)
         high = np.where(open_, np.clip(high + TINY, 0, 1), high)
-        return LayeredBounds(low.T, high.T, self.action, self.sweeps)
+        half = (high - low).T / 2
+        # The operator contracts the bounds towards each other, so the residual is at most `half`.
+        residual = float(half.max())
+        return Enclosure(
+            low.T + half, low.T, high.T, self.action, self.sweeps, residual, "sweeps in place"
+        )
 
 
 class _Problem(NamedTuple):

@@ -43,6 +43,7 @@ class Steps(NamedTuple):
     error: Floats  # float64[S], a bound
     row: Integers  # int32[S], the first choices; int32[n, S] if all are returned
     num_steps: int  # the number of backups
+    probability: Floats | None = None  # float64[T], nature's distributions in the first step
 
 
 def backup_unit(mdp: HostMDP) -> float:

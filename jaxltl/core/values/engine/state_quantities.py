@@ -11,8 +11,6 @@ from jax.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
-from jaxltl.core.sparse.interval.robust_values import RobustValues
-from jaxltl.core.sparse.solvers.average_reward import AverageReward
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status, require_states
 
@@ -142,7 +140,7 @@ def safe_mean(share: np.ndarray, bound: ArrayLike, *, up: bool, highest: float =
 
 def safe_ends(
     model: Model,
-    enclosure: Solution | Enclosure | RobustValues | AverageReward,
+    enclosure: Solution | Enclosure,
     *,
     highest: float = np.inf,
 ) -> tuple[float, float]:

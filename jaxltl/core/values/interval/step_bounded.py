@@ -10,7 +10,7 @@ import numpy as np
 from jaxltl.core.models.interval import IntervalMDP, require_interval
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.robust_values import Query
-from jaxltl.core.sparse.interval.step_bounded import StepBoundedValues
+from jaxltl.core.sparse.solvers.step_bounded import Steps
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.array_types import Floats
@@ -196,9 +196,9 @@ def _earned(
     )
 
 
-def _solution(values: StepBoundedValues, highest: float = 1) -> Solution:
+def _solution(values: Steps, highest: float = 1) -> Solution:
     """The :class:`Solution` of step-bounded values."""
-    nature: Array = values.probability
+    nature: Array | None = values.probability
     solution = solution_from_error(
         values.value, values.error, values.row.astype(np.int32), values.num_steps, highest=highest
     )

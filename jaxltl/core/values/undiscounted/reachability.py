@@ -362,23 +362,11 @@ def _by_layers(
         np.asarray(model.letter),
         None if model.allowed is None else np.asarray(model.allowed),
     )
-    layered = layered_reachability(
+    bounds = layered_reachability(
         layers, np.asarray(target), maximize=objective == "max", tolerance=width
     )
-    if layered is None:
+    if bounds is None:
         return None
-    half = (layered.upper - layered.lower) / 2
-    # The operator contracts the bounds towards each other, so the residual is at most half of the
-    # width.
-    bounds = Enclosure(
-        value=layered.lower + half,
-        lower=layered.lower,
-        upper=layered.upper,
-        row=layered.action,
-        rounds=layered.sweeps,
-        residual=float(half.max()),
-        method="sweeps in place",
-    )
     return solution_from_enclosure(model, None, bounds, requested, relative=False)
 
 

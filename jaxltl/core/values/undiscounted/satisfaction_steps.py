@@ -24,7 +24,7 @@ from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.sparse.solvers.average_reward import AverageReward, average
+from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.sparse.solvers.shortest_path import with_exits
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status
@@ -235,7 +235,7 @@ class StepAnalysis:
         return self.mean(solution, 1.0)
 
     def mean(
-        self, enclosure: Enclosure | AverageReward | Solution, highest: float = np.inf
+        self, enclosure: Enclosure | Solution, highest: float = np.inf
     ) -> tuple[float, float, float]:
         """Value, lower and upper bound of the mean over the initial distribution."""
         share = np.asarray(self.model.initial, np.float64).ravel()
@@ -313,7 +313,7 @@ class StepAnalysis:
         return share / rate[2] * (1 - 2 * _EPS) if rate[2] > 0 else np.inf, action
 
 
-def _gain(mdp: HostMDP, reward: Floats) -> AverageReward:
+def _gain(mdp: HostMDP, reward: Floats) -> Enclosure:
     return average(mdp, reward, reward, tolerance=_SOLVED, max_steps=_MOST_SWEEPS)
 
 
