@@ -27,7 +27,7 @@ from jaxltl.algos import (
 )
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
-from jaxltl.core.models.parametric.parametric import make_parametric
+from jaxltl.core.models.parametric import make_parametric
 from jaxltl.envs import lqr
 from jaxltl.envs.letter_world import events_seen
 from jaxltl.envs.networks import make_network

@@ -49,7 +49,7 @@ from .core.models.mdp import (
     make_mdp as make_mdp,
 )
 from .core.models.mesh.lanes import vmap_over_mesh as vmap_over_mesh
-from .core.models.parametric.parametric import (
+from .core.models.parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,
 )

@@ -55,7 +55,7 @@ from jaxltl.algos.common.settings import Number, RunState, static, traced
 from jaxltl.core import struct, validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
+from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal

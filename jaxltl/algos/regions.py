@@ -37,7 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.parametric.parametric import ParametricMDP, box_of
+from jaxltl.core.models.parametric import ParametricMDP, box_of
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.reachability import reachability

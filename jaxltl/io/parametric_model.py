@@ -15,9 +15,16 @@ import numpy as np
 from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside
-from jaxltl.core.models.parametric.rational import Ends as Ranges, ranges
-from jaxltl.core.models.parametric.rational import Rationals, make_rationals
+from jaxltl.core.models.parametric import (
+    Ends,
+    ParametricMDP,
+    Ranges,
+    Rationals,
+    box_of,
+    make_rationals,
+    point_inside,
+    ranges,
+)
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.array_types import Integers

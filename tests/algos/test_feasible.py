@@ -15,7 +15,7 @@ import pytest
 from jaxltl.algos import feasible as search
 from jaxltl.algos.common import loops
 from jaxltl.algos.feasible import Budget, Hparams, certify, evaluate, feasible, make_problem, within
-from jaxltl.core.models.parametric.parametric import make_parametric
+from jaxltl.core.models.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.io.drn.parametric import read_parametric

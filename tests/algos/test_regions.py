@@ -8,8 +8,7 @@ import pytest
 
 from jaxltl.algos.feasible import make_problem
 from jaxltl.algos.regions import enclose, prove_around, prove_regions
-from jaxltl.core.models.parametric.parametric import make_parametric
-from jaxltl.core.models.parametric.rational import make_rationals, ranges
+from jaxltl.core.models.parametric import make_parametric, make_rationals, ranges
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.total_reward import total_reward

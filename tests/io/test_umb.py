@@ -20,7 +20,7 @@ from jaxltl.io import files as _files
 from jaxltl.io.umb import umb
 from jaxltl.io.umb import values as _umb_values
 from jaxltl.io.umb.index import Record, Type, Variable
-from jaxltl.io.umb.tar import members, tar_pieces, write_gzip
+from jaxltl.io.umb.members import members, tar_pieces, write_gzip
 from jaxltl.io.umb.umb import read_umb, write_umb
 from jaxltl.io.umb.values import read_numbers, read_variables
 from tests.io.archives import (

@@ -33,7 +33,7 @@ from tests.io.test_umb import (
     with_member,
 )
 
-ARRAYS = ("tables", "place", "available", "sent", "kind", "shown", "rewards", "number", "row")
+ARRAYS = ("tables", "place", "available", "sent", "kind", "label_rows", "rewards", "number", "row")
 
 
 def assert_same_on_mesh(found, expected):

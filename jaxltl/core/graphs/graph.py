@@ -6,6 +6,7 @@ nothing; traced ones use a :class:`TracedGraph` of the primitives. The results a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar, cast
@@ -16,21 +17,97 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core import struct
-from jaxltl.core.graphs.colouring import components_by_sweeps
 from jaxltl.core.models.compiled import compiled_form
+from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.mdp import DenseMDP, MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import host_callback, is_traced, jit, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.row_graph import RowGraph, product_graph
 from jaxltl.core.sparse.mdp import HostGraph
 from jaxltl.core.sparse.rows import rows_from_dense, rows_from_padded
+
+
+def components_by_sweeps(
+    graph: PyTree, core: jax.Array, allowed: jax.Array, closed: bool
+) -> tuple[jax.Array, jax.Array]:
+    """Components ``int32[S]`` and inner actions ``bool[S, A]``, as ``RowGraph.components``."""
+    stay = allowed & graph.available & core[..., None]
+
+    def prune(
+        carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        stay, _, _ = carry
+        label = strong_components(graph, core, stay)
+        inside = (graph.least(label) == label[..., None]) & (
+            -graph.least(-label) == label[..., None]
+        )
+        moves = stay & inside
+        return moves, label, jnp.any(moves != stay)
+
+    start = stay, jnp.zeros(core.shape, jnp.int32), jnp.bool_(True)
+    if closed:
+        moves, label, _ = prune(start)
+        removed = graph.anywhere(jnp.any(moves != stay, axis=-1), label)
+        moves = stay & ~removed[..., None]
+    else:
+        moves, label, _ = lax.while_loop(lambda carry: carry[2], prune, start)
+    alive = jnp.any(moves, axis=-1)
+    return jnp.where(alive, label, state_numbers(core.shape)), moves
+
+
+def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax.Array:
+    """The least state of the component of each state under some actions; itself outside of `states`."""
+    number = state_numbers(states.shape)
+    none = jnp.int32(number.size)
+
+    def colour(rank: jax.Array, undecided: jax.Array) -> jax.Array:
+        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            colour, _ = carry
+            ahead = jnp.min(jnp.where(moves, graph.least(colour), none), axis=-1)
+            new = jnp.where(undecided, jnp.minimum(colour, ahead), none)
+            return new, jnp.any(new != colour)
+
+        start = jnp.where(undecided, rank, none), jnp.bool_(True)
+        return lax.while_loop(lambda carry: carry[1], grow, start)[0]
+
+    def reached(colours: jax.Array, root: jax.Array, undecided: jax.Array) -> jax.Array:
+        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            region, _ = carry
+            sent = jnp.where(moves & region[..., None], (colours + 1)[..., None], 0)
+            # Colours do not decrease along edges, so the greatest one that arrives is the state's
+            # own, if that one arrives.
+            new = region | (
+                undecided & (operators.greatest_predecessor(graph.model, sent) == colours + 1)
+            )
+            return new, jnp.any(new != region)
+
+        return lax.while_loop(lambda carry: carry[1], grow, (root, jnp.bool_(True)))[0]
+
+    def body(carry: PyTree) -> PyTree:
+        label, undecided, forward = carry
+        rank = jnp.where(forward, number, none - 1 - number)
+        colours = colour(rank, undecided)
+        region = reached(colours, undecided & (colours == rank), undecided)
+        root = jnp.where(forward, colours, none - 1 - colours)
+        return jnp.where(region, root, label), undecided & ~region, ~forward
+
+    label, _, _ = lax.while_loop(
+        lambda carry: jnp.any(carry[1]), body, (number, states, jnp.bool_(True))
+    )
+    flat = label.ravel()
+    least = jnp.full(flat.shape, none).at[flat].min(number.ravel())
+    return least[flat].reshape(states.shape)
+
+
+def state_numbers(shape: tuple[int, ...]) -> jax.Array:
+    """The number of each state, ``int32[S]``."""
+    return jnp.arange(math.prod(shape), dtype=jnp.int32).reshape(shape)
 
 
 @dataclass(frozen=True)

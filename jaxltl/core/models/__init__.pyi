@@ -54,7 +54,7 @@ from .ops.operators import (
     pushforward as pushforward,
     sample_successor as sample_successor,
 )
-from .parametric.parametric import (
+from .parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,
 )

@@ -21,8 +21,13 @@ from jaxltl.io.intervals import (
     intervals,
     joined_brackets,
 )
-from jaxltl.io.prism.sections import Section, read_labels, read_rewards, read_valuation
-from jaxltl.io.prism.sections import written_sections
+from jaxltl.io.prism.sections import (
+    Section,
+    read_labels,
+    read_rewards,
+    read_valuation,
+    written_sections,
+)
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.io.tokens import Block, Text, decoded, numbered, refuse, truncated
 

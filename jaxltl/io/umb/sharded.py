@@ -25,13 +25,13 @@ from jaxltl.io.umb.members import (
     check_memory,
     check_one_to_one,
     exact_initial,
+    fill,
     known_members,
     label_annotations,
     needed,
     probability_of,
     read_index,
 )
-from jaxltl.io.umb.tar import fill
 from jaxltl.io.umb.values import Bytes, read_bits, read_starts, write_bits
 
 _UNLIMITED = 2**62  # bytes of an archive, which is not held in memory

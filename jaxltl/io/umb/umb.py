@@ -38,15 +38,17 @@ from jaxltl.io.umb.members import (
     check_chain,
     check_memory,
     exact_initial,
+    fill,
     known_members,
     needed,
     probability_of,
     read_index,
     starts_of,
+    tar_pieces,
     texts_of,
     uniform,
+    write_gzip,
 )
-from jaxltl.io.umb.tar import fill, tar_pieces, write_gzip
 from jaxltl.io.umb.values import (
     Bytes,
     read_bits,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.policies.c_code import write_c_policy
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy, Progress
 from jaxltl.core.policies.policy_file import load_table, save_policy
+from jaxltl.io.policies import write_c_policy
 
 WORLD = jl.make_mdp(  # three rooms in a row; action 1 goes right by chance, action 0 left
     [[[0, 0], [1, 0]], [[0, 1], [2, 1]], [[1, 2], [2, 2]]],

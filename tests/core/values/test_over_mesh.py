@@ -10,9 +10,8 @@ import pytest
 from jaxltl.core.games.objective import buchi
 from jaxltl.core.games.winning import winning_region
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
-from jaxltl.core.graphs.colouring import components_by_sweeps
 from jaxltl.core.graphs.end_components import bottom_components, end_components
-from jaxltl.core.graphs.graph import TracedGraph, graph_of
+from jaxltl.core.graphs.graph import TracedGraph, components_by_sweeps, graph_of
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.mesh.shard import from_mesh, shard, to_mesh

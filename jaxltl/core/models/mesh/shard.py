@@ -16,8 +16,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
-from jaxltl.core.models.mesh.layout import StateLayout, state_layout
-from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
+from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP, StateLayout, state_layout
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import (

@@ -34,11 +34,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.ops.array_namespace import jit
-from jaxltl.core.graphs.attractor import attract, avoid, surely
-from jaxltl.core.graphs.colouring import state_numbers
+from jaxltl.core.graphs.attractor import attract, avoid, policy_sets, surely
+from jaxltl.core.graphs.graph import TracedGraph, state_numbers
 from jaxltl.core.graphs.end_components import EndComponents, components_within
-from jaxltl.core.graphs.graph import TracedGraph
-from jaxltl.core.graphs.attractor import policy_sets
 from jaxltl.core.models.ops import double_word as dw
 from jaxltl.core.models.ops.operators import (
     action_mean,

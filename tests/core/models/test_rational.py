@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.parametric.rational import make_polynomials, make_rationals
+from jaxltl.core.models.parametric import make_polynomials, make_rationals
 
 
 def random_terms(rng, num_parameters, count):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from jaxltl.core.models.parametric.parametric import make_parametric
+from jaxltl.core.models.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
 
 

@@ -1,1 +1,0 @@
-"""Parametric MDPs: rational functions of parameters and their ranges over boxes."""
