@@ -9,7 +9,6 @@ and actions of policies are rows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Unpack, cast
@@ -176,21 +175,6 @@ def solution_of(
     return result
 
 
-def differentiable(
-    solution: Solution, backup: Callable[[jax.Array], jax.Array], system: Callable[[], System]
-) -> Solution:
-    """The solution with the implicit derivatives of ``v = backup(v)`` on its value."""
-
-    def solve(b: jax.Array) -> jax.Array:
-        return solver(system()).solve(b)
-
-    def transpose_solve(b: jax.Array) -> jax.Array:
-        return solver(system()).transpose_solve(b)
-
-    value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
-    return replace(solution, value=value)
-
-
 @validated()
 def policy_value(
     model: Model,
@@ -279,8 +263,8 @@ def _policy_value(
 
     solution = solution_of(model, problem, value, image, checked.distribution, n)
     solution = _refined(model, raw, problem, solution, checked.distribution)
-    solution = differentiable(solution, backup, lambda: System(rows, weight, problem.discount))
-    return refuse(replace(solution, policy=checked.distribution), checked)
+    value = implicit(backup, solution.value, System(rows, weight, problem.discount))
+    return refuse(replace(solution, value=value, policy=checked.distribution), checked)
 
 
 @validated(method=_METHODS)
@@ -402,11 +386,9 @@ def _optimal_value(
     def backup(v: jax.Array) -> jax.Array:
         return over.max(reward + problem.discount * expectation(model, v))
 
-    def system() -> System:
-        chosen = over.one_hot(solution.policy, model.dtype)
-        return System(sweep_operator(model), over.columns(chosen), problem.discount)
-
-    return differentiable(solution, backup, system)
+    chosen = over.columns(over.one_hot(solution.policy, model.dtype))
+    system = System(sweep_operator(model), chosen, problem.discount)
+    return replace(solution, value=implicit(backup, solution.value, system))
 
 
 def _refined(

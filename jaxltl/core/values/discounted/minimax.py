@@ -46,7 +46,7 @@ from jaxltl.core.values.engine.certificates import (
 )
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
-from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, System
 
 _PER = ("move", "system_move")
 _METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
@@ -519,9 +519,7 @@ def _strategy_iteration(
 
         def solved() -> jax.Array:
             # Solving for the correction refines the value where the choices stay the same.
-            return k.z + solver(System(rows, weight, backup.scale)).solve(
-                _mean(over, weight, q) - k.z
-            )
+            return k.z + System(rows, weight, backup.scale).solve(_mean(over, weight, q) - k.z)
 
         z = lax.cond(done, lambda: k.z, solved)
         return _Strategies(z, weight, k.z, image, unchanged, done)

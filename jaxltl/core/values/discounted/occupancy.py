@@ -21,7 +21,7 @@ from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
-from jaxltl.core.values.engine.linear import System, solver
+from jaxltl.core.values.engine.linear import System, Transposed, solver
 
 
 @validated()
@@ -94,7 +94,7 @@ def _occupancy(
     finite = jnp.isfinite(bound)
     bound = jnp.where(finite, bound, jnp.inf)
     goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
-    visits = implicit(flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
+    visits = implicit(flow, visits, Transposed(linear))
     value = over.spread(visits) * policy
     frozen = lax.stop_gradient(value)
     solution = Solution(

@@ -25,7 +25,6 @@ from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
-    differentiable,
     expected_reward,
     gains,
     judge,
@@ -36,6 +35,7 @@ from jaxltl.core.values.discounted.discounted import (
 )
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, rounding_unit
+from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import System
 from jaxltl.core.values.engine.validated import SolverOptions, validated
@@ -114,12 +114,10 @@ def _soft_value(
     def backup(v: jax.Array) -> jax.Array:
         return over.logsumexp(policy_logits(model, reward, problem.discount, v))
 
-    def system() -> System:
-        logits = policy_logits(model, reward, problem.discount, solution.value)
-        return System(sweep_operator(model), over.columns(over.softmax(logits)), problem.discount)
-
-    solution = differentiable(solution, backup, system)
-    return with_softmax(model, reward, problem.discount, solution)
+    policy = over.softmax(policy_logits(model, reward, problem.discount, solution.value))
+    system = System(sweep_operator(model), over.columns(policy), problem.discount)
+    value = implicit(backup, solution.value, system)
+    return with_softmax(model, reward, problem.discount, replace(solution, value=value))
 
 
 def soft_maximum(over: Layout, q: Quantity, parameters: PyTree) -> tuple[jax.Array, Quantity]:
@@ -345,14 +343,12 @@ def _boltzmann_value(
             policy = lax.stop_gradient(policy)
         return over.mean(policy, action_value(model, reward, discount, v))
 
-    def system() -> System:
-        policy = over.softmax(policy_logits(model, reward, discount, solution.value))
-        if adjoint == "exact":
-            q = action_value(model, reward, discount, solution.value)
-            policy *= 1 + q - over.spread(over.mean(policy, q))
-        return System(sweep_operator(model), over.columns(policy), discount)
-
-    solution = differentiable(solution, backup, system)
+    policy = over.softmax(policy_logits(model, reward, discount, solution.value))
+    if adjoint == "exact":
+        q = action_value(model, reward, discount, solution.value)
+        policy *= 1 + q - over.spread(over.mean(policy, q))
+    system = System(sweep_operator(model), over.columns(policy), discount)
+    solution = replace(solution, value=implicit(backup, solution.value, system))
     return with_softmax(model, reward, discount, solution)
 
 

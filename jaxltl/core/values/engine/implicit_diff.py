@@ -28,70 +28,34 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, LinearSolver, inverse, norm, solve_linear
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Operator = Callable[[jax.Array], jax.Array]
 
+_FAST_STEPS = 256  # of a Krylov method, which suffice for chains that mix well
+
 
 class LinearSystem(Protocol):
-    """Solvers of ``A(x) = b`` for one operator A and for its transpose; a tree of arrays."""
+    """Solvers of a linear system and of its transpose; a tree of arrays."""
 
-    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """x with ``A(x) = b`` for the operator."""
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution for a right-hand side."""
 
-    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """x with ``A(x) = b`` for the transpose, with products by `matvec`."""
-
-
-class Krylov(NamedTuple):
-    """The solvers of :func:`~jaxltl.core.values.engine.linear.solve_linear`."""
-
-    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """The solution of the system."""
-        return solve_linear(matvec, b)
-
-    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
         """The solution of the transposed system."""
-        return solve_linear(matvec, b)
 
 
 def implicit(
-    operator: Operator,
-    fixed_point: jax.Array,
-    *,
-    solve: Operator | None = None,
-    transpose_solve: Operator | None = None,
-    system: LinearSystem = Krylov(),  # noqa: B008
+    operator: Operator, fixed_point: jax.Array, system: LinearSystem | None = None
 ) -> jax.Array:
     """A fixed point ``v = operator(v)`` with its implicit derivative."""
     # The result is differentiable, forward and reverse, in everything that `operator` closes over:
     # ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
-    # iteration is unrolled; each derivative solves one linear system, or its transpose.
-    if solve is None or transpose_solve is None:
-        return _traced_when_differentiated(operator, lax.stop_gradient(fixed_point), system)
-
-    def solve_tangent(jacobian: Operator, b: jax.Array) -> jax.Array:
-        result: jax.Array = lax.custom_linear_solve(
-            jacobian,
-            b,
-            solve=lambda _, b: solve(b),
-            transpose_solve=lambda _, b: transpose_solve(b),
-        )
-        return result
-
-    result: jax.Array = lax.custom_root(
-        lambda v: v - operator(v),
-        lax.stop_gradient(fixed_point),
-        solve=lambda _, start: start,
-        tangent_solve=solve_tangent,
-    )
-    return result
-
-
-def _traced_when_differentiated(
-    operator: Operator, fixed_point: jax.Array, system: LinearSystem
-) -> jax.Array:
-    """The fixed point, with a linear system that is traced only where a derivative is taken."""
+    # iteration is unrolled; each derivative solves one linear system ``I - J``, or its transpose,
+    # by a Krylov method if none is given. It is traced only where a derivative is taken;
     # ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
+    fixed_point = lax.stop_gradient(fixed_point)
     closed = jax.make_jaxpr(operator)(fixed_point)
 
     def image(constants: list[jax.Array], v: jax.Array) -> jax.Array:
@@ -99,7 +63,7 @@ def _traced_when_differentiated(
         return result
 
     @jax.custom_jvp
-    def root(constants: list[jax.Array], system: LinearSystem, v: jax.Array) -> jax.Array:
+    def root(constants: list[jax.Array], system: LinearSystem | None, v: jax.Array) -> jax.Array:
         return v
 
     @root.defjvp
@@ -111,18 +75,13 @@ def _traced_when_differentiated(
         return v, lax.custom_linear_solve(
             lambda x: x - jacobian(x),
             change,
-            solve=system.solve,
-            transpose_solve=system.transpose_solve,
+            solve=solve_linear if system is None else lambda _, b: system.solve(b),
+            transpose_solve=(
+                solve_linear if system is None else lambda _, b: system.transpose_solve(b)
+            ),
         )
 
     return root(closed.consts, lax.stop_gradient(system), fixed_point)
-
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
-
-
-_FAST_STEPS = 256  # of a Krylov method, which suffice for chains that mix well
 
 
 class ChainSystem(NamedTuple):
@@ -143,13 +102,14 @@ class ChainSystem(NamedTuple):
             ahead = ahead.ravel()[self.row_of]
         return jnp.where(self.mask, ahead, outside)
 
-    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """The solution of ``matvec(x) = b`` for the system itself."""
-        return self._solve(matvec, b, False)
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the system."""
+        return self._solve(lambda x: x - self.image(x), b, False)
 
-    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """The solution for the transpose."""
-        return self._solve(matvec, b, True)
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        back = jax.vjp(self.image, jnp.zeros_like(b))[1]
+        return self._solve(lambda y: y - back(y)[0], b, True)
 
     def _solve(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
         if is_sharded(self.model):
@@ -186,9 +146,7 @@ def with_derivative(
     """The value of a policy, ``x = (r + P x)_pi`` in transient states, with its derivative."""
     # That of an optimum is the derivative of the policy that attains it (Danskin).
     image = partial(chain.image, reward=reward, outside=outside)
-    if inverse is None:
-        return implicit(image, value, system=lax.stop_gradient(chain))
-    return implicit(image, value, solve=inverse.solve, transpose_solve=inverse.transpose_solve)
+    return implicit(image, value, lax.stop_gradient(chain) if inverse is None else inverse)
 
 
 def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -> jax.Array:

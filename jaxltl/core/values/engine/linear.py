@@ -62,6 +62,14 @@ class System(NamedTuple):
         result: jax.Array = y - back
         return result
 
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution for a right-hand side, by the method for the size of the system."""
+        return solver(self).solve(b)
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        return solver(self).transpose_solve(b)
+
     def matrix(self) -> jax.Array:
         """The system as ``float[N, N]``."""
         n = self.num_states
@@ -110,6 +118,20 @@ class LinearSolver(NamedTuple):
     def transpose_solve(self, b: jax.Array) -> jax.Array:
         """The solution of the transposed system."""
         return self.counted(b, transposed=True)[0]
+
+
+class Transposed(NamedTuple):
+    """The transpose of a system with its solutions."""
+
+    linear: LinearSolver
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        return self.linear.transpose_solve(b)
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the system itself."""
+        return self.linear.solve(b)
 
 
 def _krylov(
@@ -176,6 +198,48 @@ def _small_inverse(matrix: jax.Array) -> jax.Array:
 
     result: jax.Array = lax.fori_loop(0, matrix.shape[0], step, matrix)
     return result
+
+
+class RowSystem(NamedTuple):
+    """``mass * (x - sum_w weight * x[place])`` of padded rows, with its inverse if it is small."""
+
+    place: jax.Array  # ``int32[N, W]``
+    weight: jax.Array  # ``float[N, W]``
+    mass: jax.Array | float  # ``float[N]`` or 1
+    inverse: jax.Array | None  # ``float[N, N]``, of the rows without their mass
+
+    def matvec(self, x: jax.Array) -> jax.Array:
+        """The rows without their mass, applied to ``[N]``."""
+        return x - jnp.sum(self.weight * x[self.place], axis=1)
+
+    def vecmat(self, y: jax.Array) -> jax.Array:
+        """Their transpose applied to ``[N]``."""
+        return y - jnp.zeros_like(y).at[self.place].add(self.weight * y[:, None])
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution for a right-hand side, refined once."""
+        b = b / self.mass
+        if self.inverse is None:
+            return solve_linear(self.matvec, b)
+        x = self.inverse @ b
+        return x + self.inverse @ (b - self.matvec(x))
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        if self.inverse is None:
+            return solve_linear(self.vecmat, b) / self.mass
+        y = b @ self.inverse
+        return (y + (b - self.vecmat(y)) @ self.inverse) / self.mass
+
+
+def row_system(target: jax.Array, weight: jax.Array, mass: jax.Array | float = 1.0) -> RowSystem:
+    """The system of rows ``[N, W]``; targets from N on have the value 0."""
+    size = target.shape[0]
+    weight, place = jnp.where(target < size, weight, 0), jnp.minimum(target, size - 1)
+    if size > DENSE_LIMIT:
+        return RowSystem(place, weight, mass, None)
+    matrix = jnp.eye(size, dtype=weight.dtype).at[jnp.arange(size)[:, None], place].add(-weight)
+    return RowSystem(place, weight, mass, inverse(matrix))
 
 
 # --- large systems ---------------------------------------------------------------------------

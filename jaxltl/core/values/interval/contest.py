@@ -17,7 +17,6 @@ operator with room for rounding.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -27,7 +26,7 @@ from jaxltl.core.models.protocols import Array
 from jax import lax
 from numpy.typing import DTypeLike
 
-from jaxltl.core.values.engine.linear import DENSE_LIMIT, Operator, inverse, solve_linear
+from jaxltl.core.values.engine.linear import row_system
 
 _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
 _HASTY = 12  # rounds in which both sides move at once; then the leader waits for the other one
@@ -141,34 +140,6 @@ def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array
     return rest - before, free
 
 
-def system(target: jax.Array, weight: jax.Array) -> tuple[Operator, Operator]:
-    """Solvers of ``x - P x = b`` and of its transpose."""
-    size = target.shape[0]
-    weight = jnp.where(target < size, weight, 0)
-    place = jnp.minimum(target, size - 1)
-
-    def product(x: jax.Array) -> jax.Array:
-        return x - jnp.sum(weight * x[place], axis=1)
-
-    def back(y: jax.Array) -> jax.Array:
-        return y - jnp.zeros_like(y).at[place].add(weight * y[:, None])
-
-    if size > DENSE_LIMIT:
-        return partial(solve_linear, product), partial(solve_linear, back)
-    matrix = jnp.eye(size, dtype=weight.dtype)
-    inverted = inverse(matrix.at[jnp.arange(size)[:, None], place].add(-weight))
-
-    def solve(b: jax.Array) -> jax.Array:
-        x = inverted @ b
-        return x + inverted @ (b - product(x))
-
-    def transposed(b: jax.Array) -> jax.Array:
-        y = b @ inverted
-        return y + (b - back(y)) @ inverted
-
-    return solve, transposed
-
-
 def leaving(target: jax.Array, probability: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mass that leaves each node (1 where none does), and the weights divided by it."""
     own = jnp.arange(target.shape[0])[:, None]
@@ -269,7 +240,7 @@ def _played(
         mass, share = leaving(target, p)
         known = jnp.where(target == size + 1, share, 0)
         steps = jnp.sum(jnp.where(earning[play.row], share, 0), axis=1)
-        solve = system(target, share)[0]
+        solve = row_system(target, share).solve
         base = solve(jnp.sum(known, axis=1) + contest.cost[play.row] / mass)
         time = solve(steps)
         # The extra never grows here: otherwise choices that cycle to earn it would alternate with it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, TypeAlias, Unpack
@@ -27,9 +26,9 @@ from jaxltl.core.values.prepared.block_iteration import (
     meets,
     sweep,
 )
-from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.implicit_diff import LinearSystem, implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
-from jaxltl.core.values.engine.linear import inverse
+from jaxltl.core.values.engine.linear import RowSystem, row_system
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.prepared.block_iteration import SLACK, Problem, State, enclose_cycles
 from jaxltl.core.values.prepared.preparation import Prepared, prepare
@@ -42,9 +41,6 @@ from jaxltl.core.values.prepared.prepared_interval import (
 __all__ = ["Prepared", "evaluate_prepared", "is_direct", "prepare", "solve_prepared"]
 
 _Maybe: TypeAlias = jax.Array | None
-_Solvers: TypeAlias = tuple[
-    Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]
-]  # of a system and of its transpose
 ELIMINATED = 256  # nodes up to which cycles are solved by elimination
 
 
@@ -372,13 +368,11 @@ def _attached(
     def operator(x: jax.Array) -> jax.Array:
         return system.image(jnp.concatenate([x, one])) + put
 
-    fixed = lax.stop_gradient(system)
-    solvers: _Solvers = fixed.solve, fixed.transpose_solve
+    fixed: LinearSystem = lax.stop_gradient(system)
     if enclosure is None and prepared.cyclic and is_direct(prepared):
-        solvers = _eliminated(fixed, prepared.nodes)
-    solve, transpose = solvers
-    value = solve(lax.stop_gradient(operator(put))) if enclosure is None else enclosure.value
-    return implicit(operator, value, solve=solve, transpose_solve=transpose)
+        fixed = _Eliminated.of(lax.stop_gradient(system), prepared.nodes)
+    value = fixed.solve(lax.stop_gradient(operator(put))) if enclosure is None else enclosure.value
+    return implicit(operator, value, fixed)
 
 
 def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
@@ -503,31 +497,24 @@ def _evaluate(
     return _at_states(prepared, value), status
 
 
-def _eliminated(system: Chosen, nodes: jax.Array) -> _Solvers:
-    """Solvers of a system and of its transpose by a dense inverse on its nodes."""
-    count, _, block = system.target.shape
-    size, num_nodes = count * block, nodes.shape[0]
-    number = (
-        jnp.full(size + 3, num_nodes, jnp.int32)
-        .at[nodes]
-        .set(jnp.arange(num_nodes, dtype=jnp.int32))
-    )
-    target, weight = (
-        jnp.moveaxis(x, 1, 2).reshape(size, -1)[nodes] for x in (system.target, system.weight)
-    )
-    rows = jnp.arange(num_nodes, dtype=jnp.int32)[:, None]
-    matrix = jnp.eye(num_nodes, num_nodes + 1, dtype=weight.dtype)
-    matrix = matrix.at[rows, number[target]].add(-weight)[:, :num_nodes]
-    inverted = inverse(matrix)
+class _Eliminated(NamedTuple):
+    """A system with a dense inverse on its nodes; other places keep their values."""
 
-    def solve(b: jax.Array) -> jax.Array:
-        c = b[nodes]
-        x = inverted @ c
-        return b.at[nodes].set(x + inverted @ (c - matrix @ x))
+    rows: RowSystem
+    nodes: jax.Array
 
-    def transpose(b: jax.Array) -> jax.Array:
-        c = b[nodes]
-        x = c @ inverted
-        return b.at[nodes].set(x + (c - x @ matrix) @ inverted)
+    @staticmethod
+    def of(system: Chosen, nodes: jax.Array) -> _Eliminated:
+        count, _, block = system.target.shape
+        size, number = count * block, jnp.arange(nodes.shape[0], dtype=jnp.int32)
+        place = jnp.full(size + 3, nodes.shape[0], jnp.int32).at[nodes].set(number)
+        target, weight = (
+            jnp.moveaxis(x, 1, 2).reshape(size, -1)[nodes] for x in (system.target, system.weight)
+        )
+        return _Eliminated(row_system(place[target], weight), nodes)
 
-    return solve, transpose
+    def solve(self, b: jax.Array) -> jax.Array:
+        return b.at[self.nodes].set(self.rows.solve(b[self.nodes]))
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        return b.at[self.nodes].set(self.rows.transpose_solve(b[self.nodes]))

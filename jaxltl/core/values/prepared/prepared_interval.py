@@ -30,6 +30,7 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
+from jaxltl.core.values.engine.linear import row_system
 from jaxltl.core.values.interval.contest import (
     Bounds,
     Contest,
@@ -37,7 +38,6 @@ from jaxltl.core.values.interval.contest import (
     enclose,
     leaving,
     rounding,
-    system,
 )
 from jaxltl.core.values.interval.robust import interval_reward, nature_direction
 from jaxltl.core.values.engine.state_quantities import state_mask
@@ -431,10 +431,4 @@ def _attached(contest: Contest, bounds: Bounds, value: jax.Array, sign: int) -> 
         return sign * contest.cost[row] + jnp.sum(p * jnp.concatenate([x, ends])[target], axis=1)
 
     mass, share = lax.stop_gradient(leaving(target, p))
-    solve, transposed = system(target, share)
-    return implicit(
-        operator,
-        value,
-        solve=lambda b: solve(b / mass),
-        transpose_solve=lambda b: transposed(b) / mass,
-    )
+    return implicit(operator, value, row_system(target, share, mass))

@@ -81,8 +81,7 @@ def policy_reachability(
     goal, rows = 2 * _half_width(model, tolerance), normalised_rows(*constant)
 
     def eliminated() -> tuple[jax.Array, ...]:
-        solve = partial(chain.solve, lambda x: x - chain.image(x))
-        return m_matrix_error(rows, solve, solve(one), one, undecided)
+        return m_matrix_error(rows, chain.solve, chain.solve(one), one, undecided)
 
     start, n = linear.counted(one)
     enclosure = m_matrix_error(rows, linear.solve, start, one, undecided)

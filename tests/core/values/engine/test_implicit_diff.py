@@ -1,5 +1,7 @@
 """Linear systems and the implicit function theorem."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,6 +66,16 @@ def test_single_precision():
         np.testing.assert_allclose(found, np.linalg.solve(matrix, b), rtol=1e-4, atol=1e-4)
 
 
+class Inverse(NamedTuple):
+    matrix: jax.Array
+
+    def solve(self, b):
+        return self.matrix @ b
+
+    def transpose_solve(self, b):
+        return b @ self.matrix
+
+
 @pytest.mark.parametrize("dense", [False, True])
 def test_implicit_derivatives(dense):
     """The root of ``v = b + tanh(A v)``, found anyhow, has the derivatives of the theorem."""
@@ -80,9 +92,7 @@ def test_implicit_derivatives(dense):
         if not dense:
             return implicit(operator, found)
         solved = inverse(jax.lax.stop_gradient(jnp.eye(5) - jax.jacobian(operator)(found)))
-        return implicit(
-            operator, found, solve=lambda b: solved @ b, transpose_solve=lambda b: b @ solved
-        )
+        return implicit(operator, found, Inverse(solved))
 
     assert_gradients(root, point, {k: rng.normal(size=v.shape) for k, v in point.items()})
 
