@@ -106,22 +106,22 @@ class TaskTable(TomlTable):
                 f"has both formula and {lists[0]}; give either a formula, or guarantees with "
                 "assumptions and safe where needed."
             )
-        if self.parity is not None and (self.formula is not None or lists):
-            raise ValueError(
-                'has parity = "model", the condition in the file of a parity game, and another '
-                "one; keep one of them."
-            )
-        if all(x is None for x in (self.formula, self.guarantees, self.safe, self.parity)):
-            raise ValueError(
-                'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], '
-                'each to hold infinitely often, or safe = "...", to hold always, or parity = '
-                '"model", of a parity game from a file.'
-            )
-        if self.assumptions is not None and self.guarantees is None:
-            raise ValueError(
-                "has assumptions but no guarantees, so that they have no effect; add guarantees "
-                "or leave them out."
-            )
+        self.require(
+            self.parity is None or (self.formula is None and not lists),
+            'has parity = "model", the condition in the file of a parity game, and another '
+            "one; keep one of them.",
+        )
+        self.require(
+            any(x is not None for x in (self.formula, self.guarantees, self.safe, self.parity)),
+            'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], '
+            'each to hold infinitely often, or safe = "...", to hold always, or parity = '
+            '"model", of a parity game from a file.',
+        )
+        self.require(
+            self.assumptions is None or self.guarantees is not None,
+            "has assumptions but no guarantees, so that they have no effect; add guarantees "
+            "or leave them out.",
+        )
 
 
 @table

@@ -120,16 +120,21 @@ class TomlTable:
         pairs = ((key_name(x), getattr(self, x.name)) for x in _fields(type(self)))
         return {name: value for name, value in pairs if value is not None}
 
+    def require(self, holds: bool, error: str) -> None:
+        """Raises ValueError with a text unless a requirement on several keys holds."""
+        if not holds:
+            raise ValueError(error)
+
     def refuse(self, keys: Iterable[str], owner: str) -> None:
         """Raises ValueError for the first of some keys that has a value."""
         values = self.specified()
-        if wrong := next((key for key in keys if key in values), None):
-            raise ValueError(f"{wrong} belongs to {owner}.")
+        wrong = next((key for key in keys if key in values), None)
+        self.require(wrong is None, f"{wrong} belongs to {owner}.")
 
     def require_one(self, keys: Iterable[str], expected: str) -> None:
         """Raises ValueError unless exactly one of some keys has a value."""
-        if len(self.specified().keys() & set(keys)) != 1:
-            raise ValueError(f"must have either {expected}.")
+        number = len(self.specified().keys() & set(keys))
+        self.require(number == 1, f"must have either {expected}.")
 
 
 @table

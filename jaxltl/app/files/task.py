@@ -203,13 +203,15 @@ class TaskFile(FormulaFile):
 
     def __attrs_post_init__(self) -> None:
         guarantee, factor = self.guarantee, self.task.steps_factor
-        if self.learner.hides_formula and guarantee != "none":
-            raise ValueError(
-                f"[task] guarantee = {guarantee!r} needs a learner that sees the formula and has "
-                f"no horizon: leave out {self.learner.hides_formula}."
-            )
-        if self.task.over is not None and isinstance(guarantee, str):
-            raise ValueError("[task] over belongs to a guarantee that is a probability.")
+        self.require(
+            guarantee == "none" or not self.learner.hides_formula,
+            f"[task] guarantee = {guarantee!r} needs a learner that sees the formula and has "
+            f"no horizon: leave out {self.learner.hides_formula}.",
+        )
+        self.require(
+            self.task.over is None or not isinstance(guarantee, str),
+            "[task] over belongs to a guarantee that is a probability.",
+        )
         if factor not in (None, "none") and (self.steps is not None or guarantee == "none"):
             other = 'none, with guarantee = "none"' if self.steps is None else "steps in guarantee"
             raise ValueError(

@@ -84,11 +84,10 @@ class WorldTable(TomlTable):
         )
         if self.dynamics is not None:
             self.refuse(("labels", "propositions"), "an environment; dynamics have labels")
-        if (self.labels is None) != (self.propositions is None):
-            raise ValueError(
-                "labels and propositions belong together: a function and the names of what it "
-                "returns."
-            )
+        self.require(
+            (self.labels is None) == (self.propositions is None),
+            "labels and propositions belong together: a function and the names of what it returns.",
+        )
 
     def named_files(self) -> list[str]:
         """The Python files that the table names, each once."""
@@ -199,12 +198,13 @@ class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # ty
     episodes: TomlKey[Count, "Episodes by which a sample is scored."] = 10
 
     def __attrs_post_init__(self) -> None:
-        if self.limit is not None and self.cost is None:
-            raise ValueError(
-                'limit is that of a cost: give cost = "failure", "violation" or another score.'
-            )
-        if self.cost is not None and self.limit is None:
-            raise ValueError("cost needs a limit, its upper bound.")
+        self.require(
+            self.limit is None or self.cost is not None,
+            'limit is that of a cost: give cost = "failure", "violation" or another score.',
+        )
+        self.require(
+            self.cost is None or self.limit is not None, "cost needs a limit, its upper bound."
+        )
 
 
 @table
@@ -277,25 +277,25 @@ class EnvironmentFile(FormulaFile):
     def __attrs_post_init__(self) -> None:
         method = self.learner.method
         for other in _TABLES:
-            if other != method and getattr(self, other) is not None:
-                raise ValueError(
-                    f'[{other}] is for method = "{other}", and [learner] says "{method}": leave '
-                    "one of them out."
-                )
-        if self.world.dynamics is None and self.proof.specified():
-            raise ValueError(
-                f"[proof] is for dynamics, and [world] environment = {self.world.environment!r} "
-                "is simulated: leave [proof] out."
+            self.require(
+                other == method or getattr(self, other) is None,
+                f'[{other}] is for method = "{other}", and [learner] says "{method}": leave '
+                "one of them out.",
             )
-        if method == "cpo" and self.settings.limit is None:
-            raise ValueError(
-                "[cpo] lacks limit, the upper bound of the expected cost of an episode."
-            )
-        if method == "cce" and self.evaluation.policy is not None:
-            raise ValueError(
-                "[evaluation] policy is for methods whose policies draw their actions; that of "
-                '"cce" draws none.'
-            )
+        self.require(
+            self.world.dynamics is not None or not self.proof.specified(),
+            f"[proof] is for dynamics, and [world] environment = {self.world.environment!r} "
+            "is simulated: leave [proof] out.",
+        )
+        self.require(
+            method != "cpo" or self.settings.limit is not None,
+            "[cpo] lacks limit, the upper bound of the expected cost of an episode.",
+        )
+        self.require(
+            method != "cce" or self.evaluation.policy is None,
+            "[evaluation] policy is for methods whose policies draw their actions; that of "
+            '"cce" draws none.',
+        )
 
     def named_files(self) -> Sequence[str]:
         return self.world.named_files()

@@ -86,18 +86,22 @@ class WorldTable(GridTable):
         if self.transitions is None:
             of_log = ("confidence", "labels", "terminal", "graph", "least_probability", "method")
             self.refuse(of_log, "transitions, a log")
-            if isinstance(self.initial, list):
-                raise ValueError(
-                    "initial is a list of names of states, which a log has; here it must be a text."
-                )
+            self.require(
+                not isinstance(self.initial, list),
+                "initial is a list of names of states, which a log has; here it must be a text.",
+            )
             if self.model is not None:
                 self.refuse(of_map, "a map; a model has it in its arrays")
             return
         self.refuse(of_map, "a map; of a log, labels name states in a file")
-        if self.confidence is None:
-            raise ValueError("lacks confidence of the guarantee from the log, such as 0.95.")
-        if self.initial is None:
-            raise ValueError("lacks initial, the name of the initial state, or a list of names.")
+        self.require(
+            self.confidence is not None,
+            "lacks confidence of the guarantee from the log, such as 0.95.",
+        )
+        self.require(
+            self.initial is not None,
+            "lacks initial, the name of the initial state, or a list of names.",
+        )
         self.require_one(
             ("graph", "least_probability"),
             'graph = "seen" (only transitions that the log contains are possible), '
@@ -155,20 +159,22 @@ class LearnerTable(OptimizerTable):
     ] = None
 
     def __attrs_post_init__(self) -> None:
-        if self.in_world and self.goal is None:
-            raise ValueError(
-                'lacks goal, the propositions of the goal cells, which in = "world" needs since '
-                "the learner does not see the formula."
-            )
-        if self.in_world and self.mu is not None:
-            raise ValueError('mu weighs the satisfaction probability; it needs in = "product".')
+        self.require(
+            not self.in_world or self.goal is not None,
+            'lacks goal, the propositions of the goal cells, which in = "world" needs since '
+            "the learner does not see the formula.",
+        )
+        self.require(
+            not self.in_world or self.mu is None,
+            'mu weighs the satisfaction probability; it needs in = "product".',
+        )
         if not self.in_world:
             self.refuse(("goal",), 'in = "world"')
-        if self.learning_rate is not None and self.optimizer == "lbfgs":
-            raise ValueError(
-                'learning_rate belongs to another optimizer, such as "adam"; "lbfgs", the default, '
-                "searches for its own."
-            )
+        self.require(
+            self.learning_rate is None or self.optimizer != "lbfgs",
+            'learning_rate belongs to another optimizer, such as "adam"; "lbfgs", the default, '
+            "searches for its own.",
+        )
         kind = str if self.in_world else int
         if any(not isinstance(x, kind) for x in self.progress or ()):
             expected = "propositions" if self.in_world else "automaton states (or left out)"
@@ -206,11 +212,11 @@ class MlirlFile(TaskFile):
 
     def __attrs_post_init__(self) -> None:
         super().__attrs_post_init__()
-        if self.learner.mu is not None and not isinstance(self.guarantee, str):
-            raise ValueError(
-                f"[task] guarantee = {self.guarantee} finds the weight mu that reaches it: leave "
-                "mu out of [learner]."
-            )
+        self.require(
+            self.learner.mu is None or isinstance(self.guarantee, str),
+            f"[task] guarantee = {self.guarantee} finds the weight mu that reaches it: leave "
+            "mu out of [learner].",
+        )
 
     def named_files(self) -> Sequence[str]:
         world, demonstrations = self.world, self.demonstrations

@@ -130,19 +130,19 @@ class LearnerTable(OptimizerTable):
     horizon: TomlKey[Count | None, "Steps of an episode; default unbounded."] = None
 
     def __attrs_post_init__(self) -> None:
-        if self.discount == 1 and self.horizon is None:
-            raise ValueError(
-                "discount = 1 needs a horizon, the number of steps of an episode; or choose a "
-                "discount below 1, such as 0.95."
-            )
-        if self.optimizer == "lbfgs" and self.learning_rate is not None:
-            raise ValueError(
-                'learning_rate does not belong to optimizer = "lbfgs", which searches for its own.'
-            )
-        if self.held_out == 0 and self.patience is not None:
-            raise ValueError(
-                "patience waits for a better held-out likelihood; it needs a held_out above 0."
-            )
+        self.require(
+            self.discount != 1 or self.horizon is not None,
+            "discount = 1 needs a horizon, the number of steps of an episode; or choose a "
+            "discount below 1, such as 0.95.",
+        )
+        self.require(
+            self.optimizer != "lbfgs" or self.learning_rate is None,
+            'learning_rate does not belong to optimizer = "lbfgs", which searches for its own.',
+        )
+        self.require(
+            self.held_out != 0 or self.patience is None,
+            "patience waits for a better held-out likelihood; it needs a held_out above 0.",
+        )
 
     @property
     def hides_formula(self) -> str | None:
@@ -166,8 +166,10 @@ class TestTable(TomlTable):
     )
 
     def __attrs_post_init__(self) -> None:
-        if self.maps is None and self.generate is None:
-            raise ValueError("must have maps = [...] or generate = N, or both.")
+        self.require(
+            self.maps is not None or self.generate is not None,
+            "must have maps = [...] or generate = N, or both.",
+        )
         if self.generate is None:
             self.refuse(("obstacles", "min_distance", "shape", "seed"), "generate = N")
 
@@ -189,11 +191,10 @@ class TodirlFile(TaskFile):
                 f"[demonstrations] names {len(files)} files for {count} worlds; give one for each "
                 "of [world] maps, in their order."
             )
-        if self.test is not None and self.test.generate is not None and not self.is_colored:
-            raise ValueError(
-                "[test] generate makes coloured worlds; where [world] has a legend, give "
-                "maps = [...]."
-            )
+        self.require(
+            self.is_colored or self.test is None or self.test.generate is None,
+            "[test] generate makes coloured worlds; where [world] has a legend, give maps = [...].",
+        )
         super().__attrs_post_init__()
 
     def named_files(self) -> Sequence[str]:
