@@ -335,16 +335,6 @@ _HEADER = ("symbol", "meaning", "weight", "alternatives", "decisive steps")
 _WORLDS = ("map", "probability", "certified", "maximum", "robust policy, at least")
 
 
-def _sentence(result: Result) -> str:
-    demonstrations = result["demonstrations"]
-    kind = "synthetic demonstration" if demonstrations["synthetic"] else "demonstration"
-    return (
-        f"{many(len(result['grounding']), 'symbol')} of {many(len(result['meanings']), 'possible meaning')}, "
-        f"{many(demonstrations['number'], kind)} ({many(demonstrations['pairs'], 'step')}) in "
-        f"{many(result['num_demonstrated'], 'map')}"
-    )
-
-
 def _rows(result: Result) -> list[tuple[str, ...]]:
     return [
         (
@@ -377,7 +367,6 @@ def _worlds(result: Result) -> list[tuple[str, ...]]:
 
 def _values(result: Result) -> Record:
     return {
-        "sentence": _sentence(result),
         "tables": (
             ("Grounding", _HEADER, _rows(result)),
             ("Satisfaction probability", _WORLDS, _worlds(result)),

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.page import number, probability, Report
-from jaxltl.app.wording import many, Record, Result
+from jaxltl.app.wording import Record, Result
 from jaxltl.core.array_types import Floats
 from jaxltl.core.continuous.certificate import Certificate, HOW
 from jaxltl.core.continuous.dynamics import Dynamics
@@ -27,26 +27,12 @@ def _visits(result: Result) -> list[str]:
 
 
 def _values(result: Result) -> Record:
-    """Sentences on learning, evaluation and proof, and rows of estimates."""
-    world, evaluation = result["environment"], result["evaluation"]
-    actions, drawn = world["actions"], result["policy"]["acts"] == "drawn"
-    kind = f"{actions} actions" if isinstance(actions, int) else f"actions in a box {actions}"
-    acts = "" if result["method"] == "cce" else f" ({'random' if drawn else 'likeliest'} actions)"
+    """The proof in words, and rows of estimates."""
     names = (*_PROBABILITIES, *_visits(result))
-    seeds = result["seeds"]
+    evaluation, seeds = result["evaluation"], result["seeds"]
     return {
         "tiles": [(name, *_numbers(name, evaluation)) for name in (*names, "length")],
         "bounds": proof_bounds(result.get("proof") or {}),
-        "sentence": (
-            f"{result['method']} in {world['name']}: {kind}, "
-            f"{many(result['num_memory'], 'automaton state')}, "
-            f"{result['training']['transitions']:,} simulated steps per seed, "
-            f"{many(result['seeds']['number'], 'seed')}; {result['policy']['made_of']}"
-        ),
-        "evaluation": (
-            f"{evaluation['num_episodes']:,} fresh episodes of at most {evaluation['num_steps']:,} steps of "
-            f"the kept policy{acts}; each interval holds with confidence {evaluation['confidence']:g}."
-        ),
         "proof": proof_sentence(result["proof"]) if result.get("proof") else "",
         "estimates": [
             (name.replace("_", " "), *_numbers(name, evaluation), evaluation[name]["method"])

@@ -29,9 +29,8 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.todirl_results import Outcome, Setup, counted_worlds, part_of
-from jaxltl.app.todirl_results import summary
-from jaxltl.app.wording import Record, Result, many
+from jaxltl.app.todirl_results import Outcome, Setup, counted_worlds, part_of, summary
+from jaxltl.app.wording import Record, Result
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
@@ -51,40 +50,6 @@ _EXPERT = {
 def _groups(result: Result) -> list[tuple[str, Result]]:
     """The training worlds and, if there are any, the test worlds."""
     return [(kind, result[kind]) for kind in ("training", "test") if result[kind]]
-
-
-def _within(result: Result) -> str:
-    preposition = "for" if result["acceptance"] == "safety" else "within"
-    return f" {preposition} {result['horizon']} steps" if result["horizon"] else ""
-
-
-def _number_of_worlds(about: Result) -> str:
-    left_out = f" of {about['num_worlds']}" if about["left_out"] else ""
-    return f"{about['num_counted']}{left_out}"
-
-
-def _sentence(result: Result) -> str:
-    demonstrations, tests = result["demonstrations"], result["test"]
-    kind = "synthetic demonstrations" if demonstrations["synthetic"] else "demonstrations"
-    dropped = (
-        f", {demonstrations['dropped']} unfinished dropped" if demonstrations["dropped"] else ""
-    )
-    tested = f", tested in {tests['num_worlds']}" if tests else ""
-    return (
-        f"todirl in {many(result['training']['num_worlds'], 'world')}{tested}, "
-        f"{result['num_memory']} memory states, {sum(demonstrations['number'])} {kind} "
-        f"({sum(demonstrations['pairs'])} pairs{dropped})"
-    )
-
-
-def _how_it_ended(result: Result) -> str:
-    learning = result["learning"]
-    if learning["held_out"] is None:
-        return f"{learning['steps']} steps, without held-out demonstrations"
-    end = "stopped early" if learning["stopped_early"] else "to the end"
-    return (
-        f"{learning['steps']} steps, {end}; the parameters after {learning['best_step']} are kept"
-    )
 
 
 def _evidence(result: Result) -> list[tuple[str, ...]]:
@@ -111,15 +76,11 @@ def _values(result: Result) -> Record:
         return -1.0 if value is None else value
 
     return {
-        "sentence": _sentence(result),
-        "within": _within(result),
         "evidence": _evidence(result),
         "steps": steps,
         "expert": _EXPERT[result["expert"]],
         "groups": groups,
         "policies": _POLICIES,
-        "counted": _number_of_worlds,
-        "ended": _how_it_ended(result),
         "world_tables": [
             (f"{kind.capitalize()} worlds", about, sorted(about["worlds"], key=mean_value))
             for kind, about in reversed(groups)
