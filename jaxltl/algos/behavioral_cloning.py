@@ -240,7 +240,6 @@ def policy_in_world(
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``; see :func:`policy_in_world`."""
-    del hparams
     scores = _scores(state.best.parameters, problem)
     return jax.nn.softmax(jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)
 

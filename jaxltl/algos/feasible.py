@@ -435,7 +435,6 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The parameters ``float[D]`` of the best value; NaN before there is one."""
-    del problem, hparams
     return state.best.parameters
 
 

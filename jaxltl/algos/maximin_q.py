@@ -69,7 +69,7 @@ from jaxltl.core.models import Game, restrict
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 from jaxltl.core.models.protocols import Array, Key, Model, Numeric
 from jaxltl.core.types import require_shape
-from jaxltl.core.validation import Range
+from jaxltl.core.validation import Range, choice
 
 
 @struct.dataclass
@@ -132,8 +132,7 @@ def make_problem(
         action or none in a reachable state, rows or a start that are no distributions, or a game
         that does not fit the method.
     """
-    if method not in ("generalized", "maximin"):
-        raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
+    choice("method", method, ("generalized", "maximin"))
     game = explicit_game(game)
     system, mask = np.asarray(game.system), _mask(game, allowed)
     start = start_distribution(game, start)
@@ -419,7 +418,6 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     With maximin, action 0 of the environment's states stands for no answer: the best one, the
     minimum of ``state.q[s, a]``, depends on the system's action.
     """
-    del hparams
     sign = jnp.where(problem.game.system, 1, -1)[:, None]
     return action_argmax(sign * _action_values(state.q), problem.allowed)[1]
 

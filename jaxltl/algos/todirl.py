@@ -59,7 +59,7 @@ from jaxltl.core.models.construct.batch import (
     unstack_product as lane,
 )
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
-from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.validation import Range
 from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint, soft_value
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
@@ -201,8 +201,7 @@ def make_problem(
     observation = stack_observations(model, observation)
     counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
     weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
-    if weight.shape != (num_worlds,):
-        raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")
+    require_shape("weight", weight, (num_worlds,))
     network = RewardNetwork() if network is None else network
     inputs = _network_inputs(model, observation[0])
     require_output(

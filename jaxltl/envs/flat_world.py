@@ -242,14 +242,12 @@ def _begin(places: Array, key: Key) -> FlatState:
 
 
 def _begin_at(place: Array, key: Key) -> FlatState:
-    del key
     return FlatState(jnp.asarray(place))
 
 
 def _move(
     number: Array, moves: Array | None, world: FlatState, action: PyTree, key: Key
 ) -> Timestep:
-    del key
     velocity = jnp.clip(action, -1, 1) if moves is None else jnp.asarray(moves)[action]
     place = (world.place + number[1] * velocity).astype(jnp.float32)
     outside = (jnp.abs(place) > number[0]).any()

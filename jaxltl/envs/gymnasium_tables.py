@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.types import require_shape
 from jaxltl.envs.gymnasium_runner import TERMINATED
 
 
@@ -48,8 +49,7 @@ def from_gymnasium(
     count = table.num_states
     initial = getattr(env, "initial_state_distrib", None) if initial is None else initial
     start = np.full(count, 1 / count) if initial is None else np.asarray(initial, np.float64)
-    if start.shape != (count,):
-        raise ValueError(f"initial has shape {start.shape}; expected ({count},).")
+    require_shape("initial", start, (count,))
     ended = np.unique(table.successor[table.terminated])
     sink = count + np.arange(ended.size)
     successor = np.where(

@@ -278,7 +278,6 @@ def _starts(letter: Array, places: Array) -> tuple[LetterState, jax.Array]:
 
 
 def _move(neighbors: Array, world: LetterState, action: jax.Array, key: Key) -> Timestep:
-    del key
     place = jnp.asarray(neighbors)[world.place, action]
     return Timestep(world._replace(place=place), reward=0.0, terminated=False)
 

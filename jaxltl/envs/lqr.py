@@ -22,6 +22,7 @@ from jaxltl.core import struct, validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import require_shape
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 
@@ -121,8 +122,7 @@ def lqr(
         ("control_cost", r, (m, m)),
         ("start", x, (n,)),
     ):
-        if matrix.shape != shape:
-            raise ValueError(f"{name} has shape {list(matrix.shape)}; expected {list(shape)}.")
+        require_shape(name, matrix, shape)
     _check_definite(q, r)
     bounds = np.broadcast_to(np.asarray(low, float), m), np.broadcast_to(np.asarray(high, float), m)
     if not (bounds[0] <= bounds[1]).all():
@@ -178,7 +178,6 @@ def _fitting(world: LQR, network: Network | str) -> Network:
 def _evaluate(
     network: Network, world: LQR, parameters: jax.Array, key: object
 ) -> tuple[jax.Array, jax.Array]:
-    del key
     total, violation = _scores(network, world, parameters)
     return -total / jnp.asarray(world.scale, total.dtype), violation
 
@@ -328,7 +327,6 @@ def as_environment(world: LQR, dtype: DTypeLike | None = None) -> Environment:
 
 
 def _first_state(world: LQR, key: object) -> Plant:
-    del key
     start = jnp.asarray(world.start)
     return Plant(start, jnp.zeros((), start.dtype), jnp.int32(0))
 
@@ -338,7 +336,6 @@ def _observed(plant: Plant) -> jax.Array:
 
 
 def _controlled(world: LQR, plant: Plant, control: jax.Array, key: object) -> Timestep:
-    del key
     world = jax.tree.map(jnp.asarray, world)
     none = jnp.zeros_like(plant.violation)
     state, total, violation = _after(world, plant.state, control, none, plant.violation)

@@ -110,7 +110,6 @@ def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
 def _step(
     settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: object
 ) -> Timestep:
-    del key
     task, dtype = settings.task, settings.dtype
     in_goal, in_obstacle = nav.labels(world, place.state)
     goal, obstacle = place.goal | in_goal, place.obstacle | in_obstacle

@@ -291,7 +291,6 @@ def _act(
     allowed: jax.Array | None,
     key: Key,
 ) -> tuple[jax.Array, PyTree]:
-    del key
     network, actions, parts = policy
     said = apply_layers(network, parts, flat_observation(observation).astype(parts[0][0].dtype))
     if isinstance(actions, Box):

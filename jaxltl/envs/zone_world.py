@@ -192,7 +192,6 @@ def _ahead(heading: jax.Array) -> jax.Array:
 
 
 def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: Key) -> Timestep:
-    del key
     action = jnp.clip(action, -1, 1).astype(jnp.float32)
     turning = jnp.clip(n.turn * action[1], -n.most_turn, n.most_turn)
     heading = world.heading + turning * n.time_step

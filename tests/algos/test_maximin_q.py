@@ -518,7 +518,7 @@ def only(*rows):
             "environment: the row of state 1",
         ),
         (TURNS, np.zeros((2, 2)), {"environment": np.ones((2, 1))}, "environment has shape"),
-        (TURNS, np.zeros((2, 2)), {"method": "sarsa"}, 'choose "generalized" or "maximin"'),
+        (TURNS, np.zeros((2, 2)), {"method": "sarsa"}, "choose one of generalized, maximin"),
         (
             TURNS,
             np.zeros((2, 2)),

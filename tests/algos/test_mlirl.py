@@ -254,8 +254,8 @@ def test_states_whose_satisfaction_counts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"features": np.zeros((6, 3, 2))}, r"shape \(6, 3, 2\); expected \(6, 4, 'F'\)"),
-        ({"features": np.full((6, 4, 1), np.nan)}, r"feature 0 at \(0, 0\) is not finite"),
+        ({"features": np.zeros((6, 3, 2))}, r"shape \(6, 3, 2\); expected \(6, 4, any\)"),
+        ({"features": np.full((6, 4, 1), np.nan)}, r"features at \(0, 0, 0\) is not finite"),
         ({"satisfaction_over": "some"}, "satisfaction_over='some'; choose"),
         ({"satisfaction_over": np.zeros(5)}, r"_over has shape \(5,\); expected \(6,\)"),
         ({"reward": lambda p, f: f}, r"the reward has shape \(6, 4, 2\); expected \(6, 4\)"),

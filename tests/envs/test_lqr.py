@@ -245,8 +245,8 @@ def test_a_small_network_with_biases_comes_within_a_millionth():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"start": [1, 2, 3]}, r"start has shape \[3\]; expected \[2\]"),
-        ({"state_cost": [[1.0]]}, r"state_cost has shape \[1, 1\]; expected \[2, 2\]"),
+        ({"start": [1, 2, 3]}, r"start has shape \(3,\); expected \(2,\)"),
+        ({"state_cost": [[1.0]]}, r"state_cost has shape \(1, 1\); expected \(2, 2\)"),
         ({"state_cost": [[1, 0], [0, -1]]}, "state_cost must be symmetric and positive semi"),
         ({"state_cost": [[1, 1], [0, 1]]}, "state_cost must be symmetric"),
         ({"control_cost": [[0]]}, "control_cost must be symmetric and positive definite"),

@@ -37,6 +37,7 @@ variance is a sum of squares.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
 
@@ -50,6 +51,7 @@ from numpy.typing import ArrayLike
 from jaxltl.algos.common import splitmix
 from jaxltl.core import struct
 from jaxltl.core.models.protocols import Array, Key, PyTree
+from jaxltl.core.types import require_shape
 
 
 @struct.dataclass
@@ -109,8 +111,7 @@ def full_gaussian(mean: Array, covariance: Array) -> FullGaussian:
     """
     mean = _vector("mean", mean)
     covariance = jnp.asarray(covariance, mean.dtype)
-    if covariance.shape != 2 * mean.shape:
-        raise ValueError(f"covariance has shape {covariance.shape}; expected {2 * mean.shape}.")
+    require_shape("covariance", covariance, 2 * mean.shape)
     if not isinstance(covariance, jax.core.Tracer):
         symmetric = bool(jnp.allclose(covariance, covariance.T))
         if not symmetric or not bool(jnp.isfinite(jnp.linalg.cholesky(covariance)).all()):
@@ -282,6 +283,18 @@ def _normal(key: Key, num_samples: int, like: jax.Array) -> jax.Array:
     return noise.T  # computed with the samples last, the longer axis where policies are small
 
 
+def _mirrored(family: PyTree, key: Key, num_samples: int) -> jax.Array:
+    half = sample(family, key, -(-num_samples // 2))
+    pairs = jnp.stack([half, 2 * center(family) - half], axis=1)
+    return pairs.reshape(-1, half.shape[-1])[:num_samples]
+
+
+def _register(kind: type, methods: dict[Callable[..., PyTree], Callable[..., PyTree]]) -> None:
+    """Registers the methods of a family with the generic functions."""
+    for function, method in methods.items():
+        function.register(kind, method)  # type: ignore[attr-defined]
+
+
 def _shares(weights: jax.Array) -> jax.Array:
     return weights / jnp.sum(weights)
 
@@ -289,23 +302,10 @@ def _shares(weights: jax.Array) -> jax.Array:
 # --- diagonal Gaussians ---------------------------------------------------------------------
 
 
-sufficient_statistics.register(DiagonalGaussian, lambda f, samples: (samples, jnp.square(samples)))
-mean_parameter.register(DiagonalGaussian, lambda f: (f.mean, jnp.square(f.mean) + f.variance))
-from_mean_parameter.register(
-    DiagonalGaussian, lambda f, eta: DiagonalGaussian(eta[0], eta[1] - jnp.square(eta[0]))
-)
-
-
 @log_density.register
 def _(family: DiagonalGaussian, samples: jax.Array) -> jax.Array:
     square = jnp.square(samples - family.mean) / family.variance
     return -0.5 * jnp.sum(square + jnp.log(2 * math.pi * family.variance), axis=-1)
-
-
-sample.register(
-    DiagonalGaussian,
-    lambda f, key, num_samples: f.mean + jnp.sqrt(f.variance) * _normal(key, num_samples, f.mean),
-)
 
 
 @project.register
@@ -321,26 +321,23 @@ def _(
     return DiagonalGaussian(family.mean + rate * shift, variance)
 
 
-center.register(DiagonalGaussian, lambda f: f.mean)
-standard_deviation.register(DiagonalGaussian, lambda f: jnp.sqrt(f.variance))
-widen.register(DiagonalGaussian, lambda f, variance: replace(f, variance=f.variance + variance))
-at_least.register(
-    DiagonalGaussian, lambda f, variance: replace(f, variance=jnp.maximum(f.variance, variance))
+_register(
+    DiagonalGaussian,
+    {
+        sufficient_statistics: lambda f, samples: (samples, jnp.square(samples)),
+        mean_parameter: lambda f: (f.mean, jnp.square(f.mean) + f.variance),
+        from_mean_parameter: lambda f, eta: DiagonalGaussian(eta[0], eta[1] - jnp.square(eta[0])),
+        sample: lambda f, key, num: f.mean + jnp.sqrt(f.variance) * _normal(key, num, f.mean),
+        sample_antithetic: _mirrored,
+        center: lambda f: f.mean,
+        standard_deviation: lambda f: jnp.sqrt(f.variance),
+        widen: lambda f, variance: replace(f, variance=f.variance + variance),
+        at_least: lambda f, variance: replace(f, variance=jnp.maximum(f.variance, variance)),
+    },
 )
+
 
 # --- full Gaussians -------------------------------------------------------------------------
-
-
-sufficient_statistics.register(
-    FullGaussian, lambda f, samples: (samples, samples[..., :, None] * samples[..., None, :])
-)
-mean_parameter.register(
-    FullGaussian, lambda f: (f.mean, jnp.outer(f.mean, f.mean) + f.factor @ f.factor.T)
-)
-from_mean_parameter.register(
-    FullGaussian,
-    lambda f, eta: FullGaussian(eta[0], jnp.linalg.cholesky(eta[1] - jnp.outer(eta[0], eta[0]))),
-)
 
 
 @log_density.register
@@ -351,12 +348,6 @@ def _(family: FullGaussian, samples: jax.Array) -> jax.Array:
     square = jnp.sum(jnp.square(white), axis=0).reshape(offset.shape[:-1])
     volume = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(family.factor))))
     return -0.5 * (square + offset.shape[-1] * math.log(2 * math.pi)) - volume
-
-
-sample.register(
-    FullGaussian,
-    lambda f, key, num_samples: f.mean + _normal(key, num_samples, f.mean) @ f.factor.T,
-)
 
 
 @project.register
@@ -381,9 +372,19 @@ def _factor(rows: jax.Array) -> jax.Array:
     return (jnp.where(jnp.diagonal(upper) < 0, -1, 1)[:, None] * upper).T
 
 
-center.register(FullGaussian, lambda f: f.mean)
-standard_deviation.register(
-    FullGaussian, lambda f: jnp.sqrt(jnp.sum(jnp.square(f.factor), axis=-1))
+_register(
+    FullGaussian,
+    {
+        sufficient_statistics: lambda f, x: (x, x[..., :, None] * x[..., None, :]),
+        mean_parameter: lambda f: (f.mean, jnp.outer(f.mean, f.mean) + f.factor @ f.factor.T),
+        from_mean_parameter: lambda f, eta: FullGaussian(
+            eta[0], jnp.linalg.cholesky(eta[1] - jnp.outer(eta[0], eta[0]))
+        ),
+        sample: lambda f, key, num: f.mean + _normal(key, num, f.mean) @ f.factor.T,
+        sample_antithetic: _mirrored,
+        center: lambda f: f.mean,
+        standard_deviation: lambda f: jnp.sqrt(jnp.sum(jnp.square(f.factor), axis=-1)),
+    },
 )
 
 
@@ -398,16 +399,6 @@ def _(family: FullGaussian, variance: jax.Array | float) -> FullGaussian:
     _, length, axes = jnp.linalg.svd(family.factor.T, full_matrices=False)
     length = jnp.maximum(length, jnp.sqrt(jnp.asarray(variance, length.dtype)))
     return replace(family, factor=_factor(length[:, None] * axes))
-
-
-def _mirrored(family: PyTree, key: Key, num_samples: int) -> jax.Array:
-    half = sample(family, key, -(-num_samples // 2))
-    pairs = jnp.stack([half, 2 * center(family) - half], axis=1)
-    return pairs.reshape(-1, half.shape[-1])[:num_samples]
-
-
-sample_antithetic.register(DiagonalGaussian, _mirrored)
-sample_antithetic.register(FullGaussian, _mirrored)
 
 
 # --- gamma distributions --------------------------------------------------------------------
@@ -460,10 +451,6 @@ def _shape_of_gap(gap: jax.Array) -> jax.Array:
     return jnp.exp(lax.fori_loop(0, 5, newton, jnp.log(start)))
 
 
-sufficient_statistics.register(Gamma, lambda f, samples: (samples, jnp.log(samples)))
-mean_parameter.register(Gamma, lambda f: (f.shape / f.rate, digamma(f.shape) - jnp.log(f.rate)))
-
-
 @from_mean_parameter.register
 def _(family: Gamma, eta: tuple[jax.Array, jax.Array]) -> Gamma:
     shape = _shape_of_gap(jnp.log(eta[0]) - eta[1])
@@ -499,17 +486,20 @@ def _(family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | f
     return Gamma(shape, jnp.where(rate > 0, shape / mean, family.rate))
 
 
-center.register(Gamma, lambda f: f.shape / f.rate)
-standard_deviation.register(Gamma, lambda f: jnp.sqrt(f.shape) / f.rate)
-
-
 def _with_variance(family: Gamma, variance: jax.Array) -> Gamma:
     mean = center(family)
     return Gamma(jnp.square(mean) / variance, mean / variance)
 
 
-widen.register(
-    Gamma, lambda f, variance: _with_variance(f, jnp.square(standard_deviation(f)) + variance)
+_register(
+    Gamma,
+    {
+        sufficient_statistics: lambda f, samples: (samples, jnp.log(samples)),
+        mean_parameter: lambda f: (f.shape / f.rate, digamma(f.shape) - jnp.log(f.rate)),
+        center: lambda f: f.shape / f.rate,
+        standard_deviation: lambda f: jnp.sqrt(f.shape) / f.rate,
+        widen: lambda f, variance: _with_variance(f, jnp.square(standard_deviation(f)) + variance),
+    },
 )
 
 

@@ -131,8 +131,7 @@ def run_until(
     With `idle`, a fourth argument False of `step` keeps the state.
     """
     problem, hparams, until, num_steps = arguments
-    if keep not in ("after", "before"):
-        raise ValueError(f'keep={keep!r}; choose "after" or "before".')
+    validation.choice("keep", keep, ("after", "before"))
     if idle and (check_every, keep) != (1, "after"):
         raise ValueError('idle=True requires check_every=1 and keep="after".')
     for name, number in {"num_steps": num_steps, "check_every": check_every}.items():

@@ -25,6 +25,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
 
 from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import struct, validation
@@ -223,6 +225,24 @@ def require_output(
     shape = getattr(output, "shape", type(output).__name__)
     if shape != expected:
         raise ValueError(f"{subject} shape {shape}; expected {expected}, {rows}")
+
+
+def finite_features(
+    name: str, table: ArrayLike, rows: tuple[int, ...], dtype: DTypeLike
+) -> jax.Array:
+    """Validation of features ``float[*rows, F]``; ValueError for another shape, or NaN and infinity.
+
+    >>> finite_features("features", np.ones((3, 2)), (3,), float).shape
+    (3, 2)
+    """
+    values = np.asarray(table)
+    if values.shape[:-1] != rows:
+        raise ValueError(
+            f"{name} has shape {values.shape}; expected ({', '.join(map(str, rows))}, any)."
+        )
+    if (wrong := np.argwhere(~np.isfinite(values))).size:
+        raise ValueError(f"{name} at {tuple(wrong[0].tolist())} is not finite.")
+    return jnp.asarray(values, dtype)
 
 
 def applied(network: nn.Module, parameters: PyTree, *read: PyTree) -> PyTree:

@@ -47,7 +47,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.loops import Learned
-from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.common.settings import Number, finite_features, static, traced
 from jaxltl.algos.grounding.learner import State as State
 from jaxltl.algos.grounding.problem import NEVER, forward, joined_demonstrations
 from jaxltl.core import struct
@@ -143,15 +143,13 @@ def make_problem(
     if features is None and evidence is None:
         raise ValueError("there are neither features nor evidence; give one or both.")
     rows = {"features": world.available.shape, "evidence": (*state.shape, world.num_actions)}
-    arrays = {}
-    for name, table in (("features", features), ("evidence", evidence)):
-        values = np.zeros((*rows[name], 0)) if table is None else np.asarray(table)
-        if values.shape[:-1] != rows[name]:
-            expected = ", ".join(map(str, rows[name]))
-            raise ValueError(f"{name} has shape {values.shape}; expected ({expected}, any).")
-        if (wrong := np.argwhere(~np.isfinite(values))).size:
-            raise ValueError(f"{name} at {tuple(wrong[0].tolist())} is not finite.")
-        arrays[name] = jnp.asarray(values, world.dtype)
+    tables = {"features": features, "evidence": evidence}
+    arrays = {
+        name: finite_features(
+            name, np.zeros((*rows[name], 0)) if table is None else table, rows[name], world.dtype
+        )
+        for name, table in tables.items()
+    }
     return Problem(world, state, action, length, **arrays, num_modes=int(num_modes))
 
 

@@ -61,6 +61,7 @@ from jaxltl.algos.grounding.problem import (
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.models.product import Product
+from jaxltl.core.types import require_shape
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 
@@ -269,9 +270,7 @@ def fit_labels(
       ValueError: labels of another shape.
     """
     target = jnp.asarray(np.asarray(labels), problem.model.dtype)
-    expected = (*problem.observation.shape[:2], len(problem.symbols))
-    if target.shape != expected:
-        raise ValueError(f"labels has shape {target.shape}; expected {expected}.")
+    require_shape("labels", target, (*problem.observation.shape[:2], len(problem.symbols)))
     optimizer = optax.adam(learning_rate)
 
     def loss(parameters: PyTree) -> jax.Array:

@@ -12,7 +12,14 @@ from flax import linen as nn
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import optimizers
-from jaxltl.algos.common.settings import Number, applied, require_output, static, traced
+from jaxltl.algos.common.settings import (
+    Number,
+    applied,
+    finite_features,
+    require_output,
+    static,
+    traced,
+)
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata import Automaton, to_automaton
@@ -262,11 +269,7 @@ def _features(model: Product, features: ArrayLike | None) -> jax.Array:
         return jnp.zeros((*shape, 0), model.dtype)
     values = np.asarray(features)
     values = values[None] if values.ndim == 4 else values
-    if values.shape[:-1] != shape:
-        raise ValueError(f"features have shape {values.shape}; expected {(*shape, 'F')}.")
-    if (wrong := np.argwhere(~np.isfinite(values))).size:
-        raise ValueError(f"feature at {tuple(wrong[0].tolist())} is not finite.")
-    return jnp.asarray(values, model.dtype)
+    return finite_features("features", values, shape, model.dtype)
 
 
 _TOLERANCE = 1e-3  # of soft values: changes a log-likelihood by as much a step

@@ -42,8 +42,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner, optimizers
-from jaxltl.algos.common.settings import Number, RunState, static, traced
-from jaxltl.algos.mlirl import _line_search as line_search
+from jaxltl.algos.common.settings import Number, RunState, finite_features, static, traced
 from jaxltl.algos.mlirl.features import (
     Features as Features,
     pair_counts,
@@ -225,12 +224,7 @@ def make_problem(
     """
     model = model if allowed is None else with_allowed(model, allowed)
     actions = (*model.state_shape, model.num_actions)
-    features = jnp.asarray(features, model.dtype)
-    if features.shape[:-1] != actions:
-        raise ValueError(f"features have shape {features.shape}; expected {(*actions, 'F')}.")
-    if (wrong := ~np.isfinite(np.asarray(features))).any():
-        *pair, feature = np.argwhere(wrong)[0].tolist()
-        raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
+    features = finite_features("features", features, actions, model.dtype)
     counted = allowed_steps(model, demonstrations)
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
@@ -245,9 +239,7 @@ def make_problem(
     require_shape("satisfaction_over", weight, model.state_shape)
     start = np.zeros(features.shape[-1]) if start is None else start
     start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
-    shape = jax.eval_shape(reward, start, features).shape
-    if shape != actions:
-        raise ValueError(f"the reward has shape {shape}; expected {actions}.")
+    require_shape("the reward", jax.eval_shape(reward, start, features), actions)
     return Problem(
         model=model,
         features=features,
@@ -334,8 +326,8 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         parts = Objective(
             neg_log_likelihood=zero, satisfaction=zero, value=value, status=jnp.int32(0)
         )
-        optimizer = line_search.start(
-            parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
+        optimizer = optimizers.start_search(
+            parameters, optimizers.Point(parameters, zero + jnp.inf, parameters, parts)
         )
     else:
         optimizer = optimizers.start(hparams, parameters)
@@ -345,11 +337,11 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
 @jax.jit  # traced once for all its uses
 def _evaluate(
     parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array
-) -> line_search.Point:
+) -> optimizers.Point:
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         parameters, problem, hparams, initial
     )
-    return line_search.Point(parameters, loss, gradient, parts)
+    return optimizers.Point(parameters, loss, gradient, parts)
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
@@ -361,10 +353,10 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     if hparams.optimizer == "lbfgs":
 
-        def evaluate(parameters: PyTree, before: line_search.Point) -> line_search.Point:
+        def evaluate(parameters: PyTree, before: optimizers.Point) -> optimizers.Point:
             return _evaluate(parameters, problem, hparams, _usable(before.parts))
 
-        optimizer, before = line_search.step(evaluate, state.optimizer)
+        optimizer, before = optimizers.search_step(evaluate, state.optimizer)
         loss, parts, norm = before.loss, before.parts, optax.tree.norm(before.gradient)
         parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
     else:

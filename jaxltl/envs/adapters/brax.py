@@ -76,7 +76,6 @@ def from_brax(
 
 
 def _step(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
-    del key
     after = held.it.step(copied(world), action)
     done = after.done > 0
     truncated = after.info.get("truncation", jnp.zeros_like(after.done)) > 0

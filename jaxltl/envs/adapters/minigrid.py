@@ -85,7 +85,6 @@ def _reset(held: Held, params: Foreign, key: Key) -> PyTree:
 
 
 def _step(held: Held, params: Foreign, world: PyTree, action: PyTree, key: Key) -> Timestep:
-    del key
     after = held.it.step(params, copied(world), action)
     over = after.discount == 0
     return timestep(after, world, after.reward, after.last() & over, after.last() & ~over)
@@ -134,6 +133,5 @@ def from_navix(
 
 
 def _step_navix(held: Held, world: PyTree, action: PyTree, key: Key) -> Timestep:
-    del key  # the state has one
     after = held.it.step(copied(world).replace(step_type=jnp.zeros_like(world.step_type)), action)
     return timestep(after, world, after.reward, after.is_termination(), after.is_truncation())
