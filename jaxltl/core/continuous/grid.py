@@ -174,7 +174,5 @@ def covered(start: Integers, stop: Integers, shape: tuple[int, ...]) -> Booleans
     for corner in itertools.product((0, 1), repeat=len(shape)):
         index = tuple(stop[:, i] if c else start[:, i] for i, c in enumerate(corner))
         np.add.at(steps, index, 1 if sum(corner) % 2 == 0 else -1)
-    for axis in range(len(shape)):
-        steps = np.cumsum(steps, axis, dtype=np.int32)
-    mask: Booleans = steps[tuple(slice(k) for k in shape)] > 0
+    mask: Booleans = cumulative(steps)[tuple(slice(1, k + 1) for k in shape)] > 0
     return mask

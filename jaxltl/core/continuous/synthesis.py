@@ -19,7 +19,7 @@ from jaxltl.core.continuous.certificate import Certificate, ProofOptions, prove
 from jaxltl.core.continuous.dynamics import Dynamics, make_dynamics, to_environment  # noqa: F401 - of the examples
 from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.environments.environment import Environment, Finite, Timestep, make_environment
-from jaxltl.core.games.shielded_environment import ShieldedWorld
+from jaxltl.core.games.shielded_environment import ShieldedWorld, of_world
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
 
@@ -271,9 +271,9 @@ def shield_dynamics(policy: CellPolicy) -> Environment:
     return make_environment(
         Partial(_reset, inner.reset, Partial(policy.start)),
         Partial(_step, inner.step, Partial(policy.update), nearest),
-        Partial(_of_world, inner.observe),
+        Partial(of_world, inner.observe),
         actions=inner.actions,
-        labels=Partial(_of_world, inner.labels),
+        labels=Partial(of_world, inner.labels),
         propositions=inner.propositions,
         allowed=allowed if finite else None,
         observations=inner.observations,
@@ -300,8 +300,3 @@ def _step(
     return timestep._replace(
         world=ShieldedWorld(timestep.world, update(shielded.state, timestep.world))
     )
-
-
-def _of_world(function: Partial, shielded: ShieldedWorld) -> jax.Array:
-    result: jax.Array = function(shielded.world)
-    return result

@@ -12,7 +12,16 @@ import scipy.special
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.enclosures import interval as arithmetic
-from jaxltl.core.enclosures.interval import ULPS, Interval, eps, module_of, monotone, outward, point
+from jaxltl.core.enclosures.interval import (
+    ULPS,
+    Interval,
+    eps,
+    module_of,
+    monotone,
+    outward,
+    point,
+    unbounded,
+)
 from jaxltl.core.enclosures.program import Elementwise, narrows
 
 Function = Callable[[Array], Array]
@@ -49,10 +58,14 @@ def bounds(operation: Elementwise, inputs: list[Interval]) -> Interval:
     """
     name, x = operation.name, inputs[0]
     if name in INCREASING:
-        return _clip(name, monotone(INCREASING[name], x, ULPS.get(name, 0)))
+        return _clip(name, _increasing(name, x))
     if name in _COMPARISONS:
         return _compare(operation, *inputs)
     return _clip(name, _RULES[name](operation, inputs))
+
+
+def _increasing(name: str, x: Interval) -> Interval:
+    return monotone(INCREASING[name], x, ULPS.get(name, 0))
 
 
 def _clip(name: str, x: Interval) -> Interval:
@@ -182,10 +195,20 @@ def relax(
 ) -> Relaxation:
     """Linear bounds over the inputs' boxes (CROWN, Zhang et al. 2018).
 
-    `output` encloses the values; its bounds are used where no linear ones are known. With
-    `parallel`, the slopes of both bounds are equal, as they are for all but extrema.
+    `output` encloses the values; its bounds are used where no linear ones are known. Exact for sums
+    and opposites, whose rounding is the caller's. With `parallel`, the slopes of both bounds are
+    equal, as they are for all but extrema.
     """
-    name = operation.name
+    name, xp = operation.name, module_of(output.low)
+    zero = xp.where(xp.isnan(output.low * 0), 0, output.low * 0)
+    exact = name == "convert_element_type" and (
+        jnp.issubdtype(inputs[0].low.dtype, jnp.floating)
+        and not narrows(output.low.dtype, inputs[0].low.dtype)
+    )
+    if exact or name in ("add", "sub", "neg"):
+        last = zero + 1 if exact or name == "add" else -(zero + 1)
+        slopes = (zero + 1, last)[-len(inputs) :]
+        return Relaxation(slopes, zero, slopes, zero)
     if name in ("max", "min"):
         return _relax_extreme(name, inputs[0], inputs[1], parallel)
     if name == "mul" and operation.inputs[0] == operation.inputs[1]:
@@ -304,8 +327,7 @@ def _relax_angle(operation: Elementwise, inputs: list[Interval]) -> Relaxation:
     y, x = inputs
     square = arithmetic.add(arithmetic.power(x, 2), arithmetic.power(y, 2))
     outside = ~((x.low <= 0) & (y.low <= 0) & (y.high >= 0)) & (square.low > 0)
-    none = Interval(square.low * 0 - np.inf, square.low * 0 + np.inf)
-    scale = arithmetic.where(outside, arithmetic.reciprocal(square), none)
+    scale = arithmetic.where(outside, arithmetic.reciprocal(square), unbounded(square.low))
     slopes = (arithmetic.multiply(x, scale), arithmetic.multiply(arithmetic.negate(y), scale))
     return _mean_value(operation, inputs, slopes)
 
@@ -349,49 +371,39 @@ def _one_minus_square(x: Interval) -> Interval:
     return outward(1 - square.high, 1 - square.low)
 
 
-def _derivative_tanh(x: Interval) -> Interval:
-    return _one_minus_square(monotone(_named("tanh"), x, ULPS["tanh"]))
-
-
 def _derivative_logistic(x: Interval) -> Interval:
     """`s (1 - s) = (1 - (2 s - 1)^2) / 4`."""
-    s = monotone(_logistic, x, ULPS["logistic"])
+    s = _increasing("logistic", x)
     rest = _one_minus_square(outward(2 * s.low - 1, 2 * s.high - 1, 2))
     return Interval(rest.low / 4, rest.high / 4)
 
 
 def _derivative_erf(x: Interval) -> Interval:
     """`2 / sqrt(pi) exp(-x^2)`."""
-    bell = monotone(_named("exp"), arithmetic.negate(arithmetic.power(x, 2)), ULPS["exp"])
+    bell = _increasing("exp", arithmetic.negate(arithmetic.power(x, 2)))
     factor = 1.1283791670955126
     return outward(bell.low * factor, bell.high * factor, 4)
 
 
-def _derivative_exp(x: Interval) -> Interval:
-    return monotone(_named("exp"), x, ULPS["exp"])
-
-
 def _for_positive(derivative: Interval, x: Interval) -> Interval:
     """A derivative that holds for positive arguments alone."""
-    none = Interval(x.low * 0 - np.inf, x.low * 0 + np.inf)
-    return arithmetic.where(x.low > 0, derivative, none)
+    return arithmetic.where(x.low > 0, derivative, unbounded(x.low))
 
 
-def _derivative_sqrt(x: Interval) -> Interval:
-    root = monotone(_named("sqrt"), x, ULPS["sqrt"])
-    return _for_positive(arithmetic.reciprocal(Interval(2 * root.low, 2 * root.high)), x)
+def _twice(x: Interval) -> Interval:
+    return Interval(2 * x.low, 2 * x.high)
 
 
 _DERIVATIVES: dict[str, Callable[[Interval], Interval]] = {
-    "square": lambda x: Interval(2 * x.low, 2 * x.high),
-    "tanh": _derivative_tanh,
+    "square": _twice,
+    "tanh": lambda x: _one_minus_square(_increasing("tanh", x)),
     "logistic": _derivative_logistic,
     "erf": _derivative_erf,
-    "exp": _derivative_exp,
-    "expm1": _derivative_exp,
+    "exp": lambda x: _increasing("exp", x),
+    "expm1": lambda x: _increasing("exp", x),
     "log": lambda x: _for_positive(arithmetic.reciprocal(x), x),
     "log1p": lambda x: arithmetic.reciprocal(outward(x.low + 1, x.high + 1)),
-    "sqrt": _derivative_sqrt,
+    "sqrt": lambda x: _for_positive(arithmetic.reciprocal(_twice(_increasing("sqrt", x))), x),
     "sin": lambda x: arithmetic.sine(x, np.pi / 2),
     "cos": lambda x: arithmetic.negate(arithmetic.sine(x)),
     "tan": lambda x: _plus_one(arithmetic.power(arithmetic.tangent(x), 2)),

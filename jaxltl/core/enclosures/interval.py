@@ -102,6 +102,12 @@ def outward(low: Array, high: Array, ulps: float = 1) -> Interval:
     return Interval(xp.where(xp.isnan(down), -xp.inf, down), xp.where(xp.isnan(up), xp.inf, up))
 
 
+def unbounded(like: Array) -> Interval:
+    """An interval of all numbers, in the shape of an array."""
+    xp = module_of(like)
+    return Interval(xp.full_like(like, -xp.inf), xp.full_like(like, xp.inf))
+
+
 def intersect(x: Interval, y: Interval) -> Interval:
     """Intersection of two enclosures of the same array."""
     xp = module_of(x.low)
@@ -153,7 +159,7 @@ def reciprocal(x: Interval) -> Interval:
     xp = module_of(x.low)
     safe = (x.low > 0) | (x.high < 0)
     bounds = outward(1 / xp.where(safe, x.high, 1), 1 / xp.where(safe, x.low, 1))
-    return where(safe, bounds, Interval(xp.full_like(x.low, -xp.inf), xp.full_like(x.low, xp.inf)))
+    return where(safe, bounds, unbounded(x.low))
 
 
 def absolute(x: Interval) -> Interval:

@@ -41,7 +41,6 @@ from jaxltl.core.enclosures.program import (
     Program,
     Select,
     make_program,
-    narrows,
 )
 from jaxltl.core.models.ops.array_namespace import namespace
 from jaxltl.core.models.protocols import PyTree
@@ -246,7 +245,7 @@ def _forward(
         return AffineForm(*(_joined(part)[..., operation.index] for part in parts))
     if operation.name in ("add", "sub"):
         return _forward_sum(inputs[0], inputs[1], 1 if operation.name == "add" else -1)
-    return _forward_elementwise(relaxation(operation, values, bounds, parallel=True), inputs)
+    return _forward_elementwise(elementwise.relax(operation, values, bounds, parallel=True), inputs)
 
 
 def _constant(x: Interval, dtype: np.dtype) -> AffineForm:
@@ -306,29 +305,6 @@ def _forward_elementwise(bounds: Relaxation, inputs: list[AffineForm]) -> Affine
     rounding = 4 * (len(inputs) + 2) * eps(middle)
     error = error * (1 + rounding) + size * rounding + tiny(middle)
     return AffineForm(slope, middle, error)
-
-
-def relaxation(
-    operation: Elementwise, values: list[Interval], bounds: Interval, parallel: bool = False
-) -> Relaxation:
-    """Linear bounds of an elementwise operation; exact for sums and products with known numbers.
-
-    With `parallel`, the slopes of both bounds are equal.
-    """
-    xp, zero = module_of(bounds.low), bounds.low * 0
-    zero = xp.where(xp.isnan(zero), 0, zero)
-    one = zero + 1
-    if operation.name in ("add", "sub"):
-        slopes = (one, one if operation.name == "add" else -one)
-        return Relaxation(slopes, zero, slopes, zero)
-    exact = operation.name == "convert_element_type" and (
-        jnp.issubdtype(values[0].low.dtype, jnp.floating)
-        and not narrows(bounds.low.dtype, values[0].low.dtype)
-    )
-    if operation.name == "neg" or exact:
-        slope = -one if operation.name == "neg" else one
-        return Relaxation((slope,), zero, (slope,), zero)
-    return elementwise.relax(operation, values, bounds, parallel)
 
 
 # --- backward -------------------------------------------------------------------------------------
@@ -433,7 +409,7 @@ def _back_elementwise(
 ) -> None:
     xp, intervals = state.xp, state.known.intervals
     values, output = [intervals[x] for x in operation.inputs], intervals[operation.output]
-    bounds = relaxation(operation, values, output)
+    bounds = elementwise.relax(operation, values, output)
     state.constant(Interval(bounds.lower, bounds.upper), lower, upper)
     up, down = xp.maximum(lower, 0), xp.minimum(lower, 0)
     above, below = xp.maximum(upper, 0), xp.minimum(upper, 0)

@@ -105,8 +105,8 @@ def shield_environment(
             environment,
             reset=Partial(_reset, guide, place, environment.reset),
             step=Partial(_step, guide, place, environment.step),
-            observe=Partial(_of_world, environment.observe),
-            labels=Partial(_of_world, environment.labels),
+            observe=Partial(of_world, environment.observe),
+            labels=Partial(of_world, environment.labels),
             allowed=Partial(_allowed, guide, environment.allowed),
             starts=None
             if environment.starts is None
@@ -257,5 +257,5 @@ def _within(sure: jax.Array, inner: Callable[..., PyTree] | None, world: PyTree)
     return jnp.where((sure & every).any(), sure & every, every)
 
 
-def _of_world(function: Callable[..., PyTree], shielded: ShieldedWorld) -> PyTree:
+def of_world(function: Callable[..., PyTree], shielded: ShieldedWorld) -> PyTree:
     return function(shielded.world)
