@@ -231,12 +231,17 @@ def _expand(
     for m, (own, joint) in enumerate(local):
         for column, updates in own:
             _add(key, column, updates, narrow)
-        for column in joint:
-            if parts[column][0][0] != m:
+        for column, rows in joint.items():
+            first, *others = parts[column]
+            if first[0] != m:
                 continue
-            others = [local[other][1].get(column) for other, _ in parts[column]]
-            together = [rows for rows in others if rows is not None]
-            if len(together) == len(others):
+            together = [rows]
+            for other, _ in others:  # ends early, since most labels are blocked in most states
+                more = local[other][1].get(column)
+                if more is None:
+                    break
+                together.append(more)
+            else:
                 for updates in _joint(together):
                     _add(key, column, updates, narrow)
     narrow.row_count.append(len(narrow.column) - before)
@@ -244,7 +249,7 @@ def _expand(
 
 def _joint(together: list[list[Updates]]) -> list[Updates]:
     """The joint updates of every combination of commands."""
-    if prod(sum(map(len, rows)) for rows in together) > _MAX_UPDATES:
+    if prod([sum(map(len, rows)) for rows in together]) > _MAX_UPDATES:
         raise Unsupported
     updates = together[0]
     for rows in together[1:]:

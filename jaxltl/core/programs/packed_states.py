@@ -43,10 +43,13 @@ class Layout:
     def values(self, words: Words, name: str) -> NDArray[Any]:
         """Values of a variable: ``int64[N]``, or ``bool[N]``."""
         field = self.fields[name]
-        raw = (words[field.word] & np.uint64(field.mask)) >> np.uint64(field.shift)
+        raw = words[field.word] & np.uint64(field.mask)
         if field.variable.type == "bool":
             return np.asarray(raw != 0)
-        return raw.astype(np.int64) + field.variable.low
+        raw >>= np.uint64(field.shift)  # in place, as is what follows
+        number = raw.view(np.int64)
+        number += field.variable.low
+        return number
 
     def masks(self, names: Iterable[str]) -> tuple[int, ...]:
         """The bits of some variables in each word."""
