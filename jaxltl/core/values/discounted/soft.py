@@ -303,7 +303,7 @@ def _boltzmann_value(
 ) -> Solution:
     (tolerance, max_steps), (adjoint, method) = limits, options
     discount = jnp.asarray(discount, model.dtype)
-    criterion = _given(model, reward, discount, tolerance)
+    criterion = _criterion(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     damping = jnp.where(criterion.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
@@ -352,7 +352,7 @@ def _boltzmann_value(
     return with_softmax(model, reward, discount, solution)
 
 
-class _Given(NamedTuple):
+class _Criterion(NamedTuple):
     """Stopping criterion of Boltzmann values."""
 
     contracts: jax.Array
@@ -362,9 +362,9 @@ class _Given(NamedTuple):
     enough: jax.Array  # the error below which there is little but rounding
 
 
-def _given(
+def _criterion(
     model: Model, reward: jax.Array, discount: jax.Array, tolerance: jax.Array | float | None
-) -> _Given:
+) -> _Criterion:
     expansion = discount * boltzmann_expansion(most_choices(model))
     contracts = expansion < 1
     gap = jnp.where(contracts, 1 - expansion, 1)
@@ -375,20 +375,22 @@ def _given(
         tolerance = jnp.asarray(tolerance, model.dtype)
         # Of the enclosure's width, less its own rounding; elsewhere of the residual.
         goal = jnp.where(contracts, tolerance / 2 - rounding / 4, tolerance)
-    return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
+    return _Criterion(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
 
 
-def _error(value: jax.Array, image: jax.Array, criterion: _Given) -> jax.Array:
+def _error(value: jax.Array, image: jax.Array, criterion: _Criterion) -> jax.Array:
     """Certified where the operator contracts; elsewhere the residual."""
     return jnp.max(jnp.abs(image - value), axis=0) / criterion.gap + criterion.rounding
 
 
-def _judge(value: jax.Array, image: jax.Array, criterion: _Given) -> tuple[jax.Array, jax.Array]:
+def _judge(
+    value: jax.Array, image: jax.Array, criterion: _Criterion
+) -> tuple[jax.Array, jax.Array]:
     error = _error(value, image, criterion)
     return (error <= criterion.enough) | ~jnp.isfinite(error), error
 
 
-def softmax_mean(over: Layout, q: Quantity, parameters: _Given) -> tuple[jax.Array, Quantity]:
+def softmax_mean(over: Layout, q: Quantity, parameters: _Criterion) -> tuple[jax.Array, Quantity]:
     """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
     _, policy = soft_maximum(over, q, parameters)
     finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, cast
 
@@ -15,6 +14,7 @@ from jaxltl.core.models.ops.operators import Policy
 from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.engine.linear import Operator
 from jaxltl.core.values.engine.validated import invalidated
 
 
@@ -55,9 +55,6 @@ def backup_error(unit: jax.Array | float, *sizes: jax.Array) -> jax.Array:
     # epsilon``.
     info = jnp.finfo(jnp.asarray(sizes[0]).dtype)
     return unit * (sum(sizes[1:], sizes[0]) + 2 * float(info.tiny) / float(info.eps))
-
-
-Operator = Callable[[jax.Array], jax.Array]
 
 
 Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]

@@ -190,6 +190,6 @@ def discounted(
     return with_given_policy(solution, policy)
 
 
-def default_tolerance(model: Model) -> float:
-    """The default width of an enclosure."""
+def default_tolerance(model: Model | jax.Array) -> float:
+    """The default width of an enclosure, by the dtype."""
     return 1e-6 if np.dtype(model.dtype) == np.float64 else 1e-3

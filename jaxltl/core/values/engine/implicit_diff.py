@@ -26,12 +26,17 @@ from jaxltl.core.models.protocols import ActionModel, PyTree
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.values.engine.iterate import sequential_vmap
-from jaxltl.core.values.engine.linear import DENSE_LIMIT, LinearSolver, inverse, norm, solve_linear
+from jaxltl.core.values.engine.linear import (
+    DENSE_LIMIT,
+    LinearSolver,
+    Operator,
+    inverse,
+    norm,
+    solve_linear,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-Operator = Callable[[jax.Array], jax.Array]
 
 _FAST_STEPS = 256  # of a Krylov method, which suffice for chains that mix well
 

@@ -17,28 +17,28 @@ from jax import lax
 
 Table = TypeVar("Table")  # trees of arrays
 Carry = TypeVar("Carry")
-Given = TypeVar("Given")
+Parameters = TypeVar("Parameters")
 Result = TypeVar("Result")
 
 _ROW = 16  # the floats of the widest vector unit
 
 
 def iterate(
-    step: Callable[[Table, Carry, Given], Carry],
-    finished: Callable[[Carry, Given], jax.Array],
-    start: tuple[Table, Carry, Given],
+    step: Callable[[Table, Carry, Parameters], Carry],
+    finished: Callable[[Carry, Parameters], jax.Array],
+    start: tuple[Table, Carry, Parameters],
     *,
     max_steps: jax.Array | int,
     lanes: str = "in turn",
     every: int = 1,
 ) -> tuple[Carry, jax.Array]:
-    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
+    """Repeats ``carry = step(table, carry, parameters)`` until ``finished(carry, parameters)``, at least once.
 
-    `start` has the table, the first carry and what is given, trees of arrays.
+    `start` has the table, the first carry and parameters, trees of arrays.
     """
 
     def loop(
-        table: Table, carry: Carry, parameters: Given, limit: jax.Array
+        table: Table, carry: Carry, parameters: Parameters, limit: jax.Array
     ) -> tuple[Carry, jax.Array]:
         def one(carry: Carry, n: jax.Array, active: jax.Array) -> tuple[Carry, jax.Array]:
             new = step(table, carry, parameters)

@@ -114,7 +114,7 @@ def solve(
     return last.value, last.image, last.num_steps if method.newton else n, last.weight
 
 
-_Given = tuple[Backup, jax.Array]
+_Parameters = tuple[Backup, jax.Array]
 
 
 def _judged(
@@ -126,13 +126,15 @@ def _judged(
     return image, weight, *method.judge(k.z, image, backup.extra)
 
 
-def _sweep(method: Method, table: SweepOperator, k: _Search, parameters: _Given) -> _Search:
+def _sweep(method: Method, table: SweepOperator, k: _Search, parameters: _Parameters) -> _Search:
     image, _, done, error = _judged(method, table, k, parameters[0])
     z = k.z + (1 - parameters[0].damping) * (image - k.z)
     return k._replace(z=z, value=k.z, image=image, error=error, done=done)
 
 
-def _newton_step(method: Method, table: SweepOperator, k: _Search, parameters: _Given) -> _Search:
+def _newton_step(
+    method: Method, table: SweepOperator, k: _Search, parameters: _Parameters
+) -> _Search:
     """Judges z, and makes a step of Newton's method or a sweep."""
     (backup, limit), over = parameters, table.choices
     image, weight, done, error = _judged(method, table, k, backup)

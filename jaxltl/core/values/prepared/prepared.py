@@ -26,6 +26,7 @@ from jaxltl.core.values.prepared.block_iteration import (
     meets,
     sweep,
 )
+from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.implicit_diff import LinearSystem, implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import RowSystem, row_system
@@ -106,7 +107,7 @@ def solve_prepared(
         )
     if lower is not None or upper is not None:
         raise ValueError("lower and upper are for a prepared IntervalMDP; give probability.")
-    probability, reward = _given_numbers(prepared, probability, reward)
+    probability, reward = _checked_shapes(prepared, probability, reward)
     policy = None if policy is None else jnp.asarray(policy)
     chain = prepared.num_rows == prepared.num_states
     if prepared.objective == "policy":
@@ -120,13 +121,12 @@ def solve_prepared(
             f"a policy is given, but the question is the optimum: prepare it with "
             f'objective="policy", not {prepared.objective!r}.'
         )
-    dtype = prepared.probability.dtype
     if tolerance is None:
-        tolerance = 1e-6 if dtype == jnp.float64 else 1e-3
+        tolerance = default_tolerance(prepared.probability)
     return _solve(prepared, probability, reward, policy, tolerance, max_steps)
 
 
-def _given_numbers(
+def _checked_shapes(
     prepared: Prepared, probability: ArrayLike | None, reward: ArrayLike | None
 ) -> tuple[jax.Array | None, jax.Array | None]:
     """Given probabilities and rewards, with checked shapes."""
@@ -148,7 +148,7 @@ def _solve(
 ) -> Solution:
     tolerance = jnp.asarray(tolerance, prepared.probability.dtype)
     finite, valid = _checked_numbers(prepared, probability, reward)
-    weights = _given_policy(prepared, policy) if prepared.objective == "policy" else None
+    weights = _policy_rows(prepared, policy) if prepared.objective == "policy" else None
     decided = None if weights is None else _decided(prepared, reward, weights)
     if weights is not None:
         finite, valid = finite & weights.finite, valid & weights.valid
@@ -161,7 +161,7 @@ def _solve(
     return solution if weights is None else replace(solution, policy=weights.policy)
 
 
-class _GivenPolicy(NamedTuple):
+class _PolicyRows(NamedTuple):
     """A policy with the normalised weights of its rows."""
 
     policy: jax.Array
@@ -171,7 +171,7 @@ class _GivenPolicy(NamedTuple):
     valid: jax.Array
 
 
-def _given_policy(prepared: Prepared, policy: _Maybe) -> _GivenPolicy:
+def _policy_rows(prepared: Prepared, policy: _Maybe) -> _PolicyRows:
     """The policy; by default the only one of a chain."""
     dtype, state = prepared.probability.dtype, prepared.row_state
     policy = jnp.ones(prepared.num_rows, dtype) if policy is None else policy
@@ -183,7 +183,7 @@ def _given_policy(prepared: Prepared, policy: _Maybe) -> _GivenPolicy:
     valid = jnp.all(jnp.abs(total - 1) <= row_tolerance(dtype)) & jnp.all(weight >= 0)
     valid &= ~jnp.any(is_subnormal(weight))
     share = weight / jnp.where(total > 0, total, 1)[state]
-    return _GivenPolicy(policy, share, weight > 0, jnp.all(jnp.isfinite(weight)), valid)
+    return _PolicyRows(policy, share, weight > 0, jnp.all(jnp.isfinite(weight)), valid)
 
 
 def _checked_numbers(
@@ -241,7 +241,7 @@ class _Decided(NamedTuple):
     infinite: jax.Array
 
 
-def _decided(prepared: Prepared, reward: _Maybe, weights: _GivenPolicy) -> _Decided:
+def _decided(prepared: Prepared, reward: _Maybe, weights: _PolicyRows) -> _Decided:
     """Places where the value of a policy is 0, 1 or infinite."""
     size = prepared.size
     earned = prepared.reward if reward is None else reward
@@ -265,7 +265,7 @@ def _decided(prepared: Prepared, reward: _Maybe, weights: _GivenPolicy) -> _Deci
     return _Decided(~lost & earns, jnp.zeros(size + 3, bool), lost)
 
 
-class _Found(NamedTuple):
+class _Enclosed(NamedTuple):
     """Enclosed values of the places, ``float[N]``."""
 
     value: jax.Array
@@ -285,7 +285,7 @@ def _rounding(prepared: Prepared) -> tuple[float, float]:
 
 def _enclosed(
     prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: jax.Array | int
-) -> _Found:
+) -> _Enclosed:
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
     unit, least = _rounding(prepared)
@@ -303,7 +303,7 @@ def _enclosed(
     lower = jnp.maximum(x * (1 - share) - prepared.levels * least, 0) if known else x * 0
     upper = x * (1 + share) + prepared.levels * least if known else x * 0 + jnp.inf
     zero = jnp.zeros((), dtype)
-    return _Found(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
+    return _Enclosed(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
 
 
 def _enclosed_cycles(
@@ -312,7 +312,7 @@ def _enclosed_cycles(
     start: jax.Array,
     tolerance: jax.Array,
     max_steps: jax.Array | int,
-) -> _Found:
+) -> _Enclosed:
     """Bounds from both sides where the system has cycles."""
     unit, least = _rounding(prepared)
     before, core, after = prepared.segments
@@ -348,11 +348,11 @@ def _enclosed_cycles(
         rank = jnp.concatenate(parts)
     low, high = low[:size], high[:size]
     middle = jnp.where(s.proven, low + (high - low) / 2, low)
-    return _Found(middle, low, high, rank, s.moved, s.steps, s.proven)
+    return _Enclosed(middle, low, high, rank, s.moved, s.steps, s.proven)
 
 
 def _attached(
-    prepared: Prepared, enclosure: _Found | None, decided: _Decided | None = None
+    prepared: Prepared, enclosure: _Enclosed | None, decided: _Decided | None = None
 ) -> jax.Array:
     """Values of the places with implicit derivatives; of a chain also their approximation."""
     size, dtype = prepared.size, prepared.probability.dtype
@@ -389,7 +389,7 @@ def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
 
 def _answer(
     prepared: Prepared,
-    enclosure: _Found,
+    enclosure: _Enclosed,
     decided: _Decided | None,
     tolerance: jax.Array,
     checks: tuple[jax.Array, jax.Array],
@@ -433,7 +433,7 @@ def _at_states(prepared: Prepared, x: jax.Array) -> jax.Array:
     return jnp.concatenate([x, ends]).at[prepared.place].get(mode="promise_in_bounds")
 
 
-def _policy(prepared: Prepared, enclosure: _Found) -> jax.Array:
+def _policy(prepared: Prepared, enclosure: _Enclosed) -> jax.Array:
     """An optimal policy, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
     if enclosure.rank is None or not names.shape[0]:
@@ -483,7 +483,7 @@ def evaluate_prepared(
         raise ValueError(
             "evaluate_prepared takes Markov chains, not prepared for policies: use solve_prepared."
         )
-    return _evaluate(prepared, *_given_numbers(prepared, probability, reward))
+    return _evaluate(prepared, *_checked_shapes(prepared, probability, reward))
 
 
 @jit()

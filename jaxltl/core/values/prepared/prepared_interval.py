@@ -28,6 +28,7 @@ from jaxltl.core.sparse.rows import concatenated_ranges
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward
+from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import row_system
@@ -259,7 +260,7 @@ def solve_prepared_interval(
             require_shape(name, ends, prepared.lower.shape)
     require_prepared_reward(prepared.reward, reward)
     if tolerance is None:
-        tolerance = 1e-6 if dtype == jnp.float64 else 1e-3
+        tolerance = default_tolerance(prepared.lower)
     return _solve(prepared, lower, upper, reward, tolerance, max_steps)
 
 

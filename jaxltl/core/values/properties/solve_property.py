@@ -56,7 +56,7 @@ _AVERAGE = "averages of end components"
 _OTHER = {"max": "min", "min": "max"}
 
 
-class _Found(NamedTuple):
+class _Result(NamedTuple):
     """The solution at the requested states."""
 
     solution: Solution
@@ -210,7 +210,7 @@ def as_answer(
     prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
 ) -> Answer:
     """The answer of a solution at the requested states, without a strategy."""
-    result = _Found(replace(solution, method=method), None)
+    result = _Result(replace(solution, method=method), None)
     holds = None if prop.relation is None else _verdicts(prop, result)
     return _answer(prop, states, result, holds, tolerance)
 
@@ -218,7 +218,7 @@ def as_answer(
 def _answer(
     prop: Property,
     states: np.ndarray,
-    result: _Found,
+    result: _Result,
     holds: list[bool | None] | None,
     tolerance: float,
 ) -> Answer:
@@ -234,7 +234,7 @@ def _answer(
     return Answer(states, value, lower, upper, holds, status, method, result.strategy)
 
 
-def _status(prop: Property, result: _Found, tolerance: float) -> Status:
+def _status(prop: Property, result: _Result, tolerance: float) -> Status:
     """CONVERGED if the bounds at the requested states are within the tolerance."""
     lower, upper = result.solution.lower, result.solution.upper
     status = Status(int(np.max(result.solution.status)))
@@ -255,11 +255,11 @@ def _status(prop: Property, result: _Found, tolerance: float) -> Status:
     return max(status, Status.PRECISION)
 
 
-def _is_exact(result: _Found) -> bool:
+def _is_exact(result: _Result) -> bool:
     return bool((result.solution.lower == result.solution.upper).all())
 
 
-def _verdicts(prop: Property, result: _Found) -> list[bool | None]:
+def _verdicts(prop: Property, result: _Result) -> list[bool | None]:
     assert prop.relation is not None and prop.threshold is not None
     lower, upper = np.asarray(result.solution.lower), np.asarray(result.solution.upper)
     return [
@@ -324,7 +324,7 @@ def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
 # --- which solver -----------------------------------------------------------------------------
 
 
-def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Found:
+def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Result:
     """The solution of a property at some states."""
     model, path = query.model, prop.path
     if prop.operator == "P":
@@ -382,17 +382,17 @@ class _Query(NamedTuple):
     def where(self, condition: Formula) -> np.ndarray:
         return states_satisfying(_graph(self.model), condition, self.text)
 
-    def result(self, solution: Solution, by: str = "") -> _Found:
+    def result(self, solution: Solution, by: str = "") -> _Result:
         """A solution at all states, at those that are asked for."""
         method = {"steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
         nature = None if solution.nature is None else np.asarray(solution.nature)
         strategy = PropertyStrategy(np.asarray(solution.policy), by, nature=nature)
         solution = replace(solution, method=solution.method or method)
-        return _Found(at_states(solution, self.states), strategy)
+        return _Result(at_states(solution, self.states), strategy)
 
     def exact(
-        self, result: _Found, tolerance: float, solve: Callable[..., Bounds | None]
-    ) -> _Found:
+        self, result: _Result, tolerance: float, solve: Callable[..., Bounds | None]
+    ) -> _Result:
         """The solution with bounds by rational arithmetic, if these are asked for and possible."""
         if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
             return result
@@ -405,7 +405,7 @@ class _Query(NamedTuple):
         )
         return result._replace(solution=solution)
 
-    def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
+    def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
         """The probability of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
             return self.within(path, aim, tolerance)
@@ -434,19 +434,19 @@ class _Query(NamedTuple):
                 return self.opposite(Formula("U", (~first, ~right)), aim, tolerance)
         raise AssertionError(path.operator)
 
-    def at_once(self, path: Formula) -> _Found:
+    def at_once(self, path: Formula) -> _Result:
         holds: Array = self.where(path).astype(np.float64)[self.states]
         zero: Array = np.int32(0)
         nobody: Array = np.zeros(0, np.int32)
-        return _Found(
+        return _Result(
             Solution(holds, nobody, holds, holds, zero, zero, zero, method="the label"), None
         )
 
-    def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Found:
+    def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
         result = self.probability(path, aim.opposite, tolerance)
         return result._replace(solution=complement_event(result.solution))
 
-    def until(self, first: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Found:
+    def until(self, first: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Result:
         target: Array = self.where(right)
         stay: Array = None if first == TRUE else self.where(first)
         solution = reachability_probability(
@@ -458,16 +458,16 @@ class _Query(NamedTuple):
         )
         return self.exact(self.result(solution), tolerance, exact)
 
-    def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Found:
+    def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
         result = optimal_satisfaction(
             self.model, path, states=self.states, tolerance=tolerance, **aim.directions
         )
         size = f"product of {result.product.host.num_states} states"
         method = ", ".join(filter(None, (size, result.solution.method)))
         strategy = PropertyStrategy(result.row, memory=result, nature=result.solution.nature)
-        return _Found(replace(result.solution, method=method), strategy)
+        return _Result(replace(result.solution, method=method), strategy)
 
-    def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Found:
+    def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Result:
         if path.operator == "R":
             negated = TRUE if path.left.operator == "false" else ~path.left
             until = replace(path, operator="U", left=negated, right=~path.right)

@@ -304,7 +304,11 @@ def task_performances(
         if part is not None and part.status == Status.INVALID:
             require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
         elif part is None or part.status != Status.CONVERGED:
-            parts[w] = _on_host(models, policies, w, tolerance)
+            # by the sparse engine
+            model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
+            solution = satisfaction_probability(model, policy, tolerance=tolerance)
+            enclosure = solution.value, solution.lower, solution.upper
+            parts[w] = _summarized(model, *enclosure, tolerance)
     result: Performance = to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
     return result
 
@@ -321,16 +325,6 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
         performances = jax.block_until_ready(_together(some, chosen, tolerance))
         parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], performances))
     result: Performance = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return result
-
-
-def _on_host(models: Product, policies: jax.Array, world: int, tolerance: Array) -> Performance:
-    """Evaluation in one world by the sparse engine."""
-    model, policy = jax.tree.map(lambda x: np.asarray(x)[world], (models, policies))
-    solution = satisfaction_probability(model, policy, tolerance=tolerance)
-    result: Performance = _summarized(
-        model, solution.value, solution.lower, solution.upper, tolerance
-    )
     return result
 
 

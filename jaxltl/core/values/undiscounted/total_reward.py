@@ -108,10 +108,7 @@ def total_reward(
     earned = _earned(model, sparse, reward)
     if (earned < 0).any():
         r = int(np.flatnonzero(earned < 0)[0])
-        raise ValueError(
-            f"the reward of a choice of state {sparse.host.state[r]} is {earned[r]:.6g}; expected "
-            "total rewards need rewards of at least 0."
-        )
+        raise _negative(sparse.host.state[r], earned[r])
     if target is not None:
         require_states("target", target, model.state_shape)
         target = np.asarray(target, bool).ravel()
@@ -244,10 +241,14 @@ def _require_rewards(model: ActionModel, world: World, reward: Array) -> None:
     least, state = _least_reward(model, world, reward)
     # Inside jit the status is NONFINITE.
     if not isinstance(least, jax.core.Tracer) and not least >= 0:
-        raise ValueError(
-            f"the reward of a choice of state {state} is {least:.6g}; expected total rewards need "
-            "rewards of at least 0."
-        )
+        raise _negative(state, least)
+
+
+def _negative(state: Array | int, reward: Array | float) -> ValueError:
+    return ValueError(
+        f"the reward of a choice of state {state} is {reward:.6g}; expected total rewards need "
+        "rewards of at least 0."
+    )
 
 
 @jit()
