@@ -8,7 +8,13 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import (
+    concatenated_ranges,
+    mask_of,
+    offsets_from_counts,
+    positions,
+    row_entries,
+)
 
 _WORTH = 8  # a model is contracted if more than one in that many of its states vanishes
 
@@ -26,9 +32,7 @@ class Contraction:
 
     def region(self, states: Booleans) -> Booleans:
         """The nodes of some states, ``bool[N]``."""
-        nodes = np.zeros(self.mdp.num_states, bool)
-        nodes[self.node[states]] = True
-        return nodes
+        return mask_of(self.node[states], self.mdp.num_states)
 
 
 def identity(mdp: HostMDP, cost: Floats | None = None) -> Contraction:
@@ -64,8 +68,7 @@ def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contr
             earned += earned[step]
             step = step[step]
     kept = np.flatnonzero(~alias)
-    number = np.zeros(size, np.int32)
-    number[kept] = np.arange(kept.size)
+    number = positions(kept, size)
     node = number[end]
     row, count = row_entries(mdp.row_start, kept)
     smaller, entry = mdp.select(offsets_from_counts(count), row, node)
@@ -91,15 +94,13 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
     size = mdp.num_states
     leader = component[mdp.state]
     kept = ~inside
-    some = np.zeros(size, bool)
-    some[leader[kept]] = True
+    some = mask_of(leader[kept], size)
     is_leader = component == np.arange(size)
     kept[mdp.row_start[:-1][is_leader & ~some]] = True
     row = np.flatnonzero(kept)
     row = row[np.argsort(leader[row], kind="stable")]
     leaders = np.flatnonzero(is_leader)
-    number: Integers = np.zeros(size, np.int32)
-    number[leaders] = np.arange(leaders.size)
+    number = positions(leaders, size)
     node = number[component]
     count = np.bincount(node[mdp.state[row]], minlength=leaders.size)
     smaller, _ = mdp.select(offsets_from_counts(count), row, node)

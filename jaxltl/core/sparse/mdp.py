@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers, SparseMatrix
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import (
+    Rows,
+    concatenated_ranges,
+    mask_of,
+    offsets_from_counts,
+    row_entries,
+)
 
 _SMALL = 2000  # entries up to which NumPy alone is as fast, and SciPy need not be imported
 
@@ -78,6 +84,10 @@ class HostGraph:
     def support(self) -> Rows:
         """The successors of each row."""
         return Rows(self.entry_start, self.successor, self.num_states)
+
+    def states_of(self, rows: Booleans | Integers) -> Booleans:
+        """The states of some rows, ``bool[S]``."""
+        return mask_of(self.state[rows], self.num_states)
 
     def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
         """States with a marked row, and the first marked row of each (or its first row)."""

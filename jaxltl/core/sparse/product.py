@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import (
+    concatenated_ranges,
+    mask_of,
+    offsets_from_counts,
+    positions,
+    row_entries,
+)
 
 MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
 _DENSE = 2**27  # pairs up to which the number of each is looked up in a table
@@ -65,8 +71,7 @@ def sparse_product(
     seen = _reached(world, first)
     code = np.flatnonzero(seen)
     if host.num_states * num_memory <= _DENSE:
-        number = np.zeros(seen.size, np.int32)
-        number[code] = np.arange(code.size, dtype=np.int32)
+        number = positions(code, seen.size)
         return _written(world, code, number.__getitem__, first)
     return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), first)
 
@@ -105,8 +110,7 @@ class _World(NamedTuple):
 def _reached(world: _World, start: Integers) -> Booleans:
     """The reachable pairs, ``bool[S * Q]``, by breadth-first search."""
     host = world.host
-    seen = np.zeros(host.num_states * world.num_memory, bool)
-    seen[start] = True
+    seen = mask_of(start, host.num_states * world.num_memory)
     first_entry = host.entry_start[host.row_start]
     scratch = np.empty(seen.size, np.int32) if seen.size <= _DENSE else None
     frontier, rounds, work = np.flatnonzero(seen), 0, 0
@@ -156,9 +160,7 @@ def _searched(world: _World, start: Integers) -> Booleans:
     graph = csr_array((np.ones(edges.size), edges, index), shape=(size, size))
     order = csgraph.breadth_first_order(graph, size - 1, return_predecessors=False)[1:]
     memory, state = np.divmod(order.astype(np.int64), num_states)
-    seen = np.zeros(size - 1, bool)
-    seen[state * num_memory + memory] = True
-    return seen
+    return mask_of(state * num_memory + memory, size - 1)
 
 
 def _written(

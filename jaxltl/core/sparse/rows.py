@@ -95,6 +95,28 @@ def row_entries(start: Integers, row: Integers) -> tuple[Integers, Integers]:
     return concatenated_ranges(start[row], count), count
 
 
+def mask_of(index: Integers, size: int) -> Booleans:
+    """The mask ``bool[size]`` of some indices.
+
+    >>> mask_of(np.array([2, 0]), 3).tolist()
+    [True, False, True]
+    """
+    mask = np.zeros(size, bool)
+    mask[index] = True
+    return mask
+
+
+def positions(number: Integers, size: int) -> Integers:
+    """The position of each number in a list, ``int32[size]``; -1 where it is not listed.
+
+    >>> positions(np.array([2, 0]), 3).tolist()
+    [1, -1, 0]
+    """
+    position: Integers = np.full(size, -1, np.int32)
+    position[number] = np.arange(number.size)
+    return position
+
+
 def offsets_from_counts(count: Integers) -> Integers:
     """The start of each group of the given sizes, and the end: ``int32[N + 1]``, if that fits.
 
@@ -115,8 +137,7 @@ def sorted_unique(number: Integers, size: int) -> Integers:
     if number.size < size // 16:
         number = np.sort(number)
         return number[group_starts(number)]
-    mark = np.zeros(size, bool)
-    mark[number] = True
+    mark = mask_of(number, size)
     return np.flatnonzero(mark)
 
 

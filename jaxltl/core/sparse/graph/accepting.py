@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.sparse.rows import mask_of
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.qualitative import end_components, shortest_path_rows
 from jaxltl.core.sparse.mdp import HostMDP
@@ -31,8 +32,7 @@ def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
         allowed = (least >= p) & ~region[mdp.state]
         components = end_components(mdp, rows=allowed)
         hit = components.inside & (least == p)
-        wins = np.zeros(mdp.num_states, bool)
-        wins[components.component[mdp.state[hit]]] = True
+        wins = mask_of(components.component[mdp.state[hit]], mdp.num_states)
         new = wins[components.component] & components.region(mdp)
         inside = components.inside & new[mdp.state]
         some, first = mdp.first_choice(hit)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import decrement, group_starts, row_entries, sorted_unique
+from jaxltl.core.sparse.rows import decrement, group_starts, mask_of, row_entries, sorted_unique
 
 FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
 _MANY = 64  # transitions into one of them from which it does not
@@ -100,9 +100,7 @@ class _Search(NamedTuple):
         if row.size < self.graph.num_rows // 16:
             row = sorted_unique(row[self.waiting[row]], self.graph.num_rows)
         else:
-            mark = np.zeros(self.graph.num_rows, bool)
-            mark[row] = True
-            row = np.flatnonzero(mark & self.waiting)
+            row = np.flatnonzero(mask_of(row, self.graph.num_rows) & self.waiting)
         self.waiting[row] = False
         row = row[self.joinable[self.graph.state[row]]]
         state: Integers = self.graph.state[row]

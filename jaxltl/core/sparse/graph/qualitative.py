@@ -10,7 +10,7 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.attractor import attracted
 from jaxltl.core.sparse.graph.components import forward_search, strong_components
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import row_entries
+from jaxltl.core.sparse.rows import mask_of, row_entries
 
 
 def backward_reachable(mdp: HostGraph, goal: Booleans, rows: Booleans | None = None) -> Booleans:
@@ -62,9 +62,7 @@ class EndComponents(NamedTuple):
 
     def region(self, mdp: HostGraph) -> Booleans:
         """The states of end components, ``bool[S]``."""
-        states = np.zeros(mdp.num_states, bool)
-        states[mdp.state[self.inside]] = True
-        return states
+        return mdp.states_of(self.inside)
 
 
 def end_components(
@@ -88,8 +86,7 @@ def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
     component = np.arange(mdp.num_states)
     inside = np.zeros(mdp.num_rows, bool)
     while True:
-        candidates = np.zeros(mdp.num_states, bool)
-        candidates[mdp.state[kept]] = True
+        candidates = mdp.states_of(kept)
         candidates &= ~positive_under_all_policies(mdp, ~candidates, kept)
         row = np.flatnonzero(kept & candidates[mdp.state])
         if not row.size:
@@ -103,8 +100,7 @@ def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
         final = _untouched(mdp.state[row], crossing, leaves, label)
         inside[row[final]] = True
         component[mdp.state[row[final]]] = label[mdp.state[row[final]]]
-        kept = np.zeros(mdp.num_rows, bool)
-        kept[row[~crossing & ~final]] = True
+        kept = mask_of(row[~crossing & ~final], mdp.num_rows)
 
 
 def _labels(
@@ -123,6 +119,4 @@ def _labels(
 
 def _untouched(state: Integers, crossing: Booleans, leaves: Booleans, label: Integers) -> Booleans:
     """The rows of components that lost no row, which are end components."""
-    touched = np.zeros(label.size, bool)
-    touched[label[state[crossing & ~leaves]]] = True
-    return ~crossing & ~touched[label[state]]
+    return ~crossing & ~mask_of(label[state[crossing & ~leaves]], label.size)[label[state]]

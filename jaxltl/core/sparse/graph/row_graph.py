@@ -12,7 +12,7 @@ from jaxltl.core.sparse.graph.attractor import attracted
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import concatenated_ranges, first_action, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, first_action, mask_of, offsets_from_counts
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,7 @@ class RowGraph:
             source, target = host.state[host.row[used]], host.successor[used]
             label = strong_components(source, target, host.num_states)
             crossing = label[source] != label[target]
-            exited = np.zeros(host.num_states, bool)
-            exited[label[source[crossing]]] = True
+            exited = mask_of(label[source[crossing]], host.num_states)
             inside = rows & ~exited[label][host.state]
             alive = host.first_choice(inside)[0]
             component = np.where(alive, label, np.arange(host.num_states))
@@ -116,9 +115,7 @@ class RowGraph:
 
     def anywhere(self, mark: Booleans, component: Integers) -> Booleans:
         """Tests if a state of the same component is marked: ``bool[S]``."""
-        marked = np.zeros(component.size, bool)
-        marked[component[mark]] = True
-        return marked[component]
+        return mask_of(component[mark], component.size)[component]
 
     # --- loops --------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from jaxltl.core.sparse.graph.qualitative import (
 )
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.rows import decrement, row_entries, sorted_unique
+from jaxltl.core.sparse.rows import decrement, mask_of, row_entries, sorted_unique
 
 
 def attractor_against_nature(
@@ -129,9 +129,8 @@ def almost_sure_states(
                 else attractor_against_nature(model, goal & inside, all_rows=False, rows=kept)
             )
         else:
-            bad = np.zeros(mdp.num_states, bool)
-            bad[mdp.state[~kept]] = True
-            reached = positive_under_all_policies(mdp, goal & inside, among=inside & ~bad)
+            among = inside & ~mdp.states_of(~kept)
+            reached = positive_under_all_policies(mdp, goal & inside, among=among)
         if (reached == inside).all():
             return inside, kept & inside[mdp.state]
         inside = reached
@@ -151,8 +150,7 @@ def joint_end_components(
         used &= kept[mdp.row]
         if not kept.any():
             return EndComponents(np.arange(mdp.num_states), kept), used
-        alive = np.zeros(mdp.num_states, bool)
-        alive[mdp.state[kept]] = True
+        alive = mdp.states_of(kept)
         stays = ~_attractor(model, ~alive, True, kept)[0]
         now = used & stays[mdp.successor] & stays[source]
         label = strong_components(source[now], mdp.successor[now], mdp.num_states)
@@ -181,15 +179,12 @@ def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustReg
     for p in np.unique(priority[priority % 2 == 0]):
         components, used = joint_end_components(model, ~region, priority >= p)
         hit = used & (priority == p)
-        accepting = np.zeros(mdp.num_states, bool)
-        accepting[components.component[mdp.state[mdp.row[hit]]]] = True
+        accepting = mask_of(components.component[mdp.state[mdp.row[hit]]], mdp.num_states)
         new = accepting[components.component] & components.region(mdp)
         if not new.any():
             continue
         region |= new
-        takes = np.zeros(mdp.num_rows, bool)
-        takes[mdp.row[hit]] = True
-        some, first = mdp.first_choice(takes)
+        some, first = mdp.first_choice(mask_of(mdp.row[hit], mdp.num_rows))
         keep = used & new[mdp.state[mdp.row]]
         inside = components.inside & new[mdp.state]
         way = model.resolve(np.where(keep | ~inside[mdp.row], chance, 0))

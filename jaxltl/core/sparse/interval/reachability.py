@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxltl.core.sparse.rows import mask_of
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import EndComponents, shortest_path_rows
 from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
@@ -208,8 +209,7 @@ def move_to_exits(
     """A pair that moves inside each end component to the state of the row that leaves it."""
     (row, chance), mdp = pair, model.mdp
     exits = mdp.state[row] == np.arange(mdp.num_states)
-    inner = np.zeros(mdp.num_states, bool)
-    inner[mdp.state[inside]] = True
+    inner = mdp.states_of(inside)
     moving = inner & ~exits
     taken = inside & moving[mdp.state]
     kept = model.interior_distributions(used & taken[mdp.row])
@@ -235,9 +235,7 @@ def _first_choices(
         best = mdp.over_choices(opt, image)
         better = np.abs(best - image[row]) > gain_noise(value)
         row = np.where(better, mdp.first_choice(image == best[mdp.state])[1], row)
-        taken = np.zeros(mdp.num_rows, bool)
-        taken[row] = True
-        kept = taken[mdp.row]
+        kept = mask_of(row, mdp.num_rows)[mdp.row]
         start = np.concatenate([[0], np.diff(mdp.entry_start)[row].cumsum()])
         chain = csr_array((p[kept], mdp.successor[kept], start), shape=shape)
         before = value

@@ -20,7 +20,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, scatter
 from jaxltl.core.sparse.linear.extended_precision import TwoFloats, two_float_difference
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import mask_of, offsets_from_counts, row_entries
 from jaxltl.core.sparse.solvers.reachability import expands_fast
 
 if TYPE_CHECKING:
@@ -247,8 +247,7 @@ class RowOperator:
         """The linear system of a pair; None if some node is never left."""
         from scipy.sparse import csr_array
 
-        taken = np.zeros(self.row.size, bool)
-        taken[pair.chosen] = True
+        taken = mask_of(pair.chosen, self.row.size)
         earned, parts = np.zeros(self.size), []
         values = self.values(earned).high
         for block, p in zip(self.blocks, pair.p, strict=True):
@@ -312,8 +311,7 @@ class RowOperator:
     def proves_attained(self, z: Floats | TwoFloats, pair: PolicyPair) -> bool:
         """True if the chosen rows gain in every node, rounding included, so the pair attains z."""
         values = self.values(z)
-        taken = np.zeros(self.row.size, bool)
-        taken[pair.chosen] = True
+        taken = mask_of(pair.chosen, self.row.size)
         for block, p in zip(self.blocks, pair.p, strict=True):
             gain = block.differences(values)
             mass = self.answer(block, gain) if self.adversarial else p

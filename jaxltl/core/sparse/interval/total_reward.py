@@ -28,7 +28,7 @@ from jaxltl.core.sparse.interval.strategy_iteration import (
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.rows import mask_of, offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as mdp_reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
@@ -105,9 +105,7 @@ def _joint(
 ) -> RobustValues:
     """Optimal reward where policy and nature cooperate, in a model that ends almost surely."""
     mdp, up = model.mdp, query.maximize
-    earning = np.zeros(mdp.num_states, bool)
-    earning[mdp.state[cost > 0]] = True
-    open_ = ~target & (backward_reachable(mdp, earning) if up else True)
+    open_ = ~target & (backward_reachable(mdp, mdp.states_of(cost > 0)) if up else True)
     components = None if up else joint_end_components(model, open_, (cost == 0)[mdp.row])
     problem = PathProblem(
         model=model,
@@ -148,9 +146,7 @@ def _restrict(
     source = part.mdp.state[part.mdp.row]
     kept = inside[part.mdp.successor] & inside[source]
     lone = ~some[source]
-    head = np.zeros(entry.size, bool)
-    head[part.mdp.entry_start[:-1]] = True
-    kept = np.where(lone, head, kept)
+    kept = np.where(lone, mask_of(part.mdp.entry_start[:-1], entry.size), kept)
     successor = np.where(lone, source, part.mdp.successor)[kept].astype(np.int32)
     chance = np.where(lone, 1, part.interior_distributions(kept))[kept]
     lower, upper = (np.where(lone, 1, x)[kept] for x in (part.lower, part.upper))

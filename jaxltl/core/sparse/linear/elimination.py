@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.sparse.rows import positions
 from jaxltl.core.array_types import Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.linear.krylov import bicgstab, iterate
 
@@ -208,8 +209,7 @@ def _block(
     from scipy.sparse import linalg
 
     whole = order.size == label.size
-    place = np.full(label.size, -1, np.int32)
-    place[order] = np.arange(order.size, dtype=np.int32)
+    place = positions(order, label.size)
     inner, outer = rows[chosen[order]], None
     if whole:
         inner.indices = place[inner.indices]

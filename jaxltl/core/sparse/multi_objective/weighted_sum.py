@@ -23,7 +23,7 @@ from jaxltl.core.sparse.graph.qualitative import (
     shortest_path_rows,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import first_hits
+from jaxltl.core.sparse.rows import first_hits, mask_of
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.shortest_path_problem import ShortestPathProblem
 
@@ -64,8 +64,7 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
     sets, inside_of_set = [], []
     for size in range(count, -1, -1):
         for chosen in itertools.combinations(range(count), size):
-            wanted = np.zeros(count, bool)
-            wanted[list(chosen)] = True
+            wanted = mask_of(np.array(chosen, np.int64), count)
             region = _satisfying(mdp, sums.priority[wanted], homes.inside & rows)
             if region.any():
                 sets.append(wanted)
@@ -111,9 +110,7 @@ def weighted_optimum(
     # The best end of each state, of which a later one does not take the place.
     best = np.full(mdp.num_states, -1)
     for i in np.argsort(-worth, kind="stable"):
-        states = np.zeros(mdp.num_states, bool)
-        states[mdp.state[where.inside[i]]] = True
-        best = np.where(states & (best < 0), i, best)
+        best = np.where(mdp.states_of(where.inside[i]) & (best < 0), i, best)
     free = end_components(mdp, rows=where.rows & (spent == 0) & (earned == 0))
     quotient = _quotient(mdp, where.rows, free, best, worth)
     bound, row = _solved(quotient, earned, spent, tolerance)
@@ -140,8 +137,7 @@ class _Quotient(NamedTuple):
 def _quotient(
     mdp: HostMDP, rows: Booleans, free: EndComponents, best: Integers, worth: Floats
 ) -> _Quotient:
-    used = np.zeros(mdp.num_states, bool)
-    used[mdp.state[rows]] = True
+    used = mdp.states_of(rows)
     heads = np.unique(free.component[used])
     node = np.where(used, np.searchsorted(heads, free.component), 0)
     # A component stops in the state with the largest stopping reward.
@@ -243,8 +239,7 @@ def _policy(
     ending = np.unique(quotient.stop[quotient.node[stops]])
     for i in np.unique(best[ending]):
         part = end_components(mdp, rows=where.inside[i])
-        wanted = np.zeros(mdp.num_states, bool)
-        wanted[part.component[ending[best[ending] == i]]] = True
+        wanted = mask_of(part.component[ending[best[ending] == i]], mdp.num_states)
         new = part.inside & wanted[part.component][mdp.state] & ~home[mdp.state]
         inside |= new
         home[mdp.state[new]] = True
@@ -252,9 +247,11 @@ def _policy(
     moving = np.flatnonzero(~stops & (own >= 0))
     goal[mdp.state[own[moving]]] = True
     policy = shortest_path_rows(mdp, goal, free.inside & region[mdp.state])
-    exits = np.zeros(mdp.num_states, bool)
-    exits[mdp.state[own[moving]]] = True
-    at = exits & (own >= 0) & (mdp.state[np.maximum(own, 0)] == np.arange(mdp.num_states))
+    at = (
+        mdp.states_of(own[moving])
+        & (own >= 0)
+        & (mdp.state[np.maximum(own, 0)] == np.arange(mdp.num_states))
+    )
     policy = np.where(at, own, policy)
     weight = np.zeros(mdp.num_rows)
     weight[policy] = 1

@@ -26,7 +26,7 @@ from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.total_reward import finite_states
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.rows import mask_of, offsets_from_counts
 
 
 class RoomQueries(NamedTuple):
@@ -103,8 +103,7 @@ def plan_total_reward(
     mdp, log, large = absorbing.mdp, list[RoomQueries](), query.nature_maximizes
     recording = _recording(absorbing, log)
     free = target[mdp.state] | (reward[origin] == 0)
-    paying = np.zeros(target.size, bool)
-    paying[mdp.state[~free]] = True
+    paying = mask_of(mdp.state[~free], target.size)
     finite, kept = finite_states(recording, target, query)
     if query.maximize and large:
         nothing = finite & ~backward_reachable(mdp, paying)
@@ -221,8 +220,7 @@ class _RecordingMDP(UncertainMDP):
 
     def _record(self, row: Integers, entries: Booleans) -> None:
         start, lower = self.mdp.entry_start, self.lower
-        queried = np.zeros(self.mdp.num_rows, bool)
-        queried[row] = True
+        queried = mask_of(row, self.mdp.num_rows)
         needed = np.logical_or.reduceat(~entries & (lower > 0), start[:-1])
         some = np.logical_or.reduceat(entries, start[:-1])
         every = np.logical_and.reduceat(entries, start[:-1])
@@ -253,8 +251,7 @@ def _unique_queries(model: UncertainMDP, log: list[RoomQueries], entries: Intege
     mark = np.random.default_rng(0).integers(1, 2**62, model.mdp.num_transitions, np.int64)
     start = np.flatnonzero(np.diff(group, prepend=-1))
     _, first = np.unique(np.add.reduceat(mark[entry], start), return_index=True)
-    kept = np.zeros(room.size, bool)
-    kept[first] = True
+    kept = mask_of(first, room.size)
     chosen = kept[group]
     return RoomQueries(
         entry[chosen],

@@ -153,8 +153,7 @@ def _cycles(reduced: ReducedProblem) -> Cycles | None:
     mdp = whole.mdp
     open_ = reduced.problem.interior[part.node]
     inside = components.inside & open_[mdp.state]
-    region: Booleans = np.zeros(mdp.num_states, bool)
-    region[mdp.state[inside]] = True
+    region = mdp.states_of(inside)
     if not region.any():
         return None
     number = np.cumsum(region) - 1

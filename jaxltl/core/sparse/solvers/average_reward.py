@@ -30,7 +30,7 @@ from jaxltl.core.sparse.linear.extended_precision import (
 )
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.rows import mask_of, offsets_from_counts, positions
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.reachability import quotient_policy
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
@@ -206,8 +206,7 @@ def _submodel(
     rewards: tuple[Floats, Floats],
 ) -> _Submodel:
     """Some components of a model, with the rows that stay inside."""
-    number: Integers = np.full(mdp.num_states, -1, np.int32)
-    number[states] = np.arange(states.size)
+    number = positions(states, mdp.num_states)
     row = np.flatnonzero(inside & (number[mdp.state] >= 0))
     row = row[np.argsort(number[mdp.state[row]], kind="stable")]
     count = np.bincount(number[mdp.state[row]], minlength=states.size)
@@ -418,9 +417,7 @@ def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | No
                 return None
             gains.append(bias.gain)
         heads = heads[[int(np.argmax(gains))]]
-        taken = np.zeros(mdp.num_rows, bool)
-        taken[chosen] = True
-        goal = backward_reachable(mdp, label == heads[0], taken)
+        goal = backward_reachable(mdp, label == heads[0], mask_of(chosen, mdp.num_rows))
         onward = shortest_path_rows(mdp, goal, np.ones(mdp.num_rows, bool))
         chosen = np.where(goal, chosen, onward)
     bias = _gain_and_bias(part, chosen, np.arange(size), np.flatnonzero(label == heads[0]))

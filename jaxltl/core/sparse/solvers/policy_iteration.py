@@ -41,7 +41,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     ordered_components,
     topological_levels,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, positions, row_entries
 from jaxltl.core.sparse.solvers.shortest_path_problem import (
     TINY,
     Enclosure,
@@ -166,8 +166,7 @@ def _core_solver(
     row = concatenated_ranges(rows.row_start[core], count)[choices.order]
     core = core[choices.states]
     entry, width = row_entries(rows.entry_start, row)
-    number: Integers = np.full(rows.num_nodes, -1, np.int32)
-    number[core] = np.arange(core.size)
+    number = positions(core, rows.num_nodes)
     target, weight = rows.target[entry], rows.weight[entry]
     inner = number[target] >= 0
     of = np.repeat(np.arange(row.size, dtype=np.int32), width)

@@ -30,7 +30,7 @@ from jaxltl.core.sparse.linear.gauss_seidel import (
     solve_by_sweeps,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import group_starts, row_entries
+from jaxltl.core.sparse.rows import group_starts, mask_of, row_entries
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.shortest_path_problem import (
     TINY,
@@ -239,9 +239,7 @@ def _without_reward(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Boolea
     earning = (cost > 0) & ~goal[mdp.state]
     if earning.all():
         return goal
-    some = np.zeros(mdp.num_states, bool)
-    some[mdp.state[earning]] = True
-    return ~(backward_reachable(mdp, some, ~goal[mdp.state]) | infinite)
+    return ~(backward_reachable(mdp, mdp.states_of(earning), ~goal[mdp.state]) | infinite)
 
 
 def _finite_part(
@@ -394,8 +392,7 @@ def expands_fast(
 ) -> bool:
     """True if few steps from a state lead to many others."""
     remaining = (_MET if met is None else met) - 1
-    seen: Booleans = np.zeros(num_states, bool)
-    seen[start] = True
+    seen = mask_of(start, num_states)
     for _ in range(steps):
         if remaining <= 0:
             return True

@@ -187,11 +187,9 @@ def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
     row = shape.row[chosen].astype(np.int32)
     policy[mdp.state[row]] = row
     if shape.inside.any():
-        goal = np.zeros(mdp.num_states, bool)
-        goal[mdp.state[row]] = True
-        within = np.zeros(mdp.num_states, bool)
-        within[mdp.state[shape.inside]] = True
-        policy = np.where(within & ~goal, shortest_path_rows(mdp, goal, shape.inside), policy)
+        goal = mdp.states_of(row)
+        moving = mdp.states_of(shape.inside) & ~goal
+        policy = np.where(moving, shortest_path_rows(mdp, goal, shape.inside), policy)
     return policy
 
 

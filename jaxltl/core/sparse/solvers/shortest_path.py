@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, mask_of, offsets_from_counts
 from jaxltl.core.sparse.solvers.reachability import total_reward
 
 _TOLERANCE = 1e-8  # width of the expected times, relative
@@ -35,8 +35,7 @@ def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) ->
 
 def expected_steps(mdp: HostMDP, row: Integers, goal: Booleans) -> Floats | None:
     """Expected steps to a goal, ``float64[S]`` or infinity; None without six certified digits."""
-    rows = np.zeros(mdp.num_rows, bool)
-    rows[row] = True
+    rows = mask_of(row, mdp.num_rows)
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)
     time = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
     finite = np.isfinite(time.value)

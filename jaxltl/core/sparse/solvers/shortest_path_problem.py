@@ -15,7 +15,9 @@ from jaxltl.core.sparse.rows import (
     SCIPY_SIZE,
     concatenated_ranges,
     first_hits,
+    mask_of,
     offsets_from_counts,
+    positions,
     row_entries,
 )
 
@@ -147,8 +149,7 @@ def interior_rows(problem: ShortestPathProblem) -> InteriorRows:
     loops = inner & (target == state[of])
     if loops.any():
         rest = np.bincount(of[~loops], weight[~loops], row.size)
-        looping = np.zeros(row.size, bool)
-        looping[of[loops]] = True
+        looping = mask_of(of[loops], row.size)
         scale = np.where(looping & (rest > 0), rest, 1)
         known, leaving, weight = known / scale, leaving / scale, weight / scale[of]
         inner &= ~loops
@@ -161,8 +162,7 @@ def interior_rows(problem: ShortestPathProblem) -> InteriorRows:
     if not inner.all():
         target, weight, of = target[inner], weight[inner], of[inner]
     node = np.flatnonzero(interior)
-    number = np.zeros(interior.size, np.int32)
-    number[node] = np.arange(node.size)
+    number = positions(node, interior.size)
     return InteriorRows(
         row_start=offsets_from_counts(np.bincount(number[state], minlength=node.size)),
         entry_start=offsets_from_counts(np.bincount(of, minlength=row.size)),
