@@ -218,7 +218,7 @@ def test_parts_equal_the_whole():
 
     one = shard(model, mesh_of(4))
     other = model_from_parts(part, S, mesh_of(4), propositions=model.propositions)
-    for name in ("tables", "place", "available", "sent", "initial", "kind", "shown"):
+    for name in ("tables", "place", "available", "sent", "initial", "kind", "label_rows"):
         for x, y in zip(*(jax.tree.leaves(getattr(m, name)) for m in (one, other)), strict=True):
             np.testing.assert_array_equal(x, y, err_msg=name)
     assert one.rounds == other.rounds
