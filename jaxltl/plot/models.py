@@ -275,23 +275,20 @@ class _Arrow(NamedTuple):
 
 def _arrows_of(world: PyTree) -> Iterator[_Arrow]:
     """All transitions of a model, choice by choice."""
-    if hasattr(world, "row_start"):
-        rows, entries = np.asarray(world.row_start), np.asarray(world.entry_start)
-        for s in range(world.num_states):
-            for k, r in enumerate(range(rows[s], rows[s + 1])):
-                name = str(k) if rows[s + 1] - rows[s] > 1 else ""
-                if world.action is not None and world.action_names:
-                    name = world.action_names[int(world.action[r])]
-                for e in range(entries[r], entries[r + 1]):
-                    yield _Arrow(s, int(world.successor[e]), r, name, float(world.probability[e]))
-        return
-    dense = _is_dense(world)
-    weight = np.asarray(world.transition if dense else world.probability)
-    used = (weight > 0) & np.asarray(world.available)[..., None]
-    for s, a, k in np.argwhere(used).tolist():
-        target = k if dense else int(np.asarray(world.successor)[s, a, k])
-        name = str(a) if used[s].any(axis=-1).sum() > 1 else ""
-        yield _Arrow(s, target, a, name, float(weight[s, a, k]))
+    # Import here: other pictures do not need JAX.
+    from jaxltl.core.models import to_sparse
+
+    model = to_sparse(world)
+    host, is_sparse = model.host, model is world
+    number = np.arange(model.num_rows) if is_sparse else np.asarray(model.action)
+    names = [str(k) for k in (model.rank if is_sparse else number).tolist()]
+    if model.action is not None and model.action_names:
+        names = [model.action_names[a] for a in np.asarray(model.action).tolist()]
+    else:  # a single choice of a state has no name
+        several = np.diff(host.row_start)[host.state] > 1
+        names = [name if one else "" for name, one in zip(names, several, strict=True)]
+    for r, target, chance in zip(host.row, host.successor, host.probability, strict=True):
+        yield _Arrow(int(host.state[r]), int(target), int(number[r]), names[r], float(chance))
 
 
 def _graph(
