@@ -432,10 +432,18 @@ def _rewards(
         none = np.zeros(model.num_states)
         state = none if reward.state is None else np.asarray(reward.state, np.float64)
         header = [title.encode(), b"# State rewards\n"]
-        yield Written("srew", number, header, lambda: _state_rewards(state, storm))
+        yield Written(
+            "srew",
+            number,
+            header,
+            lambda: _nonzero(state, [state.size], lambda part: [part.tolist()], storm),
+        )
     if earned is not None:
         header = [title.encode(), b"# Transition rewards\n"]
-        yield Written("trew", number, header, lambda: _transition_rewards(model, earned, storm))
+        sizes = [model.num_states] if model.is_chain else [model.num_states, model.num_rows]
+        yield Written(
+            "trew", number, header, lambda: _nonzero(earned, sizes, _entry_columns(model), storm)
+        )
 
 
 def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None:
@@ -447,18 +455,6 @@ def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None
         return choice
     transition = np.asarray(reward.transition, np.float64)
     return transition if choice is None else choice + transition
-
-
-def _state_rewards(reward: Floats, storm: bool) -> Iterator[bytes]:
-    yield from _nonzero(reward, [reward.size], lambda part: [part.tolist()], storm)
-
-
-def _transition_rewards(
-    model: SparseMDP, earned: NDArray[np.float64], storm: bool
-) -> Iterator[bytes]:
-    host = model.host
-    sizes = [host.num_states] if host.is_chain else [host.num_states, host.num_rows]
-    yield from _nonzero(earned, sizes, _entry_columns(model), storm)
 
 
 def _nonzero(
