@@ -58,9 +58,17 @@ def implicit(
     # The result is differentiable, forward and reverse, in everything that `operator` closes over:
     # ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
     # iteration is unrolled; each derivative solves one linear system ``I - J``, or its transpose,
-    # by a Krylov method if none is given. It is traced only where a derivative is taken;
+    # by a Krylov method if none is given.
+    fixed_point, system = lax.stop_gradient((fixed_point, system))
+
+    if system is not None and not isinstance(system, ChainSystem):
+        # Only arguments with a derivative count, which is cheaper in lanes than the rule below.
+        result: jax.Array = lax.custom_root(
+            lambda v: v - operator(v), fixed_point, lambda _, start: start, partial(_solved, system)
+        )
+        return result
+    # A system that is expensive to trace is traced only where a derivative is taken;
     # ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
-    fixed_point = lax.stop_gradient(fixed_point)
     closed = jax.make_jaxpr(operator)(fixed_point)
 
     def image(constants: list[jax.Array], v: jax.Array) -> jax.Array:
@@ -77,16 +85,21 @@ def implicit(
         v = root(constants, system, v)
         _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))
         _, jacobian = jax.linearize(lambda x: image(constants, x), v)
-        return v, lax.custom_linear_solve(
-            lambda x: x - jacobian(x),
-            change,
-            solve=solve_linear if system is None else lambda _, b: system.solve(b),
-            transpose_solve=(
-                solve_linear if system is None else lambda _, b: system.transpose_solve(b)
-            ),
-        )
+        return v, _solved(system, lambda x: x - jacobian(x), change)
 
-    return root(closed.consts, lax.stop_gradient(system), fixed_point)
+    return root(closed.consts, system, fixed_point)
+
+
+def _solved(system: LinearSystem | None, matvec: Operator, b: jax.Array) -> jax.Array:
+    result: jax.Array = lax.custom_linear_solve(
+        matvec,
+        b,
+        solve=solve_linear if system is None else lambda _, b: system.solve(b),
+        transpose_solve=(
+            solve_linear if system is None else lambda _, b: system.transpose_solve(b)
+        ),
+    )
+    return result
 
 
 class ChainSystem(NamedTuple):
