@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.algos.common import learner
-from jaxltl.algos.common.play import check_reward, explicit_game
+from jaxltl.algos.common.explicit_games import check_reward, explicit_game
 from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
 from jaxltl.core import struct
 from jaxltl.core.models import MDP, sample_successor, with_allowed

@@ -51,7 +51,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, pac, splitmix
-from jaxltl.algos.common.play import cumulative, draw, draw_weighted, successor_slot, take
+from jaxltl.algos.common.explicit_games import cumulative, draw, draw_weighted, successor_slot, take
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_own, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, Numeric, PyTree
@@ -74,7 +74,7 @@ from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
-from jaxltl.core.values.interval.contest import greedy_distributions
+from jaxltl.core.values.interval.robust_policy_iteration import greedy_distributions
 
 
 @struct.dataclass

@@ -50,7 +50,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common import learner, loops, splitmix
-from jaxltl.algos.common.play import (
+from jaxltl.algos.common.explicit_games import (
     check_reward,
     cumulative,
     draw,

@@ -51,7 +51,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, pac, splitmix
-from jaxltl.algos.common.play import (
+from jaxltl.algos.common.explicit_games import (
     draw,
     draw_weighted,
     observed_reward,

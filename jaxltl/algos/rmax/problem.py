@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.algos.common.play import (
+from jaxltl.algos.common.explicit_games import (
     check_reward,
     cumulative,
     environment_policy,

@@ -32,9 +32,9 @@ from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import row_system
-from jaxltl.core.values.interval.contest import (
+from jaxltl.core.values.interval.robust_policy_iteration import (
     Bounds,
-    Contest,
+    RobustProblem,
     greedy_distributions,
     enclose,
     leaving,
@@ -277,16 +277,16 @@ def _solve(
     lower = prepared.lower if lower is None else lower
     upper = prepared.upper if upper is None else upper
     reward = prepared.reward if reward is None else reward
-    contest = _contest(prepared, lower, upper, reward)
+    problem = _robust_problem(prepared, lower, upper, reward)
     tolerance = jnp.asarray(tolerance, lower.dtype)
     if prepared.size:
-        bounds = sequential_vmap(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
+        bounds = sequential_vmap(enclose, problem, tolerance, jnp.asarray(max_steps, jnp.int32))
     else:
         none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
         bounds = Bounds(
-            none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0)
+            none, none, proven, proven, none, problem.first, problem.lower, jnp.int32(0)
         )
-    return _answer(prepared, contest, bounds, (lower, upper), tolerance, (finite, valid))
+    return _answer(prepared, problem, bounds, (lower, upper), tolerance, (finite, valid))
 
 
 def _checked(
@@ -329,7 +329,9 @@ def _checked(
     return finite, valid
 
 
-def _contest(prepared: PreparedInterval, lower: Array, upper: Array, reward: Array) -> Contest:
+def _robust_problem(
+    prepared: PreparedInterval, lower: Array, upper: Array, reward: Array
+) -> RobustProblem:
     """The residual problem with its intervals and rewards."""
     low, high = (jnp.append(x, 0)[prepared.table] for x in (lower, upper))
     is_reward = prepared.question == "reward"
@@ -337,7 +339,7 @@ def _contest(prepared: PreparedInterval, lower: Array, upper: Array, reward: Arr
     wanted = "min" if is_reward else "max"
     chain = prepared.choice.shape[1] == 1
     nature = prepared.nature_objective == wanted
-    return Contest(
+    return RobustProblem(
         prepared.target,
         prepared.owner,
         prepared.choice,
@@ -354,7 +356,7 @@ def _contest(prepared: PreparedInterval, lower: Array, upper: Array, reward: Arr
 
 def _answer(
     prepared: PreparedInterval,
-    contest: Contest,
+    problem: RobustProblem,
     bounds: Bounds,
     ends: tuple[jax.Array, jax.Array],
     tolerance: jax.Array,
@@ -362,7 +364,7 @@ def _answer(
 ) -> Solution:
     """The solution at the states."""
     (lower, upper), (finite, valid) = ends, checks
-    is_reward, dtype = contest.relative, contest.lower.dtype
+    is_reward, dtype = problem.relative, problem.lower.dtype
     middle = bounds.middle
     highest = jnp.inf if is_reward else 1.0
     sign = -1 if is_reward else 1
@@ -373,8 +375,8 @@ def _answer(
     low = jnp.where(sure[0], jnp.clip(low, 0, highest), 0)
     high = jnp.where(sure[1], jnp.clip(high, 0, highest), highest)
     middle = jnp.clip(sign * middle, low, high)
-    residual = jnp.max(jnp.abs(_image(contest, middle, sign) - middle), initial=0)
-    value = _attached(contest, bounds, middle, sign) if prepared.size else middle
+    residual = jnp.max(jnp.abs(_image(problem, middle, sign) - middle), initial=0)
+    value = _attached(problem, bounds, middle, sign) if prepared.size else middle
     scale = jnp.where(jnp.isfinite(high), high, 1) if is_reward else 1.0
     narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
     proven = bounds.lower_proven & bounds.upper_proven
@@ -411,25 +413,25 @@ def _answer(
     )
 
 
-def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
+def _image(problem: RobustProblem, x: jax.Array, sign: int) -> jax.Array:
     """The optimality operator applied to values."""
-    if not contest.size:
+    if not problem.size:
         return x
-    gain = contest.ahead(sign * x)
-    best = contest.best(jnp.sum(contest.greedy(gain) * gain, axis=1) + contest.cost)[0]
+    gain = problem.ahead(sign * x)
+    best = problem.best(jnp.sum(problem.greedy(gain) * gain, axis=1) + problem.cost)[0]
     return lax.stop_gradient(x + sign * best)
 
 
-def _attached(contest: Contest, bounds: Bounds, value: jax.Array, sign: int) -> jax.Array:
+def _attached(problem: RobustProblem, bounds: Bounds, value: jax.Array, sign: int) -> jax.Array:
     """Values with implicit derivatives, policy and order of successors held fixed."""
-    row, target = bounds.row, contest.target[bounds.row]
+    row, target = bounds.row, problem.target[bounds.row]
     value = lax.stop_gradient(value)
-    key = lax.stop_gradient(contest.ahead(sign * value))[row]
-    p = greedy_distributions(contest.lower[row], contest.upper[row], contest.key(key))
+    key = lax.stop_gradient(problem.ahead(sign * value))[row]
+    p = greedy_distributions(problem.lower[row], problem.upper[row], problem.key(key))
     ends = jnp.asarray([0, 1], value.dtype)
 
     def operator(x: jax.Array) -> jax.Array:
-        return sign * contest.cost[row] + jnp.sum(p * jnp.concatenate([x, ends])[target], axis=1)
+        return sign * problem.cost[row] + jnp.sum(p * jnp.concatenate([x, ends])[target], axis=1)
 
     mass, share = lax.stop_gradient(leaving(target, p))
     return implicit(operator, value, row_system(target, share, mass))

@@ -9,8 +9,8 @@ import pytest
 
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.types import Status
-from jaxltl.core.values.interval.contest import greedy_distributions
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
+from jaxltl.core.values.interval.robust_policy_iteration import greedy_distributions
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.prepared import prepare, solve_prepared
 from tests.reference_intervals import vertices

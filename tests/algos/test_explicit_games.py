@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.algos.common.play import cumulative, draw, draw_weighted
+from jaxltl.algos.common.explicit_games import cumulative, draw, draw_weighted
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 16, 17])

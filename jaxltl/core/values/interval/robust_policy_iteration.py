@@ -1,4 +1,4 @@
-"""Certified values of policy against nature, or with it, by policy iteration inside ``jit``.
+"""Robust policy iteration of interval models inside ``jit``, with certified bounds.
 
 Values carry a sign, such that one player, the leader, maximises them and must leave the open
 states: the maximiser of a probability, the minimiser of a reward until a target. Policy iteration
@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
-from jaxltl.core.models.protocols import Array
 from jax import lax
 from numpy.typing import DTypeLike
 
+from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.values.engine.linear import row_system
 
 _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
@@ -38,7 +38,7 @@ _EQUAL = 2.0**12  # roundings by which equal values may differ
 
 
 @struct.dataclass
-class Contest:
+class RobustProblem:
     """Optimality equations of interval rows between open states."""
 
     target: jax.Array  # int32[R, W], nodes; N is worth 0, N + 1 is worth 1
@@ -116,12 +116,14 @@ def rounding(width: Array, dtype: DTypeLike) -> Array:
 
 def greedy_distributions(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
     """Greedy distributions ``float[R, W]`` between the ends; differentiable, the order held fixed."""
-    remaining, free = _left(lower, upper, key)
+    remaining, free = _remaining_mass(lower, upper, key)
     remaining = jnp.where(remaining > rounding(key.shape[1], key.dtype), remaining, 0)
     return jnp.where(remaining >= free, upper, lower + jnp.maximum(remaining, 0))
 
 
-def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _remaining_mass(
+    lower: jax.Array, upper: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Mass that better entries leave to each entry, and its room."""
     width = key.shape[1]
     free = upper - lower
@@ -152,7 +154,7 @@ def leaving(target: jax.Array, probability: jax.Array) -> tuple[jax.Array, jax.A
 # --- policy iteration -----------------------------------------------------------------------------
 
 
-class _Play(NamedTuple):
+class _Iteration(NamedTuple):
     row: jax.Array
     probability: jax.Array
     base: jax.Array  # the solution without anything extra
@@ -165,15 +167,15 @@ class _Play(NamedTuple):
     proven: jax.Array
 
 
-def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
+def enclose(problem: RobustProblem, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
     """Certified lower and upper bounds."""
-    every = jnp.sum(contest.upper - contest.lower, axis=1, keepdims=True)
-    rest = jnp.maximum(1 - jnp.sum(contest.lower, axis=1, keepdims=True), 0)
+    every = jnp.sum(problem.upper - problem.lower, axis=1, keepdims=True)
+    rest = jnp.maximum(1 - jnp.sum(problem.lower, axis=1, keepdims=True), 0)
     share = jnp.where(every > 0, jnp.minimum(rest / jnp.where(every > 0, every, 1), 1), 0)
-    p = contest.lower + (contest.upper - contest.lower) * share
-    zero, no = jnp.zeros(contest.size, p.dtype), jnp.asarray(False)
-    start = _Play(
-        contest.first,
+    p = problem.lower + (problem.upper - problem.lower) * share
+    zero, no = jnp.zeros(problem.size, p.dtype), jnp.asarray(False)
+    start = _Iteration(
+        problem.first,
         p,
         zero,
         zero,
@@ -184,18 +186,18 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
         no,
         no,
     )
-    apart = jnp.arange(contest.size + 2)
-    lower = _played(contest, start, -1.0, apart, tolerance, max_rounds)
+    apart = jnp.arange(problem.size + 2)
+    lower = _policy_iteration(problem, start, -1.0, apart, tolerance, max_rounds)
     label = apart
-    if contest.has_free_cycles:
-        label = jnp.concatenate([_groups(lower.base, contest.eps)[0], apart[contest.size :]])
+    if problem.has_free_cycles:
+        label = jnp.concatenate([_groups(lower.base, problem.eps)[0], apart[problem.size :]])
     again = start._replace(row=lower.row, probability=lower.probability)
-    upper = _played(contest, again, 1.0, label, tolerance, max_rounds)
-    low, high = contest.ahead(lower.z), contest.ahead(upper.z)
-    p_low, p_high = contest.greedy(low), contest.greedy(high)
-    lows, highs = (jnp.sum(p * d, axis=1) + contest.cost for p, d in ((p_low, low), (p_high, high)))
+    upper = _policy_iteration(problem, again, 1.0, label, tolerance, max_rounds)
+    low, high = problem.ahead(lower.z), problem.ahead(upper.z)
+    p_low, p_high = problem.greedy(low), problem.greedy(high)
+    lows, highs = (jnp.sum(p * d, axis=1) + problem.cost for p, d in ((p_low, low), (p_high, high)))
     # The leader's choices attain the one bound, those of the opponent the other.
-    row = contest.best(lows if contest.policy_leads else highs)[1]
+    row = problem.best(lows if problem.policy_leads else highs)[1]
     middle = jnp.where(lower.proven & upper.proven, (lower.z + upper.z) / 2, lower.base)
     return Bounds(
         lower.z,
@@ -204,7 +206,7 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
         upper.proven,
         middle,
         row,
-        p_low if contest.nature_leads else p_high,
+        p_low if problem.nature_leads else p_high,
         lower.rounds + upper.rounds,
     )
 
@@ -221,118 +223,124 @@ def _groups(z: jax.Array, eps: float) -> tuple[jax.Array, jax.Array]:
     return label, largest[label]
 
 
-def _played(
-    contest: Contest,
-    start: _Play,
+def _policy_iteration(
+    problem: RobustProblem,
+    start: _Iteration,
     sign: float,
     label: jax.Array,
     tolerance: jax.Array,
     max_rounds: jax.Array,
-) -> _Play:
+) -> _Iteration:
     """Policy iteration until a lower or an upper bound is proven."""
-    out, size = contest.out, contest.size
-    earning = out & (label[contest.target] != label[contest.owner][:, None])
-    equal = contest.has_free_cycles and sign > 0
+    out, size = problem.out, problem.size
+    earning = out & (label[problem.target] != label[problem.owner][:, None])
+    equal = problem.has_free_cycles and sign > 0
 
-    def body(play: _Play) -> _Play:
-        target = contest.target[play.row]
-        p = jnp.where(out[play.row], play.probability[play.row], 0)
+    def body(iteration: _Iteration) -> _Iteration:
+        target = problem.target[iteration.row]
+        p = jnp.where(out[iteration.row], iteration.probability[iteration.row], 0)
         mass, share = leaving(target, p)
         known = jnp.where(target == size + 1, share, 0)
-        steps = jnp.sum(jnp.where(earning[play.row], share, 0), axis=1)
+        steps = jnp.sum(jnp.where(earning[iteration.row], share, 0), axis=1)
         solve = row_system(target, share).solve
-        base = solve(jnp.sum(known, axis=1) + contest.cost[play.row] / mass)
+        base = solve(jnp.sum(known, axis=1) + problem.cost[iteration.row] / mass)
         time = solve(steps)
         # The extra never grows here: otherwise choices that cycle to earn it would alternate with it.
-        aim = _extra(contest, base, time, tolerance)
-        least = jnp.where(jnp.isfinite(aim), jnp.minimum(play.extra, aim), play.extra)
-        extra = play.growth * least
+        aim = _extra(problem, base, time, tolerance)
+        least = jnp.where(jnp.isfinite(aim), jnp.minimum(iteration.extra, aim), iteration.extra)
+        extra = iteration.growth * least
         z = base + sign * extra * time
         if equal:
-            z = _groups(z, contest.eps)[1]
-        row, chance = _moved(contest, play, z, sign * extra * earning)
+            z = _groups(z, problem.eps)[1]
+        row, chance = _improved(problem, iteration, z, sign * extra * earning)
         # Simultaneous moves may end in a pair that never leaves the open states; alternating ones
         # do not.
         lost = ~(jnp.all(jnp.isfinite(z)) & jnp.all(time >= 0))
-        again = lost & play.hasty
+        again = lost & iteration.hasty
         row, chance = (
             jnp.where(again, x, y) for x, y in ((start.row, row), (start.probability, chance))
         )
         z = jnp.where(again, 0, z)
-        hasty = play.hasty & ~lost & (play.rounds < _HASTY)
-        still = jnp.all(row == play.row) & jnp.all(chance == play.probability)
-        proven = _proves(contest, z, sign) & ~lost
-        growth = jnp.where(still & ~proven, _GROWTH * play.growth, play.growth)
-        return _Play(row, chance, base, z, least, growth, play.rounds + 1, hasty, still, proven)
+        hasty = iteration.hasty & ~lost & (iteration.rounds < _HASTY)
+        still = jnp.all(row == iteration.row) & jnp.all(chance == iteration.probability)
+        proven = _proves(problem, z, sign) & ~lost
+        growth = jnp.where(still & ~proven, _GROWTH * iteration.growth, iteration.growth)
+        return _Iteration(
+            row, chance, base, z, least, growth, iteration.rounds + 1, hasty, still, proven
+        )
 
-    def goes_on(play: _Play) -> jax.Array:
-        alive = jnp.all(jnp.isfinite(play.z)) & (play.growth < _MOST_GROWTH)
-        done = play.proven & play.still
-        return ~done & alive & (play.rounds < jnp.minimum(max_rounds, _ROUNDS))
+    def goes_on(iteration: _Iteration) -> jax.Array:
+        alive = jnp.all(jnp.isfinite(iteration.z)) & (iteration.growth < _MOST_GROWTH)
+        done = iteration.proven & iteration.still
+        return ~done & alive & (iteration.rounds < jnp.minimum(max_rounds, _ROUNDS))
 
     return lax.while_loop(goes_on, body, start)
 
 
-def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array) -> jax.Array:
+def _extra(
+    problem: RobustProblem, base: jax.Array, time: jax.Array, tolerance: jax.Array
+) -> jax.Array:
     """Extra of a step: small relative to the tolerance, and more than rounding."""
     largest = jnp.max(jnp.abs(base))
     scale: jax.Array | float = 1.0
-    if contest.relative:
+    if problem.relative:
         scale = jnp.min(jnp.where(base != 0, jnp.abs(base), largest))
-    width = contest.target.shape[1]
-    finest = 64 * (width + 8) * contest.eps * jnp.maximum(largest, 0.0 if contest.relative else 1.0)
+    width = problem.target.shape[1]
+    finest = 64 * (width + 8) * problem.eps * jnp.maximum(largest, 0.0 if problem.relative else 1.0)
     tiny = 1e6 * float(jnp.finfo(base.dtype).tiny)
     aim = _AIM * tolerance * scale / jnp.maximum(jnp.max(time), 1)
     return jnp.maximum(jnp.maximum(aim, finest), tiny)
 
 
-def _moved(
-    contest: Contest, play: _Play, z: jax.Array, more: jax.Array
+def _improved(
+    problem: RobustProblem, iteration: _Iteration, z: jax.Array, more: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Improved rows and distributions."""
-    gain = contest.ahead(z) + more
-    greedy = contest.greedy(gain)
-    now = jnp.sum(play.probability * gain, axis=1) + contest.cost
-    then = jnp.sum(greedy * gain, axis=1) + contest.cost
-    slack = 4 * contest.eps * (jnp.abs(z) + rounding(contest.target.shape[1], z.dtype))
-    policy = 1.0 if contest.policy_leads else -1.0
-    nature = 1.0 if contest.nature_leads else -1.0
-    best, row = contest.best(then)
+    gain = problem.ahead(z) + more
+    greedy = problem.greedy(gain)
+    now = jnp.sum(iteration.probability * gain, axis=1) + problem.cost
+    then = jnp.sum(greedy * gain, axis=1) + problem.cost
+    slack = 4 * problem.eps * (jnp.abs(z) + rounding(problem.target.shape[1], z.dtype))
+    policy = 1.0 if problem.policy_leads else -1.0
+    nature = 1.0 if problem.nature_leads else -1.0
+    best, row = problem.best(then)
     switches = policy * best > slack
-    moved = jnp.where(switches, row, play.row)
-    better = nature * (then - now) > slack[contest.owner]
-    fresh = jnp.zeros(contest.owner.shape, bool).at[moved].max(switches)
-    chance = jnp.where((better | fresh)[:, None], greedy, play.probability)
-    if contest.policy_leads == contest.nature_leads:
+    moved = jnp.where(switches, row, iteration.row)
+    better = nature * (then - now) > slack[problem.owner]
+    fresh = jnp.zeros(problem.owner.shape, bool).at[moved].max(switches)
+    chance = jnp.where((better | fresh)[:, None], greedy, iteration.probability)
+    if problem.policy_leads == problem.nature_leads:
         return moved, chance
-    if contest.policy_leads:
-        answers = better[play.row]
-        only = play.row, jnp.where(better[:, None], greedy, play.probability)
+    if problem.policy_leads:
+        answers = better[iteration.row]
+        only = iteration.row, jnp.where(better[:, None], greedy, iteration.probability)
     else:
-        best, row = contest.best(now)
+        best, row = problem.best(now)
         answers = -best > slack
-        only = jnp.where(answers, row, play.row), play.probability
+        only = jnp.where(answers, row, iteration.row), iteration.probability
         # A leader that waited moves, and the policy answers its distributions.
-        moved = jnp.where(play.hasty, moved, play.row)
-        chance = jnp.where(play.hasty, chance, jnp.where(better[:, None], greedy, play.probability))
-    waits = ~play.hasty & jnp.any(answers)
+        moved = jnp.where(iteration.hasty, moved, iteration.row)
+        chance = jnp.where(
+            iteration.hasty, chance, jnp.where(better[:, None], greedy, iteration.probability)
+        )
+    waits = ~iteration.hasty & jnp.any(answers)
     return jnp.where(waits, only[0], moved), jnp.where(waits, only[1], chance)
 
 
-def _proves(contest: Contest, z: jax.Array, sign: float) -> jax.Array:
+def _proves(problem: RobustProblem, z: jax.Array, sign: float) -> jax.Array:
     """True if values are a bound: every node gains strictly, or none gains, rounding included."""
-    gain = contest.ahead(z)
-    p = contest.greedy(gain)
+    gain = problem.ahead(z)
+    p = problem.greedy(gain)
     size = jnp.abs(gain)
-    width, dtype = contest.target.shape[1], z.dtype
-    terms = (2 * width + 8) * contest.eps
+    width, dtype = problem.target.shape[1], z.dtype
+    terms = (2 * width + 8) * problem.eps
     # Mass is known up to rounding where it is not certain to be all or nothing.
-    remaining, free = _left(contest.lower, contest.upper, contest.key(gain))
+    remaining, free = _remaining_mass(problem.lower, problem.upper, problem.key(gain))
     miss = rounding(width, dtype)
     partly = (remaining > -miss) & (remaining < free + miss)
-    slack = terms * (jnp.sum(p * size, axis=1) + jnp.abs(contest.cost))
+    slack = terms * (jnp.sum(p * size, axis=1) + jnp.abs(problem.cost))
     slack = slack + miss * jnp.max(jnp.where(partly, size, 0), axis=1)
     slack = slack + (width + 2) * float(jnp.finfo(dtype).tiny) * (slack > 0)
-    image = jnp.sum(p * gain, axis=1) + contest.cost
-    best = contest.best(image + sign * slack)[0]
+    image = jnp.sum(p * gain, axis=1) + problem.cost
+    best = problem.best(image + sign * slack)[0]
     return jnp.all(best <= 0) if sign > 0 else jnp.all(best > 0)
