@@ -230,7 +230,10 @@ def require_output(
 def finite_features(
     name: str, table: ArrayLike, rows: tuple[int, ...], dtype: DTypeLike
 ) -> jax.Array:
-    """Validation of features ``float[*rows, F]``; ValueError for another shape, or NaN and infinity.
+    """Features `table` as ``float[*rows, F]`` in `dtype`; `name` is the argument in errors.
+
+    Raises:
+      ValueError: another shape than `rows` and one more axis, or entries that are not finite.
 
     >>> finite_features("features", np.ones((3, 2)), (3,), float).shape
     (3, 2)
