@@ -230,7 +230,7 @@ def require_output(
 def finite_features(
     name: str, table: ArrayLike, rows: tuple[int, ...], dtype: DTypeLike
 ) -> jax.Array:
-    """Features `table` as ``float[*rows, F]`` in `dtype`; `name` is the argument in errors.
+    """The features `table` as ``float[*rows, F]`` in `dtype`; `name` is the argument in errors.
 
     Raises:
       ValueError: another shape than `rows` and one more axis, or entries that are not finite.
