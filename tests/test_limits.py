@@ -14,13 +14,13 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 98_271,
-    "statements": 49_170,
-    "docstring lines": 16_823,
+    "lines": 97_893,
+    "statements": 48_669,
+    "docstring lines": 16_604,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,
-    "Any in annotations": 206,
-    "modules of the largest folder": 19,
+    "Any in annotations": 205,
+    "modules of the largest folder": 20,
     "names at the top level": 80,
 }
 MODULE_LINES, BODY_LINES = 600, 68

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,9 @@ from jaxltl.core.models.game import Game, is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.policies.policy_file import save_policy, write_policy_file
 from jaxltl.envs.text_map import parse_map
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 # --- results --------------------------------------------------------------------------------
@@ -302,7 +305,7 @@ def place_of(synthesis: Synthesis, cell: tuple[int, int] | None) -> int | None:
     return int(here[0])
 
 
-def _moves_picture(synthesis: Synthesis, environment: int | None) -> Any:
+def _moves_picture(synthesis: Synthesis, environment: int | None) -> Figure:
     from jaxltl import plot
 
     world, nodes = synthesis.world, synthesis.nodes

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypedDict, Unpack, cast
+from typing import TypedDict, Unpack, cast
 
 import chex
 import jax
@@ -366,7 +366,7 @@ def _actions(value: object) -> Bounds | Floats | None:
     return grid
 
 
-def _initial(value: Any, low: Floats, high: Floats) -> Region:
+def _initial(value: Region | Sequence[ArrayLike] | None, low: Floats, high: Floats) -> Region:
     """The boxes of initial states, intersected with the domain."""
     if value is None:
         return box(low, high)
