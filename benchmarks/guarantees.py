@@ -44,7 +44,7 @@ s . x x . a
 . . # x . b
 """
 _SLIP = 0.2
-_FIRST, _MOST = 2000, 1e8
+_FIRST, _LIMIT = 2000, 1e8
 
 
 class Runs:
@@ -194,7 +194,7 @@ def _followed(
 ) -> Runs:
     """Looks at ever more samples, until every seed has come to the last share."""
     moves, last = _FIRST, SHARES[-1]
-    while not all(runs.reached(i, last) for i in range(SEEDS)) and moves < _MOST:
+    while not all(runs.reached(i, last) for i in range(SEEDS)) and moves < _LIMIT:
         states = go_on(states, moves)
         for i in range(SEEDS):
             if not runs.reached(i, last):

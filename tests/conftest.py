@@ -112,7 +112,7 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-_MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+_MAPS, _MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _compiled = [0]
 
 
@@ -135,5 +135,5 @@ def few_compiled_programs():
     if _compiled[0] < 500 or not _MAPS.exists():
         return
     _compiled[0] = 0
-    if _MAPS.read_bytes().count(b"\n") > int(_MOST_MAPS.read_text()) - 13_000:
+    if _MAPS.read_bytes().count(b"\n") > int(_MAX_MAPS.read_text()) - 13_000:
         jax.clear_caches()

@@ -219,7 +219,7 @@ def _check_alternating(game: Game, reachable: NDArray[np.integer]) -> None:
             )
 
 
-MOST_VISITS = 2**30  # counted; a step adds at most as many again
+MAX_VISITS = 2**30  # counted; a step adds at most as many again
 _UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster
 
 
@@ -360,10 +360,10 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         flat,
         step=state.step + 1,
         q=q,
-        visits=jnp.minimum(flat.visits, MOST_VISITS).reshape(q.shape),
+        visits=jnp.minimum(flat.visits, MAX_VISITS).reshape(q.shape),
         value=updated,
         residual=jnp.max(jnp.abs(updated - state.value)),
-        violations=jnp.minimum(flat.violations, MOST_VISITS),
+        violations=jnp.minimum(flat.violations, MAX_VISITS),
     )
     return after, measure(after, problem, hparams)
 
@@ -571,9 +571,9 @@ def _answers(problem: Problem) -> jax.Array:
 def _check(problem: Problem, hparams: Hparams) -> None:
     """Raises ValueError for static settings that are out of range or do not fit the game."""
     chains, moves = hparams.num_chains, hparams.moves_per_step
-    if chains * moves > MOST_VISITS:
+    if chains * moves > MAX_VISITS:
         raise ValueError(
-            f"num_chains={chains} times moves_per_step={moves} is more than {MOST_VISITS} moves; "
+            f"num_chains={chains} times moves_per_step={moves} is more than {MAX_VISITS} moves; "
             "make them in several steps."
         )
     if hparams.step_size is None and problem.game.num_successors > 1:

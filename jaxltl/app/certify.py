@@ -40,7 +40,7 @@ from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.io.templates import render
 
-SHOWN = 5  # choices for which more samples are recommended
+NUM_RECOMMENDED = 5  # choices for which more samples are recommended
 POINTS = 13  # of a curve
 PICTURES = (".svg", ".png", ".pdf")
 
@@ -211,7 +211,7 @@ def sample_next(evidence: Evidence, guarantee: DataGuarantee) -> list[Record]:
             "gain": float(guarantee.gain[r]),
             "samples": int(guarantee.sets.num_samples[r]),
         }
-        for r in np.argsort(-guarantee.gain, kind="stable")[:SHOWN].tolist()
+        for r in np.argsort(-guarantee.gain, kind="stable")[:NUM_RECOMMENDED].tolist()
         if guarantee.gain[r] > 1e-12
     ]
 

@@ -27,7 +27,7 @@ from jaxltl.core.values.undiscounted.mixture import (
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions, OptimalActions
 from jaxltl.core.values.undiscounted.reachability import rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction_steps import (
-    meeting,
+    constrained_policy,
     Quickest,
     StepAnalysis,
     steps_front,
@@ -367,7 +367,7 @@ def _anchor(
     )
     if isinstance(requested, str) or over != "mean" or not model.automaton.is_cosafe:
         raise ValueError(f"{text}; ask for at least so many.")
-    front_point = meeting(model, requested, steps, quickest)
+    front_point = constrained_policy(model, requested, steps, quickest)
     if front_point.policy is None:
         raise ValueError(
             f"{text}, and in {steps:g} steps no policy has more than {max(front_point.upper, 0):.6g}; ask "

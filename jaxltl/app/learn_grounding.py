@@ -41,7 +41,7 @@ from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 
 DOUBLE, FILE = True, GroundingFile
-_MOST = 8  # groundings of a robust policy
+_LIMIT = 8  # groundings of a robust policy
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
         members,
         grounding.grounding_table(problem, hparams, posterior),
         grounding.best_query(posterior),
-        [_answer(setup, posterior, members[:_MOST], w) for w in range(len(setup.worlds))],
+        [_answer(setup, posterior, members[:_LIMIT], w) for w in range(len(setup.worlds))],
     )
 
 
@@ -247,7 +247,7 @@ def summary(outcome: Outcome) -> Record:
     """The results for ``result.json``."""
     setup, posterior, query = outcome.setup, outcome.posterior, outcome.query
     task, problem, members = setup.task, setup.problem, outcome.members
-    level, first = task.grounding.level, members[:_MOST].tolist()
+    level, first = task.grounding.level, members[:_LIMIT].tolist()
     result = {
         **about(task),
         "demonstrations": {

@@ -26,7 +26,7 @@ from jaxltl.core.values.properties.solve_on_mesh import (
     first_bounds,
     question_on_mesh,
 )
-from jaxltl.core.values.properties.solve_property import FINER, Answer
+from jaxltl.core.values.properties.solve_property import TOLERANCE_SHARES, Answer
 from jaxltl.io.umb.sharded import read_sharded
 from jaxltl.app.wording import Record
 
@@ -142,7 +142,7 @@ class MeshSolver:
         chunk = steps_between(model)
         while True:
             solution = question.advance(
-                bounds, question.tolerance(self.tolerance, FINER[part]), chunk
+                bounds, question.tolerance(self.tolerance, TOLERANCE_SHARES[part]), chunk
             )
             bounds, steps = (solution.lower, solution.upper), int(np.asarray(solution.num_steps))
             num_steps += steps
@@ -151,7 +151,7 @@ class MeshSolver:
                     files.save(path, _state(model, bounds, part, num_steps), mark)
                 continue
             answer = question.answer(solution, self.tolerance)
-            if question.is_answered(answer, FINER[part]):
+            if question.is_answered(answer, TOLERANCE_SHARES[part]):
                 break
             part += 1
         if path is not None and group.is_first:

@@ -1,4 +1,4 @@
-"""Setup and results of a todirl job: worlds, learned networks, evaluations, and their summary."""
+"""Results of a deep inverse RL job: learned rewards, evaluations, and their JSON summary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Types of results, and the wording of counts and of positions of states."""
+"""Result types of jobs: JSON records of bounds and state positions, and their text."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 _STAY = ACTIONS.index("stay")
 
 
-_MOST = 181  # cells a side, so that 32 bits number the states
+_LIMIT = 181  # cells a side, so that 32 bits number the states
 
 
 def robots(size: int) -> Game:
@@ -48,9 +48,9 @@ def robots(size: int) -> Game:
     >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
     ['diagonal', 'system_turn', 'system_lower_left']
     """
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 2 <= size <= _MOST:
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 2 <= size <= _LIMIT:
         raise ValueError(
-            f"size={size!r}; give the cells along a side, an integer from 2 to {_MOST}."
+            f"size={size!r}; give the cells along a side, an integer from 2 to {_LIMIT}."
         )
     size = int(size)
     world = gridworld("\n".join(["." * size] * size))

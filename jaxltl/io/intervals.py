@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxltl.core.models.interval import NEAR
+from jaxltl.core.models.interval import ROW_SUM_TOLERANCE
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.io.tokens import Block, Text, as_double, edges
 
@@ -73,7 +73,9 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     numbers = Block(block.text, data, *edges(data), first, line)
     lower = numbers.floats(first[:-1], EXPECTED)
     upper = numbers.floats(first[1:] - 1, EXPECTED) if is_pair.any() else lower
-    block.require((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR), token, EXPECTED)
+    block.require(
+        (lower >= 0) & (lower <= upper) & (upper <= 1 + ROW_SUM_TOLERANCE), token, EXPECTED
+    )
     return lower, upper
 
 
@@ -102,7 +104,7 @@ def _point(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes:
 def first_invalid_sum(total: Floats) -> tuple[int, str, str] | None:
     """First choice with an infeasible sum ``[R]`` or ``[R, 2]``, subject and problem; or None."""
     ends = total.reshape(len(total), -1)
-    above, below = ends[:, 0] > 1 + NEAR, ends[:, -1] < 1 - NEAR
+    above, below = ends[:, 0] > 1 + ROW_SUM_TOLERANCE, ends[:, -1] < 1 - ROW_SUM_TOLERANCE
     if not (above | below).any():
         return None
     row = int((above | below).argmax())

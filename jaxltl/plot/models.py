@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from jaxltl.core.models.protocols import PyTree
     from jaxltl.core.types import Solution
 
-MOST_CELLS, MOST_STATES, MOST_ARROWS = 900, 16, 40  # up to which something is drawn
-_MOST_PANELS = 9
+MAX_CELLS, MAX_STATES, MAX_ARROWS = 900, 16, 40  # up to which something is drawn
+_MAX_PANELS = 9
 _WALL = "#"
 
 
@@ -108,7 +108,7 @@ def solution(
     chosen, titles = [0], [""]
     if is_product:
         several = [q for q in range(panels.shape[1]) if np.ptp(panels[inside, q]) > 0] or [0]
-        chosen = several[:_MOST_PANELS] if memories is None else [int(q) for q in memories]
+        chosen = several[:_MAX_PANELS] if memories is None else [int(q) for q in memories]
         if not chosen or not all(0 <= q < panels.shape[1] for q in chosen):
             raise ValueError(f"memories={memories}; give some of 0 to {panels.shape[1] - 1}.")
         names = model.automaton.state_names or ("",) * panels.shape[1]
@@ -171,7 +171,7 @@ def map_of(world: PyTree) -> NDArray[np.str_] | None:
     if hasattr(world, "row_start") or not (hasattr(world, "successor") or _is_dense(world)):
         return None
     if world.available.ndim != 2 or not (
-        world.num_actions == len(STEPS) and 1 < world.num_states <= MOST_CELLS
+        world.num_actions == len(STEPS) and 1 < world.num_states <= MAX_CELLS
     ):
         return None
     state = np.arange(world.num_states)
@@ -228,7 +228,7 @@ def board_of_robots(game: PyTree) -> Board | None:
         and world.available.shape[1:] == (5,)
         and (world.propositions[:3] == ("collision", "diagonal", "system_turn"))
     )
-    if not known or 2 * count**2 != world.num_states or count > MOST_CELLS:
+    if not known or 2 * count**2 != world.num_states or count > MAX_CELLS:
         return None
     own = 2 * np.arange(count) + 1  # the environment in its first place, the system to move
     target = np.where(np.asarray(world.available)[own], _likeliest(world)[own] // 2, -1)
@@ -298,10 +298,10 @@ def _graph(
     policy: NDArray[np.int64] | None = None,
 ) -> Figure:
     count = world.num_states
-    if count > MOST_STATES:
+    if count > MAX_STATES:
         raise ValueError(
             f"model: it has {count} states and its moves lie on no map; graphs have up to "
-            f"{MOST_STATES} states."
+            f"{MAX_STATES} states."
         )
     arrows = list(_arrows_of(world))
     rows: dict[drawing.Key, drawing.Rows] = {}
@@ -311,8 +311,8 @@ def _graph(
         text = text or ("⊤" if x.source == x.target else "1")  # layout omits "⊤"
         key = (x.source, x.target, 0)
         rows[key] = (*rows.get(key, ()), ("", text))
-    if len(rows) > MOST_ARROWS:
-        raise ValueError(f"model: it has {len(rows)} arrows; graphs have up to {MOST_ARROWS}.")
+    if len(rows) > MAX_ARROWS:
+        raise ValueError(f"model: it has {len(rows)} arrows; graphs have up to {MAX_ARROWS}.")
     delta = np.repeat(np.arange(count)[:, None], max(1, len(arrows)), axis=1)
     for i, x in enumerate(arrows):
         delta[x.source, i] = x.target

@@ -1,4 +1,4 @@
-"""Section 4.5: the constrained cross-entropy method compared with TRPO and CPO."""
+"""Experiment of Wen (2019), section 4.5: constrained cross-entropy on LQR and robot navigation."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Plan:
 def measure(
     progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
 ) -> Record:
-    """Record 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
+    """Figures 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
     plan = plan or Plan()
     optimum = lqr.optimum(lqr.lqr())
     regulators = []
@@ -388,7 +388,7 @@ def table(result: Record) -> str:
 
 
 def pictures(result: Record) -> Record:
-    """Record 8, 10 and 11, and trajectories of the returned policies of the first seed."""
+    """Figures 8, 10 and 11, and trajectories of the returned policies of the first seed."""
     from jaxltl import plot
 
     best = result["figure8"]["optimum"]

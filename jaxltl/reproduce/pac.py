@@ -245,7 +245,7 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Rec
 
 
 def pictures(result: Record) -> Record:
-    """Record 17 to 19: the task, the values, and the strategies of the first seed."""
+    """Figures 17 to 19: the task, the values, and the strategies of the first seed."""
     from jaxltl import plot
 
     task = surveillance()

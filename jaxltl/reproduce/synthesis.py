@@ -200,7 +200,7 @@ def table(result: Record) -> str:
 
 
 def pictures(result: Record) -> Record:
-    """Record 13 and 14: values of the system's states, and the convergence of learning."""
+    """Figures 13 and 14: values of the system's states, and the convergence of learning."""
     from jaxltl import plot
 
     first, second = result["figure13"], result["figure14"]

@@ -46,7 +46,7 @@ class Plan:
 def measure(
     progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
 ) -> Record:
-    """Record 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
+    """Figures 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
     plan, num_seeds = plan or Plan(), seeds or 10
     setting = _setting(num_seeds, plan)
     rows, drawn = [], []
@@ -320,7 +320,7 @@ def _orders(rows: list[Record]) -> list[str]:
 
 
 def pictures(result: Record) -> Record:
-    """Record 6 and 7, and trajectories of learned policies."""
+    """Figures 6 and 7, and trajectories of learned policies."""
     from jaxltl import plot
 
     columns = {"train": "training world", "test": "test worlds"}

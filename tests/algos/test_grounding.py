@@ -227,7 +227,7 @@ def test_symmetric_symbols_are_counted_once():
 def test_beam_search_finds_what_enumeration_finds(monkeypatch):
     problem, hparams = small_problem(count=8, length=10), grounding.Hparams()
     whole = grounding.posterior(problem, hparams)
-    monkeypatch.setattr("jaxltl.algos.grounding.hypotheses._MOST", 10)
+    monkeypatch.setattr("jaxltl.algos.grounding.hypotheses._LIMIT", 10)
     found = grounding.posterior(problem, hparams)
     assert whole.complete and not found.complete
     assert found.assignment[0].tolist() == whole.assignment[0].tolist()

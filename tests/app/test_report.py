@@ -224,7 +224,7 @@ def test_a_model_without_a_map_and_a_marked_step():
 
 
 def test_what_is_too_large_is_said_and_shown_as_a_picture(monkeypatch):
-    monkeypatch.setattr(exploring, "MOST_CELLS", 30)
+    monkeypatch.setattr(exploring, "MAX_CELLS", 30)
     part = made()
     assert part.too_large and not part.drawings
     text = page(part)

@@ -370,7 +370,7 @@ def test_a_picture_for_each_memory_of_a_strategy(tmp_path):
 
 def test_large_maps_show_some_places(monkeypatch, tmp_path):
     (tmp_path / "game.toml").write_text(CORRIDOR)
-    monkeypatch.setattr(report, "MOST_MAPS", 2)
+    monkeypatch.setattr(report, "MAX_MAPS", 2)
     shown = []
     real = plot.game_region
     monkeypatch.setattr(

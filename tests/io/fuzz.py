@@ -41,8 +41,8 @@ from tests.io.test_pgsolver import EXAMPLE
 from tests.io.test_program import PROGRAMS
 from tests.io.test_reward_machine import OFFICE
 
-MOST_SECONDS = 5.0  # of processor time, for one small file
-MOST_MEMORY = 2**30  # bytes that trying them may add
+MAX_SECONDS = 5.0  # of processor time, for one small file
+MAX_MEMORY = 2**30  # bytes that trying them may add
 
 Damage = Callable[[np.random.Generator, bytes], bytes]
 
@@ -87,8 +87,8 @@ def try_damaged(name: str, count: int, seed: int, folder: Path) -> int:
             ours = type(error) is ValueError and str(path) in str(error)
             assert ours, f"{name}, seed {seed}, file {i} in {path}: {error!r}"
         spent = time.process_time() - start
-        assert spent < MOST_SECONDS, f"{name}, seed {seed}, file {i} in {path}: {spent:.1f} s"
-    assert _memory() - before < MOST_MEMORY, f"{name}, seed {seed}"
+        assert spent < MAX_SECONDS, f"{name}, seed {seed}, file {i} in {path}: {spent:.1f} s"
+    assert _memory() - before < MAX_MEMORY, f"{name}, seed {seed}"
     return valid
 
 

@@ -246,7 +246,7 @@ def test_long_texts_are_objects(tmp_path, monkeypatch):
     )
     write_umb(tmp_path / "m.umb", model)
     for most, kind in ((2**30, "U"), (100, "O")):
-        monkeypatch.setattr(_umb_values, "_MOST_TEXT", most)
+        monkeypatch.setattr(_umb_values, "_MAX_TEXT", most)
         found = read_umb(tmp_path / "m.umb").valuation["t"]
         assert found.dtype.kind == kind and found.tolist() == model.valuation["t"].tolist()
 

@@ -1,4 +1,4 @@
-"""Interface of learners: the protocol, its loops, and the random keys of steps.
+"""Learner protocol: binds init and step to the training loops; random keys, early stopping.
 
 A learner is a module with the members of :class:`Learner`. It writes two pure functions, ``_init``
 and ``_step``; :func:`bind` checks hyperparameters and adds the loops::

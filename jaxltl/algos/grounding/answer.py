@@ -56,7 +56,7 @@ from jaxltl.core.values.multi_objective.front_search import FrontSearch
 from jaxltl.core.values.multi_objective.front_search import Front
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
-MOST_MEMBERS = 8  # objectives at once, see Objective
+MAX_MEMBERS = 8  # objectives at once, see Objective
 _STEPS = 3  # decisive steps in the table
 
 
@@ -215,9 +215,9 @@ def robust_policy(
     Raises:
       ValueError: no grounding, or more than 8.
     """
-    if not 1 <= len(labels) <= MOST_MEMBERS:
+    if not 1 <= len(labels) <= MAX_MEMBERS:
         raise ValueError(
-            f"there are {len(labels)} groundings; a robust policy takes 1 to {MOST_MEMBERS}. "
+            f"there are {len(labels)} groundings; a robust policy takes 1 to {MAX_MEMBERS}. "
             "Lower the level of the credible set, or answer the query."
         )
     automaton, objectives = as_automaton(task), []

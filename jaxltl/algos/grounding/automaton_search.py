@@ -1,4 +1,4 @@
-"""Automata learned from demonstrations: local search over transitions with exact likelihoods.
+"""Automata learned by inverse RL: local search that maximises the likelihood of demonstrations.
 
 What is visible in each state is known, and so are the letters; the task is not, except its number of
 memory states. A candidate is a table ``delta`` and a set of events, transitions that are rewarded; its
@@ -41,7 +41,7 @@ from jaxltl.core.validation import require_in_range
 
 SCALES = (10.0, 25.0, 50.0, 100.0)
 _PENALTY = 2.0  # nats for each moving transition and each event: suppresses chance improvements
-_MOST_STEPS = 60
+_MAX_STEPS = 60
 _SEQUENCES = 500  # starts of each kind that are scored, drawn if there are more
 
 
@@ -153,7 +153,7 @@ def _climb(
 ) -> tuple[float, np.ndarray, np.ndarray, float]:
     """Steepest ascent over changes of one transition: score, table, events and scale."""
     score, best, scale = -np.inf, (moves, event), SCALES[0]
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         neighbours = _neighbours(*best)
         tables = np.stack([n[0] for n in neighbours]), np.stack([n[1] for n in neighbours])
         scores = _scores(problem, discount, *tables)

@@ -41,7 +41,7 @@ from jaxltl.core.models.product import Product
 
 Score = Callable[[np.ndarray], np.ndarray]
 SCALES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
-_MOST = 20_000  # hypotheses that are enumerated; beyond, a beam search
+_LIMIT = 20_000  # hypotheses that are enumerated; beyond, a beam search
 _BATCH = 64  # hypotheses in one program: bounds its memory
 _BEAM = 8
 _UNEXPLAINED = np.log(1e4)  # decisive evidence (Jeffreys) for random actions
@@ -113,7 +113,7 @@ def posterior(
     symmetries = symbol_symmetries(automaton_of(problem))
     score = partial(_scores, problem, hparams.discount, meaning, np.asarray(scales, float))
     count = len(meaning) ** len(problem.symbols)
-    if count <= _MOST:
+    if count <= _LIMIT:
         every = itertools.product(range(len(meaning)), repeat=len(problem.symbols))
         rows = sorted({_canonical(row, symmetries) for row in every})
         table = score(np.asarray(rows, np.int32))
@@ -129,7 +129,7 @@ def posterior(
             meaning=meaning,
             symbols=problem.symbols,
             names=titles,
-            complete=count <= _MOST,
+            complete=count <= _LIMIT,
         )
     )
     _require_explained(problem, hparams, result, table)

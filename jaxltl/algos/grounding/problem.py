@@ -1,4 +1,4 @@
-"""Problems and settings of symbol grounding from demonstrations."""
+"""Symbol grounding problems: data, settings, and the likelihood of demonstrations."""
 
 from __future__ import annotations
 

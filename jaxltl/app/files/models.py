@@ -17,7 +17,7 @@ from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
 from jaxltl.io.pgsolver import objective_of
 
-_MOST_NAMES = 100  # each is a column of the padded model
+_MAX_NAMES = 100  # each is a column of the padded model
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
         used = np.unique(action)
         pairs = np.unique(state.astype(np.int64) * len(names) + action)
         listed = tuple(names[a] for a in used)
-        if pairs.size == action.size and len(set(listed)) == used.size <= _MOST_NAMES:
+        if pairs.size == action.size and len(set(listed)) == used.size <= _MAX_NAMES:
             column = np.searchsorted(used, action).astype(np.int32)
             return to_padded(replace(model, action=column, action_names=())), listed, column
         model = replace(model, action=None)

@@ -18,9 +18,9 @@ from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, Trajectories
 from jaxltl.envs.text_map import plain_kind
 
-MOST_CELLS = 20_000  # of all maps of a world together; a page of more takes seconds to load
-MOST_STATES = 40  # of an automaton that is drawn
-MOST_RUNS = 5  # of each kind
+MAX_CELLS = 20_000  # of all maps of a world together; a page of more takes seconds to load
+MAX_STATES = 40  # of an automaton that is drawn
+MAX_RUNS = 5  # of each kind
 LONGEST_RUN = 200  # steps of a trajectory of the learned policy
 
 START = "start"  # key of the layer of initial states
@@ -75,12 +75,12 @@ class Explorer:
     def too_large(self) -> str:
         """The remark in place of an explorer that is too large for a page, or no text."""
         count = 0 if self.automaton is None else len(self.automaton.delta)
-        if self.size * len(self.layers) <= MOST_CELLS and count <= MOST_STATES:
+        if self.size * len(self.layers) <= MAX_CELLS and count <= MAX_STATES:
             return ""
         return (
             f"{self.size} states by {len(self.layers)} maps and an automaton of {count} states are "
-            f"too large for interactive maps (at most {MOST_CELLS} states over all maps, and "
-            f"{MOST_STATES} automaton states); pictures replace them, and the files in this "
+            f"too large for interactive maps (at most {MAX_CELLS} states over all maps, and "
+            f"{MAX_STATES} automaton states); pictures replace them, and the files in this "
             "directory have the figures."
         )
 
@@ -170,7 +170,7 @@ def demonstrated_runs(model: Product, demonstrations: Trajectories) -> list[Run]
     world, runs = _Dynamics(model), []
     states, actions = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
     lengths = np.asarray(demonstrations.length)
-    for number in np.flatnonzero(lengths > 0)[:MOST_RUNS].tolist():
+    for number in np.flatnonzero(lengths > 0)[:MAX_RUNS].tolist():
         length = int(lengths[number])
         at, did = states[number, :length].tolist(), actions[number, :length].tolist()
         reached, _ = world.reached(at[-1], did[-1])

@@ -1,4 +1,4 @@
-"""Expected steps in reports: certified numbers, their trade-offs, and a picture of these."""
+"""Expected steps to satisfaction in reports: certified bounds, Pareto front, and picture."""
 
 from __future__ import annotations
 

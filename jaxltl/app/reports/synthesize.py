@@ -254,8 +254,8 @@ FILES = (
     "moves.svg",
     "report.html",
 )
-MOST_MAPS = 36  # of the environment's places
-MOST_PANELS = 6  # of a strategy's memory
+MAX_MAPS = 36  # of the environment's places
+MAX_PANELS = 6  # of a strategy's memory
 
 
 def pictures(synthesis: Synthesis, environment: int | None = None) -> list[tuple[Picture, bytes]]:
@@ -272,7 +272,7 @@ def pictures(synthesis: Synthesis, environment: int | None = None) -> list[tuple
     if world.text is not None and world.places is not None:
         count = len(world.places)
         few = None
-        if count > MOST_MAPS:  # those with the most losing cells, in order
+        if count > MAX_MAPS:  # those with the most losing cells, in order
             lost = ~synthesis.wins.reshape(count, count, 2)[:, :, 1]
             few = sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
         caption = "A map for each place of the environment's robot."
@@ -323,7 +323,7 @@ def _moves_picture(synthesis: Synthesis, environment: int | None) -> Figure:
     pairs, size = np.unique(
         np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True
     )
-    panels = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
+    panels = np.sort(np.argsort(-size, kind="stable")[:MAX_PANELS])
     size_a = world.game.num_actions
     mask = np.asarray(strategy.allowed).reshape(
         nodes.game.num_states, -1, strategy.allowed.shape[-1]

@@ -22,7 +22,7 @@ from jaxltl.core.logic.labels import require_known
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.components import strong_components
 
-_MOST_PATHS = 20_000  # looked at from each state
+_MAX_PATHS = 20_000  # looked at from each state
 
 
 @brief
@@ -214,7 +214,7 @@ def _paths(
 ) -> Iterator[tuple[_Path, _Path]]:
     """Stems, and cycles with an even least priority that follow them, shortest first."""
     queue: deque[_Path] = deque([()])
-    for _ in range(_MOST_PATHS):
+    for _ in range(_MAX_PATHS):
         if not queue:
             return
         path = queue.popleft()

@@ -1,4 +1,4 @@
-"""Independent verification of winning regions and strategies, by end components on the host.
+"""Independent verification of almost-sure winning regions and strategies of stochastic games.
 
 With the strategy of one player fixed, the game is a decision process of the other player, and its
 end components decide it. No nested fixed point is computed, so that the check is independent of the
@@ -162,7 +162,7 @@ def _refute_system(claim: _Claim) -> str:
     missing = _unavailable(claim, claim.action, undecided & claim.system)
     if missing:
         return f"the system's strategy has no valid action: {missing}"
-    play = _fix(claim, claim.system, claim.action, claim.guarantees)
+    play = _induced_mdp(claim, claim.system, claim.action, claim.guarantees)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
     edge = np.flatnonzero(node_in[play.source] & ~np.repeat(claim.region, memories)[play.target])
@@ -187,7 +187,7 @@ def _refute_environment(claim: _Claim) -> str:
     missing = _unavailable(claim, claim.counter_action, undecided & ~claim.system)
     if missing:
         return f"the environment's strategy has no valid action: {missing}"
-    play = _fix(claim, ~claim.system, claim.counter_action, claim.assumptions)
+    play = _induced_mdp(claim, ~claim.system, claim.counter_action, claim.assumptions)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
     for avoid, meet, reason in _successes(claim):
@@ -237,7 +237,7 @@ def _name(claim: _Claim, state: int) -> str:
     return str(where[0]) if len(where) == 1 else str(where)
 
 
-def _where(claim: _Claim, play: _Play, node: int) -> str:
+def _where(claim: _Claim, play: _InducedMDP, node: int) -> str:
     state, memory = divmod(int(node), play.memories)
     extra = f" with memory {memory}" if play.memories > 1 else ""
     return f"state {_name(claim, state)}{extra}"
@@ -263,7 +263,7 @@ def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
 # --- one player against chance ----------------------------------------------------------------
 
 
-class _Play(NamedTuple):
+class _InducedMDP(NamedTuple):
     """The graph of the free player: edges from nodes ``state * memories + memory`` by numbered pairs."""
 
     source: Integers
@@ -276,7 +276,7 @@ class _Play(NamedTuple):
     memories: int
 
 
-def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _Play:
+def _induced_mdp(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _InducedMDP:
     """The game with one player's actions fixed; the memory advances past a goal that is met."""
     moves = claim.moves
     memories = len(goals)
@@ -292,7 +292,7 @@ def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _
     order = np.argsort(target, kind="stable")
     start = np.searchsorted(target[order], np.arange(nodes + 1))
     of_pair = (moves.state[:, None] * memories + memory).ravel()
-    return _Play(source, pair, target, pair[order], start, of_pair, nodes, memories)
+    return _InducedMDP(source, pair, target, pair[order], start, of_pair, nodes, memories)
 
 
 def _moves(game: Game) -> _Moves:
@@ -303,7 +303,7 @@ def _moves(game: Game) -> _Moves:
     return _Moves(*(x.astype(int) for x in (host.state, action, host.row, host.successor)))
 
 
-def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
+def _component(play: _InducedMDP, inside: Booleans, meet: Booleans) -> int | None:
     """A node of an end component that meets every set of states, or None."""
     if not inside.any():
         return None
@@ -314,7 +314,7 @@ def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
     return int(np.flatnonzero(label == labels[0])[0]) if labels.size else None
 
 
-def _end_components(play: _Play, inside: Booleans) -> Integers:
+def _end_components(play: _InducedMDP, inside: Booleans) -> Integers:
     """The smallest node of each node's maximal end component among some; -1 without one."""
     alive = _staying(play, inside, inside)
     while True:
@@ -330,7 +330,7 @@ def _end_components(play: _Play, inside: Booleans) -> Integers:
         alive[play.pair[edge][leaving]] = False
 
 
-def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
+def _almost_surely(play: _InducedMDP, goal: Booleans, inside: Booleans) -> Booleans:
     """Nodes from which choices reach the goal with probability one, through inside nodes."""
     while True:
         alive = _staying(play, inside, inside | goal)
@@ -342,7 +342,7 @@ def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
         inside = smaller
 
 
-def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
+def _staying(play: _InducedMDP, sources: Booleans, targets: Booleans) -> Booleans:
     """Pairs of some nodes that surely lead to some nodes, ``bool[pairs]``."""
     alive = np.zeros(play.owner.size, bool)
     alive[play.pair] = True
@@ -350,7 +350,7 @@ def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
     return alive
 
 
-def _trim(play: _Play, alive: Booleans, inside: Booleans) -> None:
+def _trim(play: _InducedMDP, alive: Booleans, inside: Booleans) -> None:
     """Removes pairs that lead to inside nodes without pairs, until none is left, in place."""
     remaining = np.bincount(play.owner[alive], minlength=play.nodes)
     stuck = np.flatnonzero(inside & (remaining == 0)).tolist()

@@ -1,4 +1,4 @@
-"""Interval MDPs: uncertainty sets of intervals and L1 balls."""
+"""Interval MDPs: construction and validation of intervals and L1 balls around rows."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, uncertaint
 from jaxltl.core.sparse.linear.extended_precision import two_sum
 from jaxltl.core.sparse.rows import offsets_from_counts
 
-NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
+ROW_SUM_TOLERANCE = 1e-6  # how far a row may miss a distribution and still be scaled to one
 _ENDS = ("lower", "upper", "center", "radius")
 _PREFIX = "\0"  # of the names of rewards that are ends, centers or radii
 
@@ -125,7 +125,9 @@ class IntervalMDP:
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but merges none."""
         ends = {name: getattr(self, name) for name in _ENDS}
-        return _arrived(change(replace(self.nominal, rewards=self.rewards | _travelling(**ends))))
+        return _rewards_to_bounds(
+            change(replace(self.nominal, rewards=self.rewards | _bounds_to_rewards(**ends)))
+        )
 
 
 def require_interval(model: Model) -> IntervalMDP:
@@ -149,7 +151,7 @@ def refuse_ball(model: IntervalMDP, why: str) -> None:
         )
 
 
-def _travelling(**ends: Array) -> dict[str, Rewards]:
+def _bounds_to_rewards(**ends: Array) -> dict[str, Rewards]:
     """Numbers of entries and rows as rewards, which travel with these."""
     return {
         _PREFIX + name: Rewards(**{"choice" if name == "radius" else "transition": x})
@@ -158,8 +160,8 @@ def _travelling(**ends: Array) -> dict[str, Rewards]:
     }
 
 
-def _arrived(model: SparseMDP) -> IntervalMDP:
-    """The inverse of :func:`_travelling`."""
+def _rewards_to_bounds(model: SparseMDP) -> IntervalMDP:
+    """The inverse of :func:`_bounds_to_rewards`."""
     own = {name: x for name, x in model.rewards.items() if not name.startswith(_PREFIX)}
     ends = {
         name.removeprefix(_PREFIX): np.asarray(x.choice if x.transition is None else x.transition)
@@ -307,14 +309,14 @@ def interval_rows(
     rows, rewards = _merged(
         _Rows(starts, entry_start, successor, lower, upper, *ball_rows), dict(rewards or {})
     )
-    rows = _pointed(_around(_scaled(rows)))
+    rows = _collapse_empty_rows(_tightened_by_balls(_scaled(rows)))
     ball = None if rows.center is None else Ball(rows.center, rows.radius / 2)
     sets = uncertainty_sets(rows.entry_start, rows.lower, rows.upper, ball)
     # Nature has nothing left to give where lower ends add up to one.
     possible = (rows.upper > 0) & ((rows.lower > 0) | (sets.free_mass > 0)[rows.row])
     nominal = np.where(possible, sets.interior_distributions(possible), 0)
-    rewards |= _travelling(**rows.ends)
-    return _arrived(
+    rewards |= _bounds_to_rewards(**rows.ends)
+    return _rewards_to_bounds(
         make_sparse(row_start, rows.entry_start, rows.successor, nominal, rewards=rewards, **rest)
     )
 
@@ -377,7 +379,7 @@ def _ball(
 def _merged(rows: _Rows, rewards: dict[str, Rewards]) -> tuple[_Rows, dict[str, Rewards]]:
     """Checked ends, with those of repeated successors of a row added up."""
     rows.require(
-        (rows.lower >= 0) & (rows.lower <= rows.upper) & (rows.upper <= 1 + NEAR),
+        (rows.lower >= 0) & (rows.lower <= rows.upper) & (rows.upper <= 1 + ROW_SUM_TOLERANCE),
         lambda e: (
             f"the interval of successor {rows.successor[e]} is [{rows.lower[e]:.9g}, "
             f"{rows.upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1."
@@ -421,14 +423,14 @@ def _scaled(rows: _Rows) -> _Rows:
     """Ends scaled where they miss a distribution by little."""
     low, high = rows.sums(rows.lower), rows.sums(rows.upper)
     rows.require(
-        low <= 1 + NEAR,
+        low <= 1 + ROW_SUM_TOLERANCE,
         lambda r: (
             f"the lower ends sum to {low[r]:.9g}, which is above 1; no distribution lies between them."
         ),
         entries=False,
     )
     rows.require(
-        high >= 1 - NEAR,
+        high >= 1 - ROW_SUM_TOLERANCE,
         lambda r: (
             f"the upper ends sum to {high[r]:.9g}, which is below 1; no distribution lies between them."
         ),
@@ -440,7 +442,7 @@ def _scaled(rows: _Rows) -> _Rows:
     return replace(rows, lower=lower, upper=np.clip(np.maximum(upper, lower), 0, 1))
 
 
-def _around(rows: _Rows) -> _Rows:
+def _tightened_by_balls(rows: _Rows) -> _Rows:
     """Checked L1 balls, and intervals tightened by them."""
     lower, upper, center, radius = rows.ends.values()
     if center is None:
@@ -452,12 +454,14 @@ def _around(rows: _Rows) -> _Rows:
         entries=False,
     )
     rows.require(
-        np.abs(total - 1) <= NEAR,
+        np.abs(total - 1) <= ROW_SUM_TOLERANCE,
         lambda r: f"the center sums to {total[r]:.9g}; it must be a distribution.",
         entries=False,
     )
     rows.require(
-        (lower - NEAR <= center) & (center <= upper + NEAR) & (center >= 0),
+        (lower - ROW_SUM_TOLERANCE <= center)
+        & (center <= upper + ROW_SUM_TOLERANCE)
+        & (center >= 0),
         lambda e: (
             f"the center has {center[e]:.9g} where the interval is [{lower[e]:.9g}, "
             f"{upper[e]:.9g}]; the center must lie between the ends."
@@ -488,7 +492,7 @@ def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
     return np.where(side * rest > 0, np.nextafter(total, side * np.inf), total)
 
 
-def _pointed(rows: _Rows) -> _Rows:
+def _collapse_empty_rows(rows: _Rows) -> _Rows:
     """Ends made equal in rows that hold no distribution because of rounding."""
     # To the upper ends where these sum to less than one, to the lower ones where these sum to more,
     # and to the center of a ball that is farther from all distributions than its radius.

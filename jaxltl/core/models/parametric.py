@@ -122,7 +122,7 @@ def make_rationals(functions: Sequence[tuple[Terms, Terms]], num_parameters: int
 
 
 _EPS = float(np.finfo(np.float64).eps)
-_MOST = 10  # parameters of a polynomial up to which its 2^n corners are enumerated
+_LIMIT = 10  # parameters of a polynomial up to which its 2^n corners are enumerated
 
 
 class Ranges(NamedTuple):
@@ -168,7 +168,7 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ranges:
     linear = np.ones(of.count, bool)
     np.logical_and.at(linear, owner, np.all(powers <= 1, axis=1)[monomial])
     number = used.sum(1)
-    for n in np.unique(number[linear & (terms > 1) & (number <= _MOST)]):
+    for n in np.unique(number[linear & (terms > 1) & (number <= _LIMIT)]):
         some = np.flatnonzero(linear & (terms > 1) & (number == n))
         extremes = _corners(some, n, used, _Terms(owner, powers[monomial], coefficient), ends)
         lower[some], upper[some] = (

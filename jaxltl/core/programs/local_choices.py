@@ -342,7 +342,7 @@ def state_text(read: Reader, i: int) -> str:
 
 _DENSE_BITS = 20  # of a module's variables, up to which a table of numbers has all combinations
 _TRIAL, _GAIN = 2**13, 4  # combinations after which they must be this much fewer than states
-_MOST = 2**17  # combinations of which numbers are looked up by hash; tables grow by copies
+_LIMIT = 2**17  # combinations of which numbers are looked up by hash; tables grow by copies
 
 
 class LocalTable:
@@ -366,7 +366,7 @@ class LocalTable:
         self.num_requested += words[0].size
         if self.number is not None:
             index = self._dense(self.number, words)
-        elif self.size < max(_TRIAL, min(_MOST, self.num_requested // _GAIN)):
+        elif self.size < max(_TRIAL, min(_LIMIT, self.num_requested // _GAIN)):
             support = map(np.uint64, self.code.support)
             index = self.known.insert(tuple(map(np.bitwise_and, words, support)))
         else:

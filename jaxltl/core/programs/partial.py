@@ -36,7 +36,7 @@ Report = Callable[[int, int, Answer], None]  # of the numbers of states found an
 
 _FIRST = 1000  # states before the first solve
 _GROWTH = {"dtmc": 2.0, "mdp": 1.3}  # of their number between two solves
-_NEAR = 0.1  # states with this share of the largest weight are expanded together
+_LIKELY_SHARE = 0.1  # states with this share of the largest weight are expanded together
 _SHARE = 50  # of an mdp at least 1 / _SHARE of the known states are, so that batches are large
 # A chain's states are expanded from a reach probability on, which falls by a factor when less than
 # this share of states is new.
@@ -298,7 +298,7 @@ class _Part:
             count = min(states.size, self.room, size - self.num_expanded)
             if self.program.kind == "mdp":
                 weight = self.weight[states]
-                likely = int(np.count_nonzero(weight >= _NEAR * weight.max()))
+                likely = int(np.count_nonzero(weight >= _LIKELY_SHARE * weight.max()))
                 count = min(max(likely, self.num_expanded // _SHARE), count)
             if count < states.size:
                 order = np.argpartition(-self.weight[states], count - 1)

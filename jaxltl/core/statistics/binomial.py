@@ -151,7 +151,7 @@ def _climbed(
 # --- means of bounded numbers ------------------------------------------------------------------
 
 
-_MOST = 0.5  # of a weight; more gains little where the variance is small, and loses much else
+_LIMIT = 0.5  # of a weight; more gains little where the variance is small, and loses much else
 
 
 def bounded_mean(
@@ -173,7 +173,7 @@ def bounded_mean(
     # Guesses from what came before each number.
     guess, old = np.append(0.5, mean)[:-1], np.append(0.25, variance)[:-1]
     many = count * np.log1p(count) if planned is None else planned
-    weight = np.minimum(np.sqrt(2 * np.log(2 / failure) / (many * old)), _MOST)
+    weight = np.minimum(np.sqrt(2 * np.log(2 / failure) / (many * old)), _LIMIT)
     sum_of_squares = (x - guess) ** 2 @ (-np.log1p(-weight) - weight)
     total = weight.sum()
     if not total:

@@ -35,7 +35,7 @@ _ENDS: dict[str, Callable[[Integers, Integers, float], Ends]] = {
     "anytime": anytime,
 }
 _EPS = float(np.finfo(np.float64).eps)
-_MOST = 2**53  # throws of a row, up to which doubles count
+_LIMIT = 2**53  # throws of a row, up to which doubles count
 
 
 def _facts(sets: ConfidenceSets) -> Iterator[str]:
@@ -136,7 +136,7 @@ def intervals_from_counts(
     outcomes = _outcomes(num_outcomes, listed, shape)
     claimed = _claimed(rows, shape)
     total = np.bincount(row, count, listed.size).astype(np.int64)
-    if (total >= _MOST).any():
+    if (total >= _LIMIT).any():
         raise ValueError(
             f"{_name(int(np.argmax(total)), shape)} was thrown {total.max()} times; at most 2^53 "
             "are counted."
@@ -212,7 +212,7 @@ def samples_needed(
     low, high = 0, 1
     while widest(high) > width:
         low, high = high, 2 * high
-        if high >= _MOST:
+        if high >= _LIMIT:
             raise ValueError(f"width={width} takes more than 2^53 throws of a row; ask for less.")
     while high - low > 1:
         middle = (low + high) // 2
@@ -271,7 +271,7 @@ def _entries(
     if not np.issubdtype(counts.dtype, np.integer):
         with np.errstate(invalid="ignore"):
             whole = counts.astype(np.int64)
-    bad = (whole != counts) | (counts < 0) | (counts >= _MOST) | (~is_entry & (counts != 0))
+    bad = (whole != counts) | (counts < 0) | (counts >= _LIMIT) | (~is_entry & (counts != 0))
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])
         if not is_entry[place]:

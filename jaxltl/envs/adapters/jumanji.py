@@ -44,7 +44,7 @@ from jaxltl.envs.adapters.common import (
 )
 
 # More are learned part by part, and a mask of all their combinations would fill the memory.
-_MOST_ACTIONS = 2**20
+_MAX_ACTIONS = 2**20
 
 
 def from_jumanji(
@@ -154,10 +154,10 @@ def _parts(env: Foreign) -> tuple[int, ...] | None:
 def _actions(spec: Foreign, parts: tuple[int, ...] | None) -> Finite | Box:
     if parts is not None:
         count = math.prod(parts) if spec.shape else int(spec.num_values)
-        if count > _MOST_ACTIONS:
+        if count > _MAX_ACTIONS:
             raise ValueError(
                 f"from_jumanji: parts of {list(parts)} values make {count} actions; at most "
-                f"{_MOST_ACTIONS} are numbered. Choose the parts one after the other, "
+                f"{_MAX_ACTIONS} are numbered. Choose the parts one after the other, "
                 "in_turn=True, or take fewer agents or a smaller board."
             )
         return Finite(count)

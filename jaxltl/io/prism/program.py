@@ -1,4 +1,4 @@
-"""Models from programs in the PRISM language."""
+"""PRISM-language files: programs, values of constants, and sparse, interval or game models."""
 
 from __future__ import annotations
 

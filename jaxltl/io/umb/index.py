@@ -30,10 +30,10 @@ OTHER_LABELS = "other-aps"
 INITIAL = "initial"  # an initial distribution that is not uniform
 TEXTS = "texts"  # our parameter: names of the variables that are string indices
 ACTIONS, VALUATIONS = "actions/choices", "valuations/states"  # folders
-_MOST_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
-_MOST_STRING = 2**10  # average bytes of a string
+_MAX_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
+_MAX_STRING = 2**10  # average bytes of a string
 _STRINGS_ALLOWED = 2**20
-_MOST_RECORD = 2**16  # bytes of one state's valuation
+_MAX_RECORD = 2**16  # bytes of one state's valuation
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Index:
         for folder, count in ((ACTIONS, self.actions), (VALUATIONS, self.texts)):
             if count:
                 bounds[f"{folder}/string-mapping.bin"] = (8 * (count + 1), 8 * (count + 1))
-                bounds[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MOST_STRING * count)
+                bounds[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MAX_STRING * count)
         return bounds
 
 
@@ -276,7 +276,7 @@ def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
     if not counts["states"]:
         raise ValueError("#states is 0; a model needs at least one.")
     for name in ("states", "choices", "choice-actions"):
-        system.count(f"#{name}", below=_MOST_STATES + 1)
+        system.count(f"#{name}", below=_MAX_STATES + 1)
     system.count("#branches", below=2**60)
 
 
@@ -327,7 +327,7 @@ def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
     with errors_in(f"{VALUATIONS}: "):
         states = valuations.table("states")
         classes = states.get("classes", "a list", lambda x: isinstance(x, list) and bool(x))
-        texts = states.count("#strings", 0, below=_MOST_STATES + 1)
+        texts = states.count("#strings", 0, below=_MAX_STATES + 1)
         return tuple(_record(one, ours if isinstance(ours, list) else []) for one in classes), texts
 
 
@@ -351,9 +351,9 @@ def _record(data: object, names_of_texts: Sequence[object]) -> Record:
             is_text = kind.name == "uint" and name in names_of_texts
             variable_of_name[name] = Variable(name, kind, offset, start, presence, is_text)
             start += kind.size
-        if start > 8 * _MOST_RECORD:
+        if start > 8 * _MAX_RECORD:
             raise ValueError(
-                f"a state's variables take more than {8 * _MOST_RECORD} bits; no more are read."
+                f"a state's variables take more than {8 * _MAX_RECORD} bits; no more are read."
             )
     if start % 8:
         raise ValueError(

@@ -16,7 +16,7 @@ Bytes = NDArray[np.uint8]
 Values = NDArray[np.generic]  # of a state variable: bool, integers, doubles or strings
 
 _EXACT = 2**53  # integers up to this are exact doubles
-_MOST_TEXT = 2**30  # bytes of the strings of one variable
+_MAX_TEXT = 2**30  # bytes of the strings of one variable
 
 
 def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
@@ -199,7 +199,7 @@ def _texts(number: Values, texts: Sequence[str]) -> Values:
         raise ValueError(f"has the text {used[-1]}; there are {len(texts)}.")
     chosen = [texts[i] for i in used.tolist()]
     # NumPy pads every string to the longest one.
-    dtype = object if 4 * number.size * max(map(len, chosen)) > _MOST_TEXT else str
+    dtype = object if 4 * number.size * max(map(len, chosen)) > _MAX_TEXT else str
     return np.array(chosen, dtype)[which.ravel()]
 
 

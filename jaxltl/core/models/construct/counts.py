@@ -20,8 +20,8 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
-MOST_SAMPLES = 2**53  # the largest range of exact integers in double precision
-_MOST_ENTRIES = 10**8
+MAX_SAMPLES = 2**53  # the largest range of exact integers in double precision
+_MAX_ENTRIES = 10**8
 _ANY = "any"  # the only action of an unvisited state
 
 Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
@@ -107,7 +107,7 @@ def make_counts(
             )
         if (x < 0).any():
             raise ValueError(f"{name}[{int(np.argmax(x < 0))}] is {x.min()}; none is negative.")
-    if count is not None and sum(arrays["count"].tolist()) > MOST_SAMPLES:
+    if count is not None and sum(arrays["count"].tolist()) > MAX_SAMPLES:
         raise ValueError(
             f"count adds up to {sum(arrays['count'].tolist())}; at most 2^53 "
             "transitions are counted."
@@ -136,13 +136,13 @@ def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _totals(place: Integers, count: Integers) -> NDArray[np.int64]:
-    """Sums of the counts at each place; at most `MOST_SAMPLES`, which doubles count exactly."""
+    """Sums of the counts at each place; at most `MAX_SAMPLES`, which doubles count exactly."""
     return np.bincount(place.ravel(), count).astype(np.int64)
 
 
 def _checked_names(noun: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:
     if names is None:
-        if least > _MOST_ENTRIES:
+        if least > _MAX_ENTRIES:
             raise ValueError(f"{noun} go up to {least - 1}; number them from 0, without gaps.")
         return tuple(map(str, range(least)))
     names = tuple(map(str, validation.sequence(noun, names)))
@@ -431,10 +431,10 @@ def _entries(
 ) -> tuple[Integers, Integers, NDArray[np.int64]]:
     """Row starts, successors and counts of the observed and of the possible transitions."""
     size, num_open = len(counts.states), int(is_open.sum())
-    if num_open * size > _MOST_ENTRIES:
+    if num_open * size > _MAX_ENTRIES:
         raise ValueError(
             f"{num_open} choices that may lead to each of {size} states are {num_open * size} "
-            f"entries of 28 bytes; at most {_MOST_ENTRIES} are built. Say which states are "
+            f"entries of 28 bytes; at most {_MAX_ENTRIES} are built. Say which states are "
             "terminal, or what is possible, with a count of 0."
         )
     counted = np.zeros(state.size, bool)

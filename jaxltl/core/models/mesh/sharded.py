@@ -1,4 +1,4 @@
-"""Models distributed over the devices of a mesh, and their operators.
+"""Sharded MDPs: states partitioned over the devices of a mesh, and their Bellman operators.
 
 A device holds a range of the states with the rows of their choices, by local places: its own states
 first, then those received before a sweep by one exchange, of a halo or of all values.

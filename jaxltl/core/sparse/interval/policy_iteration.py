@@ -34,7 +34,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270
 _AIM = 0.25  # share of the tolerance that the extras of all steps may take
 _RESIDUAL = 0.1  # of systems with an extra, as a share of it
-_NEARLY = 1e-4  # change of values, as a share of the tolerance, at which extras are added
+_SMALL_CHANGE = 1e-4  # change of values, as a share of the tolerance, at which extras are added
 _ROUGH = 0.1  # residual of systems before that, as a share of the last change
 _DOUBT = 0.2  # gain to exceed then, as a share of that residual
 _LARGE = 500  # nodes from which value iteration comes first, where elimination fills little:
@@ -277,7 +277,7 @@ class _Search:
             if evaluated is None:
                 return None
             pair, change = self.operator.improve(evaluated, evaluated.value, 0.0, _DOUBT * residual)
-            if change <= _NEARLY * self.accuracy.tolerance * self.scale(evaluated.value):
+            if change <= _SMALL_CHANGE * self.accuracy.tolerance * self.scale(evaluated.value):
                 break
             residual = _ROUGH * change
         return pair

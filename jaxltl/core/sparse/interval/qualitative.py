@@ -1,4 +1,4 @@
-"""Qualitative analysis of uncertain MDPs: fixed points on supports that nature may change.
+"""Qualitative analysis of interval MDPs: prob0 and prob1 states, and joint end components.
 
 Nature may drop an edge with lower end 0 if the others can carry all mass, so the graph is a
 game: nature *can stay* in a set of states (some distribution does), or a row *must enter* one

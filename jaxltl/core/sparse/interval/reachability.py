@@ -43,7 +43,7 @@ METHOD = "policy iteration with nature"
 _STARTS = 60  # improvements by value iteration before strategy iteration
 _SWEEPS = 100  # sweeps of each
 _SLOW = 1e-7  # change of a sweep at which choices are improved
-_NEARLY = 1e-5  # change since the last improvement at which value iteration ends
+_SMALL_CHANGE = 1e-5  # change since the last improvement at which value iteration ends
 
 
 def reachability(
@@ -243,7 +243,7 @@ def _first_choices(
             last, value = value, chain @ value
             if np.abs(value - last).max() <= _SLOW:
                 break
-        if np.abs(value - before).max() <= _NEARLY:
+        if np.abs(value - before).max() <= _SMALL_CHANGE:
             break
     return row, model.extreme_distributions(value[mdp.successor], maximize=not maximize)
 

@@ -1,4 +1,4 @@
-"""Sparse elimination of policy evaluation systems ``(I - P) x = b``, and Krylov steps where it fills.
+"""Sparse LU solver of policy evaluation systems ``(I - P) x = b``, and Krylov steps where it fills.
 
 Unknowns are ordered by strongly connected component, and within each by reverse Cuthill-McKee
 (1969), so that only components and the blocks between them fill. Where the blocks between fill too
@@ -23,21 +23,23 @@ _SMALL = 3000  # states of a component up to which it may fill
 _LARGE = 3000  # states of a component from which minimum degree is tried,
 _SEVERAL = 1.5  # if its rows have more entries in the mean (sparser ones are nearly trees)
 _NARROW = 40  # and its mean bandwidth is larger
-_SPREAD = 8  # times its mean bandwidth that a larger component must have states
-_MOST = 2**28  # entries of factors, 12 bytes each
-_MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
-_APART = 500  # states from which a component is eliminated alone otherwise
-_LAST = 8000  # states up to which a component is eliminated, however it fills, if sweeps fail
+_MIN_STATES_PER_BANDWIDTH = 8  # times its mean bandwidth that a larger component must have states
+_MAX_FILL = 2**28  # entries of factors, 12 bytes each
+_MAX_FILL_TOGETHER = 10**7  # of these, between components that are eliminated together
+_MIN_STATES_ALONE = 500  # states from which a component is eliminated alone otherwise
+_MAX_FORCED_STATES = (
+    8000  # states up to which a component is eliminated, however it fills, if sweeps fail
+)
 _WORK = 1e11  # multiplications of a band from which a Krylov method comes first,
 _MANY = 2  # if rows have more entries in the mean
 _SAMPLED = 64  # rows in which the fill is counted
 _PANEL = 2  # columns that SuperLU eliminates at once: each needs room for a full one
 _FILL = 4  # growth of the fill after which the order is computed anew
-_AGAIN = 8  # restarts of the Krylov method,
-_KRYLOV = 500  # steps of each
+_KRYLOV_RESTARTS = 8  # restarts of the Krylov method,
+_KRYLOV_STEPS = 500  # steps of each
 _SWEEPS = 20_000  # and sweeps after it
 _ROUNDED = 4 * float(np.finfo(np.float64).eps)  # smallest residual relative to the solution
-_LEFT = 1e-14  # residual relative to the right side
+_RELATIVE_RESIDUAL = 1e-14  # residual relative to the right side
 _DIRECT = 2000  # unknowns up to which each system of a sequence is eliminated
 _MAX_OLD_STEPS = 10  # steps after which old factors are given up
 _MAX_STEPS = 200  # of BiCGSTAB without factors
@@ -113,7 +115,7 @@ class Factors(NamedTuple):
             nodes, swept = block.order, block.factor is None
             if (
                 swept
-                and nodes.size > _LAST
+                and nodes.size > _MAX_FORCED_STATES
                 and elimination_order(matrix[nodes][:, nodes], self.label[nodes]) is None
             ):
                 return None
@@ -127,7 +129,7 @@ class Factors(NamedTuple):
 def factorize(rows: SparseMatrix, label: Integers, chosen: Integers) -> Factors | None:
     """Factors of a policy's system; None if it is singular."""
     matrix, size = rows[chosen], np.bincount(label)
-    if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
+    if min(_between(matrix, label, size)) <= _MAX_FILL_TOGETHER:
         order = elimination_order(matrix, label, _WORK)
         one = None if order is None else _block(rows, label, order, chosen)
         if order is not None and one is None:
@@ -147,7 +149,7 @@ def factorize(rows: SparseMatrix, label: Integers, chosen: Integers) -> Factors 
 
 def _parts(label: Integers, size: Integers) -> list[Integers]:
     """The states of each large component, and of what lies between two of them."""
-    large = size > _APART
+    large = size > _MIN_STATES_ALONE
     begins = large.copy()
     begins[1:] |= large[:-1]
     begins[:1] = False
@@ -189,7 +191,7 @@ def elimination_order(
         np.maximum.at(furthest, source, place[source] - place[both.indices])
         mean = np.bincount(label, furthest) / np.maximum(size, 1)
         fills = (size * mean**2 > work) & (within.nnz > _MANY * label.size)
-        if ((size > _SMALL) & ((mean * _SPREAD > size) | fills)).any():
+        if ((size > _SMALL) & ((mean * _MIN_STATES_PER_BANDWIDTH > size) | fills)).any():
             return None
     # An edge between components fills the one that is eliminated first.
     result: Integers | None = order[::-1] if out_of < into else order
@@ -265,7 +267,7 @@ def _too_much(matrix: SparseMatrix, label: Integers) -> bool:
     components where that bound is too large, rows are counted along the elimination tree.
     """
     size = label.size
-    if size * (size + 1) <= _MOST:
+    if size * (size + 1) <= _MAX_FILL:
         return False
     source = np.repeat(np.arange(size), np.diff(matrix.indptr))
     target = matrix.indices
@@ -273,7 +275,7 @@ def _too_much(matrix: SparseMatrix, label: Integers) -> bool:
     last = np.zeros(int(label.max(initial=0)) + 1, np.int64)
     last[label] = np.arange(1, size + 1)
     first = np.minimum(source[between], target[between])
-    allowed = _MOST - size - int((last[label[first]] - first).sum())
+    allowed = _MAX_FILL - size - int((last[label[first]] - first).sum())
     source, target = source[~between], target[~between]
     leftmost, top = _first_entries(source, target, size)
     if int((2 * np.arange(size) - leftmost - top).sum()) <= allowed:
@@ -335,12 +337,14 @@ def _swept(matrix: SparseMatrix, b: Floats) -> Floats:
 
     def enough() -> bool:
         # Where x is far larger than b, its own rounding remains.
-        least = max(_LEFT * size, _ROUNDED * float(np.abs(x).max(initial=0)))
+        least = max(_RELATIVE_RESIDUAL * size, _ROUNDED * float(np.abs(x).max(initial=0)))
         return bool(np.abs(residual).max(initial=0) <= least)
 
-    for _ in range(_AGAIN):  # restarts where it stagnates or breaks down
+    for _ in range(_KRYLOV_RESTARTS):  # restarts where it stagnates or breaks down
         with np.errstate(all="ignore"):
-            more = iterate(matrix, residual, np.zeros(b.size), _LEFT * size, _KRYLOV)
+            more = iterate(
+                matrix, residual, np.zeros(b.size), _RELATIVE_RESIDUAL * size, _KRYLOV_STEPS
+            )
         after = residual - (more - matrix @ more)
         if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(residual).max():
             break

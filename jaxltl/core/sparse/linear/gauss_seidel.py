@@ -39,7 +39,7 @@ _SINGLE = 1e-6  # change, relative to the largest value, at which single precisi
 _ROUGH = 0.01  # and at which a first policy is read off
 _STAYS = 0.25  # the largest probability to stay for longer than the truncated time
 _STEPS = 300  # steps of the truncated time at most
-_LEFT = 0.25  # of the extra cost: the change at which sweeps end
+_FINAL_CHANGE = 0.25  # of the extra cost: the change at which sweeps end
 _MARGIN = 1.05  # of the proof
 _PROOFS = 4  # attempts
 _THREADS = 2**20  # transitions from which two blocks are swept at once
@@ -253,7 +253,7 @@ class _Search:
             if not np.isfinite(largest):
                 return False
             rough_or_single = max(rough, _SINGLE if kind is np.float32 else 0.0)
-            goal = max(_LEFT * extra, rough_or_single * float(value.max(initial=0)))
+            goal = max(_FINAL_CHANGE * extra, rough_or_single * float(value.max(initial=0)))
             if largest <= goal:
                 return True
             changes.append(largest)
@@ -332,7 +332,9 @@ class _Search:
         if self.settings.relative:
             share = float((value[some] / time[some]).min(initial=np.inf))
             share = share if np.isfinite(share) else 1.0
-        needed = _MARGIN * (1 + _LEFT) / (1 - _STAYS) + 1  # times the extra, between the bounds
+        needed = (
+            _MARGIN * (1 + _FINAL_CHANGE) / (1 - _STAYS) + 1
+        )  # times the extra, between the bounds
         rounding = 32 * self.settings.unit * max(size, 1e-300)
         return max(0.9 * self.settings.tolerance * share / needed, rounding)
 
@@ -353,7 +355,11 @@ class _Search:
             return None
         time, least = timed
         known = self._known_width()
-        loss = _MARGIN * (extra * (1 + 2 * _LEFT) + 4 * unit * float(value.max(initial=0))) / least
+        loss = (
+            _MARGIN
+            * (extra * (1 + 2 * _FINAL_CHANGE) + 4 * unit * float(value.max(initial=0)))
+            / least
+        )
         attained = np.where(problem.live, value - sign * (loss * time + known), problem.attained)
         image = chain @ attained
         if cost is not None:

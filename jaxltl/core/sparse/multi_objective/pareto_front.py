@@ -15,7 +15,7 @@ import numpy as np
 from jaxltl.core.array_types import Floats, Integers
 
 _EPS = float(np.finfo(np.float64).eps)
-_NEAR = 1e-6  # of the size of a program: differences that it does not resolve
+_RESOLUTION = 1e-6  # of the size of a program: differences that it does not resolve
 _ZOOMS = 12
 _EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
@@ -48,7 +48,7 @@ def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
         height = ahead @ normal
         top = height[chosen].max()
         beyond = np.flatnonzero(height > top + 8 * _EPS * np.abs(ahead).max(1))
-        upper = np.flatnonzero(height >= top - _NEAR * size)
+        upper = np.flatnonzero(height >= top - _RESOLUTION * size)
         if beyond.size:
             chosen = np.union1d(chosen, beyond)
         elif np.abs(ahead[upper]).max() > size / 2:

@@ -51,7 +51,7 @@ _ELIMINATED = 2_000_000  # states up to which policies are evaluated by eliminat
 _LINGERS = 1e12  # range of biases, relative to rewards, that shows states that are hardly left
 _IDLE = 6  # policies that improve the gain by no more than
 _IDLE_SHARE = 1e-12  # this share, after which policy iteration ends
-_NEAR = 1e-3  # of the range of biases: the best states
+_BEST_SHARE = 1e-3  # of the range of biases: the best states
 _TINY = 1e-13  # relative size of gains that have no relative tolerance
 _LOOSEST = 1e-3  # share up to which second-order terms are negligible
 _FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolved further
@@ -391,7 +391,7 @@ def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floa
             chosen = np.where(better, part.first_best(gain - slack), chosen)
         elif range_ > _LINGERS * part.magnitude.max():
             # Some states are hardly ever left: the others go to the best of these.
-            goal = best >= best.max() - _NEAR * range_
+            goal = best >= best.max() - _BEST_SHARE * range_
             onward = shortest_path_rows(part.mdp, goal, np.ones(part.row.size, bool))
             chosen = np.where(goal, chosen, onward)
         else:

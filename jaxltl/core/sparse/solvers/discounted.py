@@ -1,4 +1,4 @@
-"""Discounted values on sparse rows, as a shortest path problem that ends with probability 1 - d."""
+"""Optimal discounted values of sparse MDPs, by reduction to a stochastic shortest path."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def discounted_value(
     cost = np.append(reward - least, 0)
     problem = ShortestPathProblem(ending, interior, np.zeros(interior.size), cost, depth=depth)
     enclosure = solve_shortest_path(problem, maximize=True, tolerance=tolerance, relative=False)
-    always = least / (1 - discount)
+    baseline = least / (1 - discount)
     value, lower, upper = (
-        x[:-1] + always for x in (enclosure.value, enclosure.lower, enclosure.upper)
+        x[:-1] + baseline for x in (enclosure.value, enclosure.lower, enclosure.upper)
     )
     # Terms of a reward may cancel; their rounding stays.
     terms = int(np.diff(mdp.entry_start).max()) + depth + 4
-    lost = terms * float(magnitude.max()) / (1 - discount)
-    slack = 4 * _EPS * (np.abs(enclosure.value[:-1]) + abs(always) + lost)
+    cancellation = terms * float(magnitude.max()) / (1 - discount)
+    slack = 4 * _EPS * (np.abs(enclosure.value[:-1]) + abs(baseline) + cancellation)
     return replace(
         enclosure, value=value, lower=lower - slack, upper=upper + slack, row=enclosure.row[:-1]
     )

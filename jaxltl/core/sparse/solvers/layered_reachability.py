@@ -36,7 +36,7 @@ from jaxltl.core.sparse.solvers.shortest_path_problem import TINY, Enclosure
 _EPS = float(np.finfo(np.float64).eps)
 _STARTS = 8  # states from one of which few steps
 _MET = 4096  # lead to that many, so that the graph is shallow and sweeps end soon
-_MOST = 2**27  # transitions of a component that is written out, at most
+_LIMIT = 2**27  # transitions of a component that is written out, at most
 
 
 class PaddedProduct(NamedTuple):
@@ -164,7 +164,7 @@ class _Search:
     def component(self, part: Integers, budget: float) -> bool:
         """Solves one component, to bounds at most `budget` wider than the known ones."""
         host = self.rows.host
-        if part.size > 1 and host.num_transitions * part.size > _MOST:
+        if part.size > 1 and host.num_transitions * part.size > _LIMIT:
             return False
         # Columns are pairs that a step may enter; of one memory, numbered by the state.
         problem = _alone(self, int(part[0])) if part.size == 1 else _together(self, part)

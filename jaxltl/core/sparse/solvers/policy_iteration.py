@@ -67,7 +67,7 @@ _KEPT = 0.75  # of the extra cost: smaller gains are ignored, and the rest prove
 _MAX_ROUNDS = 300
 # Unknowns from which value iteration is tried, its sweeps, and a change at its end, in tolerances;
 # elimination takes longer in cores of zeroconf with 120,000 unknowns.
-_LARGE_CORE, _MOST_SWEEPS, _CONVERGED = 20_000, 400, 0.01
+_LARGE_CORE, _MAX_SWEEPS, _CONVERGED = 20_000, 400, 0.01
 _USEFUL = 0.1  # bounds of this width give a start policy for extended precision
 
 
@@ -240,7 +240,7 @@ class _CoreSolver:
         if equation.is_chain:  # one elimination suffices
             return value, False
         num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
-        for k in range(1, _MOST_SWEEPS):
+        for k in range(1, _MAX_SWEEPS):
             before, value = value, equation.best(equation.backup(value))
             if k < num_sweeps - large * _SWEEPS or k % _SWEEPS:
                 continue
@@ -255,7 +255,7 @@ class _CoreSolver:
             if not excess:
                 return value, True
             # The rate varies, so that it may predict more sweeps.
-            if excess * _SWEEPS > (last - excess) * (2 * _MOST_SWEEPS):
+            if excess * _SWEEPS > (last - excess) * (2 * _MAX_SWEEPS):
                 break
         return value, False
 
@@ -267,7 +267,7 @@ class _CoreSolver:
             return None
         extra = self._extra_cost(time, value, _MARGIN)
         value, rounds = value + sign * extra * time, 0
-        while rounds < _MOST_SWEEPS:
+        while rounds < _MAX_SWEEPS:
             rounds += 1
             image = equation.backup(value)
             best = equation.best(image)
@@ -286,7 +286,7 @@ class _CoreSolver:
     def _truncated_time(self, policy: Integers, weight: Floats) -> Floats | None:
         """A policy's expected sum of weights but for an eighth of them; None if that takes long."""
         rows, stays, time = self.equation.matrix[policy], weight, np.zeros(policy.size)
-        for _ in range(_MOST_SWEEPS):
+        for _ in range(_MAX_SWEEPS):
             if (8 * stays <= weight).all():
                 return time
             time, stays = time + stays, rows @ stays

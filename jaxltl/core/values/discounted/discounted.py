@@ -55,7 +55,7 @@ from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
 MAX_STEPS = 100_000
 _SWEEPS = 24  # under a fixed policy, in modified policy iteration
 _STEPS = 6  # of Newton's method, in double words
-_MOST_PRODUCTS = 2000  # in the linear system of one
+_MAX_PRODUCTS = 2000  # in the linear system of one
 _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iteration")
 
 
@@ -455,7 +455,7 @@ def _newton_steps(
         weight = jax.nn.one_hot(action, model.num_actions, dtype=model.dtype)
         columns = action_columns(model.num_actions, weight if policy is None else policy)
         system = System(sweep_operator(model), columns, problem.discount)
-        linear = solver(system, max_steps=_MOST_PRODUCTS)
+        linear = solver(system, max_steps=_MAX_PRODUCTS)
         step = lax.cond(n < 0, jnp.zeros_like, linear.solve, change)
         new = backup(dw.plus(value, dw.double_word(step)))
         size = jnp.max(jnp.abs(new[3]))

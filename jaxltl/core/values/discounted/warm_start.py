@@ -15,7 +15,7 @@ from jax import lax
 from jaxltl.core.models.game import Game
 from jaxltl.core.values.engine.iterate import side_by_side
 
-_MOST_SWEEPS = 100_000
+_MAX_SWEEPS = 100_000
 _FEWEST = 16  # lanes of the last sweeps
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
@@ -86,7 +86,7 @@ def _solved(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Ar
 
 
 def _is_active(models: Models, sweeps: _Sweeps) -> jax.Array:
-    return models.active & (sweeps.error > models.enough) & (sweeps.number < _MOST_SWEEPS)
+    return models.active & (sweeps.error > models.enough) & (sweeps.number < _MAX_SWEEPS)
 
 
 def _swept(graph: _Graph, models: Models, start: _Sweeps, few: int) -> _Sweeps:

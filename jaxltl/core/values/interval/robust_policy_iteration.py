@@ -32,7 +32,7 @@ _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
 _HASTY = 12  # rounds in which both sides move at once; then the leader waits for the other one
 _ROUNDS = 100
 _GROWTH = 8.0  # of the extra where no choice changes and yet no bound is proven
-_MOST_GROWTH = 1e5
+_MAX_GROWTH = 1e5
 _PAIRS = 16  # entries of a row up to which each pair is compared
 _EQUAL = 2.0**12  # roundings by which equal values may differ
 
@@ -270,7 +270,7 @@ def _policy_iteration(
         )
 
     def goes_on(iteration: _Iteration) -> jax.Array:
-        alive = jnp.all(jnp.isfinite(iteration.z)) & (iteration.growth < _MOST_GROWTH)
+        alive = jnp.all(jnp.isfinite(iteration.z)) & (iteration.growth < _MAX_GROWTH)
         done = iteration.proven & iteration.still
         return ~done & alive & (iteration.rounds < jnp.minimum(max_rounds, _ROUNDS))
 

@@ -21,7 +21,7 @@ from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
 from jaxltl.core.values.engine.state_quantities import nonnegative_reward, state_mask
 
-_MOST = 8  # probabilities at once, of which all sets are looked at
+_LIMIT = 8  # probabilities at once, of which all sets are looked at
 
 
 def _facts(value: Objective) -> Iterator[str]:
@@ -102,10 +102,10 @@ def weighted_problem(
     rewards = [_checked(model, i, o) for i, o in enumerate(objectives)]
     trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
     used = [i for i, x in enumerate(trackers) if x is not None]
-    if sum(r is None for r in rewards) > _MOST:
+    if sum(r is None for r in rewards) > _LIMIT:
         raise ValueError(
             f"there are {sum(r is None for r in rewards)} probabilities; at most "
-            f"{_MOST} can be had at once."
+            f"{_LIMIT} can be had at once."
         )
     product, members = _product(
         model,

@@ -218,7 +218,9 @@ class Chosen:
 
 
 SLACK = 1e6  # smallest numbers that a guess is above nothing
-_NEAR = 0.9  # distance of the first guess of a bound from the other, as a share of the tolerance
+_GUESS_SHARE = (
+    0.9  # distance of the first guess of a bound from the other, as a share of the tolerance
+)
 _FINER = 0.25  # how much nearer values come before the next guess
 _PATIENCE = 20  # passes, and a quarter of those before, until a guess is given up
 _PASSES = 100  # until policy iteration is tried
@@ -316,7 +318,7 @@ def enclose_cycles(
         none,
         none,
         tolerance,
-        _NEAR * tolerance,
+        _GUESS_SHARE * tolerance,
         zero,
         zero,
         jnp.full((), jnp.inf, low.dtype),

@@ -24,7 +24,7 @@ from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.properties.solve_property import FINER, Answer, as_answer
+from jaxltl.core.values.properties.solve_property import TOLERANCE_SHARES, Answer, as_answer
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.total_reward import total_reward
@@ -58,14 +58,18 @@ class Question:
         """The answer of a solution."""
         names = ("value", "lower", "upper")
         small: dict[str, Array] = {name: self.taken(getattr(solution, name)) for name in names}
-        nobody: Array = np.zeros(0, np.int32)
-        answer = replace(solution, **small, policy=nobody, status=on_host(solution.status))
+        no_policy: Array = np.zeros(0, np.int32)
+        answer = replace(solution, **small, policy=no_policy, status=on_host(solution.status))
         method = "interval iteration" if self.goes_on else "policy iteration by a Krylov method"
         return as_answer(self.prop, self.states, answer, wanted, f"{method} on the mesh")
 
     def is_answered(self, answer: Answer, part: float) -> bool:
-        """True if the answer needs no narrower bounds of those in :data:`FINER`."""
-        return self.prop.relation is None or answer.status == Status.CONVERGED or part <= FINER[-1]
+        """True if the answer needs no narrower bounds of those in :data:`TOLERANCE_SHARES`."""
+        return (
+            self.prop.relation is None
+            or answer.status == Status.CONVERGED
+            or part <= TOLERANCE_SHARES[-1]
+        )
 
 
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:

@@ -49,7 +49,11 @@ from jaxltl.core.values.undiscounted.total_reward import total_reward
 
 
 TOLERANCE = 1e-6
-FINER = (1.0, 1e-3, 1e-6)  # shares of the tolerance with which an open threshold is tried
+TOLERANCE_SHARES = (
+    1.0,
+    1e-3,
+    1e-6,
+)  # shares of the tolerance with which an open threshold is tried
 _EXACT = 1e-10  # tolerances up to which small chains are solved in rational arithmetic
 TINY = 1e-12  # absolute width of bounds on rewards that is always accepted
 _AVERAGE = "averages of end components"
@@ -178,7 +182,7 @@ def solve_property(
             answer = _answer(prop, states, result, None, width(tolerance))
         return answer
     verdicts = _verdicts(prop, result)
-    for share in FINER[1:]:
+    for share in TOLERANCE_SHARES[1:]:
         if None not in verdicts or _is_exact(result):
             break
         result = solve(width(tolerance * share))
@@ -410,7 +414,7 @@ class _Query(NamedTuple):
         if isinstance(path, Bounded):
             return self.within(path, aim, tolerance)
         if is_boolean(path):
-            return self.at_once(path)
+            return self.state_formula(path)
         if path.operator == "!":
             return self.opposite(path.operands[0], aim, tolerance)
         if not all(is_boolean(f) for f in path.operands):
@@ -434,12 +438,12 @@ class _Query(NamedTuple):
                 return self.opposite(Formula("U", (~first, ~right)), aim, tolerance)
         raise AssertionError(path.operator)
 
-    def at_once(self, path: Formula) -> _Result:
+    def state_formula(self, path: Formula) -> _Result:
         holds: Array = self.where(path).astype(np.float64)[self.states]
         zero: Array = np.int32(0)
-        nobody: Array = np.zeros(0, np.int32)
+        no_policy: Array = np.zeros(0, np.int32)
         return _Result(
-            Solution(holds, nobody, holds, holds, zero, zero, zero, method="the label"), None
+            Solution(holds, no_policy, holds, holds, zero, zero, zero, method="the label"), None
         )
 
     def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:

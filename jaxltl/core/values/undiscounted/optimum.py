@@ -44,7 +44,7 @@ from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_p
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FINER = 8  # factor by which a guess is narrower than the bounds, once these meet the goal
 _SWEEPS = 1_000_000  # of interval iteration
-_FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
+_GUESS_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 
 
 # --- a policy: a linear system with a certificate -------------------------------------------------
@@ -235,7 +235,7 @@ def _tighter(finest: bool, table: None, bounds: _Bounds, search: _Search) -> _Bo
             image = search.rounded(search.image(pair[1]), 1)
             return pair[1], jnp.where(guesses, image, jnp.minimum(image, pair[1]))
 
-        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (start, start))
+        before, after = lax.fori_loop(0, _GUESS_SWEEPS, sweep, (start, start))
         proven = jnp.all(after <= before)
         return jnp.where(proven, jnp.minimum(upper, after), upper), ~proven
 

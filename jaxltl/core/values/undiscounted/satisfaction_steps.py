@@ -1,4 +1,4 @@
-"""Expected number of steps until a task is decided, or between acceptances; fastest policies.
+"""Expected steps to satisfaction: of policies, of fastest optimal policies, and Pareto fronts.
 
 Stochastic shortest paths (Bertsekas and Tsitsiklis 1991) to a decision, and long-run rates of
 acceptance (Puterman 1994, chapters 8 and 9). docs/optimal-actions.md has the proofs.
@@ -42,10 +42,10 @@ from jaxltl.core.values.undiscounted.satisfaction import (
 
 
 _EPS = float(np.finfo(np.float64).eps)
-_SOLVED = 1e-9  # relative width to which each part is solved
+_PART_WIDTH = 1e-9  # relative width to which each part is solved
 _TOLERANCE = 1e-6  # relative width of a converged enclosure
-_MOST_SWEEPS = 1_000_000  # of the rates of acceptance
-_CLOSE = 1e-10  # width of probabilities; the default width may need exact fractions
+_MAX_SWEEPS = 1_000_000  # of the rates of acceptance
+_PROBABILITY_WIDTH = 1e-10  # width of probabilities; the default width may need exact fractions
 _LOSS = 1e-9  # of the satisfaction probability, that counts as a rounding error
 
 
@@ -192,7 +192,7 @@ class StepAnalysis:
             chain.mdp,
             self.undecided.astype(float),
             maximize=False,
-            tolerance=_SOLVED,
+            tolerance=_PART_WIDTH,
             depth=chain.depth,
         )
         value, low, high = self.mean(total)
@@ -211,7 +211,7 @@ class StepAnalysis:
         host = self.sparse.host
         rows = on_rows(self.sparse, actions.allowed)
         cost = np.where(rows, self.undecided[host.state], np.inf)
-        total = optimal.reward_forever(host, cost, maximize=False, tolerance=_SOLVED)
+        total = optimal.reward_forever(host, cost, maximize=False, tolerance=_PART_WIDTH)
         least = self.mean(total)[1]
         shape = self.model.state_shape
         taken = np.asarray(self.sparse.action)[total.row].reshape(shape)
@@ -231,7 +231,7 @@ class StepAnalysis:
 
     def probability(self, policy: Array) -> tuple[float, float, float]:
         """Satisfaction probability from the initial distribution: value, lower and upper bound."""
-        solution = satisfaction_probability(self.model, policy, tolerance=_CLOSE)
+        solution = satisfaction_probability(self.model, policy, tolerance=_PROBABILITY_WIDTH)
         return self.mean(solution, 1.0)
 
     def mean(
@@ -277,7 +277,7 @@ class StepAnalysis:
             """The mean worth of the accepting component that is reached, 0 for others."""
             cost = np.append(np.where(accepted, worth, 0), 0)
             total = optimal.total_reward(
-                ended, cost, goal, maximize=False, tolerance=_SOLVED, depth=chain.depth
+                ended, cost, goal, maximize=False, tolerance=_PART_WIDTH, depth=chain.depth
             )
             return self.mean(total)
 
@@ -302,7 +302,7 @@ class StepAnalysis:
         read, start = self._priorities(host), host.entry_start[:-1]
         hits = np.where((read % 2 == 0) & region[host.state][host.row], host.probability, 0)
         rate = self.mean(_gain(*_among(host, rows, np.add.reduceat(hits, start))[:2]), 1.0)
-        reached = optimal.reachability(host, region, maximize=True, tolerance=_SOLVED)
+        reached = optimal.reachability(host, region, maximize=True, tolerance=_PART_WIDTH)
         share = self.mean(reached, highest=1.0)[1]
         # Inside an accepting end component the least priority alone is sure to be accepted.
         inner = ~region[host.state] | on_rows(self.sparse, accepting.inside)
@@ -314,7 +314,7 @@ class StepAnalysis:
 
 
 def _gain(mdp: HostMDP, reward: Floats) -> Enclosure:
-    return average(mdp, reward, reward, tolerance=_SOLVED, max_steps=_MOST_SWEEPS)
+    return average(mdp, reward, reward, tolerance=_PART_WIDTH, max_steps=_MAX_SWEEPS)
 
 
 def _among(mdp: HostMDP, rows: Booleans, reward: Floats) -> tuple[HostMDP, Floats, Integers]:
@@ -325,11 +325,11 @@ def _among(mdp: HostMDP, rows: Booleans, reward: Floats) -> tuple[HostMDP, Float
     return small, reward[row][order], row[order]
 
 
-_NEAR = 1e-6  # distance in probability up to which a vertex is on a line
-_COARSE = 1e-3  # the same, in a front of few points
+_LINE_TOLERANCE = 1e-6  # distance in probability up to which a vertex is on a line
+_COARSE_LINE_TOLERANCE = 1e-3  # the same, in a front of few points
 _MARGIN = 1e-9  # by which a mixture exceeds requirements, for the rounding of its certificate
 _SUM_WIDTH = 1e-10  # relative width to which weighted sums are solved
-_MOST_SUMS = 60  # weighted sums of a search for one point
+_MAX_SUMS = 60  # weighted sums of a search for one point
 
 
 @brief
@@ -385,21 +385,21 @@ def steps_front(
     lines = [front.ends]
     while lines and len(vertices) < max_points:
         first, last = lines.pop(0)
-        if first.probability[0] - last.probability[0] <= _COARSE:
+        if first.probability[0] - last.probability[0] <= _COARSE_LINE_TOLERANCE:
             continue
-        between = front.between(first, last, _COARSE)[0]
+        between = front.between(first, last, _COARSE_LINE_TOLERANCE)[0]
         if between is not None:
             vertices.append(between)
             lines += [(first, between), (between, last)]
     vertices.sort(key=lambda one: (-one.probability[0], one.steps[0]))
     least, front_vertices = np.inf, list[Vertex]()
     for one in vertices:
-        if one.steps[0] < least * (1 - _NEAR):
+        if one.steps[0] < least * (1 - _LINE_TOLERANCE):
             least, front_vertices = one.steps[0], [*front_vertices, one]
     return front_vertices
 
 
-class Meeting(NamedTuple):
+class ConstrainedPolicy(NamedTuple):
     """Policy with a required satisfaction probability and expected steps, if there is one."""
 
     policy: np.ndarray | None  # float[S, Q, A]
@@ -407,32 +407,34 @@ class Meeting(NamedTuple):
     upper: float
 
 
-def meeting(model: Product, probability: float, steps: float, quickest: Quickest) -> Meeting:
+def constrained_policy(
+    model: Product, probability: float, steps: float, quickest: Quickest
+) -> ConstrainedPolicy:
     """A policy with at least a probability and at most a number of steps, of a co-safe task."""
     front = _Front.of(model, quickest)
     one_hot = np.eye(model.num_actions)
     first, last = front.ends
     highest = min(1.0, first.probability[2])
     if first.steps[2] <= steps:
-        return Meeting(
+        return ConstrainedPolicy(
             one_hot[first.policy] if first.probability[1] >= probability else None, highest
         )
     if steps < quickest.steps.upper and last.steps[1] > steps:
-        return Meeting(None, 0.0)
-    for _ in range(_MOST_SUMS):
+        return ConstrainedPolicy(None, 0.0)
+    for _ in range(_MAX_SUMS):
         if last.steps[2] <= steps and last.probability[1] >= probability:
-            return Meeting(one_hot[last.policy], highest)
+            return ConstrainedPolicy(one_hot[last.policy], highest)
         gain = first.probability[1] - last.probability[1]
         share = (probability + _MARGIN - last.probability[1]) / gain
         time = (1 - share) * last.steps[2] + share * first.steps[2]
         if share <= 1 and time <= steps * (1 - _MARGIN):
-            return Meeting(front.mixed(first, last, share), highest)
+            return ConstrainedPolicy(front.mixed(first, last, share), highest)
         between, slope, bound = front.between(first, last)
         highest = min(highest, 1 + slope * steps - bound)
         if between is None or highest < probability:
             break
         first, last = (first, between) if between.steps[2] <= steps else (between, last)
-    return Meeting(None, highest)
+    return ConstrainedPolicy(None, highest)
 
 
 @dataclass(frozen=True)
@@ -458,7 +460,7 @@ class _Front:
         quickest = quickest_policy(model) if quickest is None else quickest
         clock = StepAnalysis(model)
         front = _Front(clock, ())  # type: ignore[arg-type]
-        ends = front.vertex(quickest.policy), front.vertex(front.cheapest(1.0, _NEAR)[0])
+        ends = front.vertex(quickest.policy), front.vertex(front.cheapest(1.0, _LINE_TOLERANCE)[0])
         return _Front(clock, ends)
 
     def vertex(self, policy: np.ndarray) -> Vertex:
@@ -479,7 +481,7 @@ class _Front:
         return action.astype(np.int32), bound
 
     def between(
-        self, first: Vertex, last: Vertex, distance: float = _NEAR
+        self, first: Vertex, last: Vertex, distance: float = _LINE_TOLERANCE
     ) -> tuple[Vertex | None, float, float]:
         """A vertex beyond the line between two, the line's slope, and the weighted sum's bound."""
         slope = (first.probability[0] - last.probability[0]) / (first.steps[0] - last.steps[0])

@@ -70,7 +70,7 @@ _ROUNDINGS = 3  # the smallest e, in rounding errors of a backup
 _REST = 400  # steps of policy iteration in which the error must halve
 _SAME = 80  # steps for which one counts that does not change the policy
 _LARGEST = 0.1  # the largest share e
-_MOST_STEPS = 1_000_000
+_MAX_STEPS = 1_000_000
 
 
 class Problem(NamedTuple):
@@ -373,7 +373,7 @@ def _solved(
         error = jnp.max(excess / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
         halved = begun & (error < best / 2)  # false for NaN
         best, rest = jnp.where(halved, error, best), jnp.where(halved, 0, rest + wait)
-        goes_on = ~(error <= goal) & (rest < _REST) & (n < _MOST_STEPS)
+        goes_on = ~(error <= goal) & (rest < _REST) & (n < _MAX_STEPS)
 
         def improved() -> tuple[jax.Array, _Inverse, jax.Array]:
             own = _inverse(problem, at, known)

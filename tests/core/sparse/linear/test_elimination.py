@@ -36,11 +36,11 @@ def test_solutions(way, monkeypatch):
         monkeypatch.setattr(elimination, "_SEVERAL", 0)
         monkeypatch.setattr(elimination, "_NARROW", -1)
     if way == "apart":
-        monkeypatch.setattr(elimination, "_MOST_BETWEEN", -1)
-        monkeypatch.setattr(elimination, "_APART", 2)
+        monkeypatch.setattr(elimination, "_MAX_FILL_TOGETHER", -1)
+        monkeypatch.setattr(elimination, "_MIN_STATES_ALONE", 2)
     if way in ("swept", "some swept"):
-        monkeypatch.setattr(elimination, "_MOST", 0 if way == "swept" else 20)
-        monkeypatch.setattr(elimination, "_APART", 2)
+        monkeypatch.setattr(elimination, "_MAX_FILL", 0 if way == "swept" else 20)
+        monkeypatch.setattr(elimination, "_MIN_STATES_ALONE", 2)
     rng, seen = np.random.default_rng(0), set()
     for _ in range(20):
         size = int(rng.integers(1, 30))
@@ -77,7 +77,7 @@ def test_what_fills_is_counted(monkeypatch):
         assert size + 2 * elimination._counted(source, target, size) == pytest.approx(both)
         matrix, label = sparse.csr_array(pattern * 1.0), np.zeros(size, int)
         for most, too_much in ((filled(pattern) - 1, True), (both, False)):
-            monkeypatch.setattr(elimination, "_MOST", most)
+            monkeypatch.setattr(elimination, "_MAX_FILL", most)
             assert elimination._too_much(matrix, label) == too_much
 
 
@@ -116,9 +116,9 @@ def test_nothing_fills_between_large_components():
 def test_what_would_fill_is_swept(converges, monkeypatch):
     """And where sweeps do not come to an end either, the bounds say so."""
     monkeypatch.setattr(levels, "_ROUNDS", 0)
-    monkeypatch.setattr(elimination, "_MOST", 100)
+    monkeypatch.setattr(elimination, "_MAX_FILL", 100)
     if not converges:
-        monkeypatch.setattr(elimination, "_KRYLOV", 1)
+        monkeypatch.setattr(elimination, "_KRYLOV_STEPS", 1)
         monkeypatch.setattr(elimination, "_SWEEPS", 10)
         monkeypatch.setattr(exact, "_MAX_BAND", 0)
         monkeypatch.setattr(exact, "_OPERATIONS", 0)

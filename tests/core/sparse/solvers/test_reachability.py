@@ -142,7 +142,7 @@ def way(request, monkeypatch):
         monkeypatch.setattr(levels, "_NODES", 10**9)
     if request.param in ("by sweeps", "eliminated at last"):
         monkeypatch.setattr(elimination, "_SMALL", 0)
-        monkeypatch.setattr(elimination, "_SPREAD", 10**9)
+        monkeypatch.setattr(elimination, "_MIN_STATES_PER_BANDWIDTH", 10**9)
     if request.param == "by value iteration":
         monkeypatch.setattr(transient, "_LARGE_CORE", 0)
     if request.param == "eliminated at last":

@@ -7,7 +7,7 @@ from scipy.optimize import linprog
 import jaxltl as jl
 from jaxltl.core.values.undiscounted.satisfaction_steps import (
     StepAnalysis,
-    meeting,
+    constrained_policy,
     quickest_policy,
     steps_front,
 )
@@ -59,7 +59,7 @@ def test_fronts_and_required_points_agree_with_linear_programs(count):
         for steps in rng.uniform(low, high, 3) if len(front) > 1 else [high * 1.5]:
             best = largest(*facts, steps)
             for asked in (best - 1e-5, best + 1e-5):
-                found = meeting(model, asked, steps, quickest)
+                found = constrained_policy(model, asked, steps, quickest)
                 if found.policy is None:
                     assert found.upper < asked and asked > best
                     refused += 1
@@ -68,7 +68,7 @@ def test_fronts_and_required_points_agree_with_linear_programs(count):
                     assert clock.probability(found.policy)[1] >= asked
                     assert clock.steps(found.policy).upper <= steps
                     met += 1
-            assert meeting(model, best + 1e-5, steps, quickest).upper >= best - 1e-8
+            assert constrained_policy(model, best + 1e-5, steps, quickest).upper >= best - 1e-8
     assert several >= count / 2 and met and refused
 
 
