@@ -14,13 +14,13 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 97_921,
-    "statements": 48_669,
+    "lines": 97_916,
+    "statements": 48_664,
     "docstring lines": 16_604,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,
     "Any in annotations": 205,
-    "modules of the largest folder": 20,
+    "modules of the largest folder": 19,
     "names at the top level": 80,
 }
 MODULE_LINES, BODY_LINES = 600, 68

@@ -17,9 +17,8 @@ import numpy as np
 
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
-from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.environment_loading import load_environment, load_world
+from jaxltl.app.environment_setup import Method, load_environment, load_world, make_method
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
 from jaxltl.app.reports.explorer import Curves, curves

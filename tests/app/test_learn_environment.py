@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import jaxltl as jl
 from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
-from jaxltl.app.environment_loading import load_environment
+from jaxltl.app.environment_setup import load_environment
 from jaxltl.app.files.task import kind_of
 from jaxltl.app.files.task_environment import EnvironmentFile
 from jaxltl.cli import main

@@ -258,4 +258,5 @@ def _within(sure: jax.Array, inner: Callable[..., PyTree] | None, world: PyTree)
 
 
 def of_world(function: Callable[..., PyTree], shielded: ShieldedWorld) -> PyTree:
+    """A function of the world's state, for a shielded state."""
     return function(shielded.world)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.app.environment_loading import load_environment
+from jaxltl.app.environment_setup import load_environment
 from jaxltl.core.environments.environment import Finite
 from jaxltl.envs import from_jumanji
 from tests.envs.adapters.harness import (  # noqa: F401

@@ -1,11 +1,13 @@
-"""Environments of task files: built-in ones, adapters of other packages, and user functions."""
+"""Environments and learners of task files: the set-up of reinforcement learning by simulation."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import inspect
+import math
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -13,12 +15,28 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jaxltl.app.files.task_environment import EnvironmentFile
+import chex
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jaxltl.algos import cce, ppo, trust_region
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
+from jaxltl.algos.common.actor_critic import default_network
+from jaxltl.algos.common.schedules import Linear
+from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentFile
+from jaxltl.app.job import settings
+from jaxltl.app.protocols import Algorithm
+from jaxltl.app.wording import Record
 from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.environments import Agent, Box, Finite, Timestep, Verdict
 from jaxltl.core.environments.environment import Environment, make_environment, require_environment
 from jaxltl.core.environments.episodes import with_time_limit
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.validation import errors_in
+from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs.continuous_worlds import BenchmarkWorld
+from jaxltl.envs.networks import make_network, network_agent
 
 BUILT_IN = {
     "flat_world": "jaxltl.envs.flat_world:flat_world",
@@ -225,3 +243,141 @@ def _error_line(name: str, problem: BaseException) -> str:
         else (f" ({Path(places[-1].filename).name}, line {places[-1].lineno})")
     )
     return f"{name!r} raises {type(problem).__name__}{': ' if text else ''}{text}{where}."
+
+
+# --- learners --------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A learner with its problem and hyperparameters."""
+
+    algorithm: Algorithm  # its module
+    problem: PyTree  # with `hparams`, arguments of its functions
+    hparams: PyTree
+    agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
+    drawn: tuple[str, ...]  # names of the metrics that are drawn
+    policy_fields: tuple[str, ...]  # names of the state's fields that determine a policy
+    transitions: int  # bound of the environment's steps in a step of the learner
+    description: str  # of the policy
+
+
+def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+    """The learner of a task file."""
+    make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
+    method = make(task, environment, num_steps)
+    if method.transitions > _LARGEST_COUNT:
+        raise ValueError(
+            f"a step of the learner would make {method.transitions:,} simulated steps; at most "
+            f"{_LARGEST_COUNT:,} are counted: simulate fewer or shorter episodes."
+        )
+    # With concrete numbers, so that the learner's own checks see them.
+    jax.eval_shape(
+        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
+    )
+    return method
+
+
+_LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
+
+
+def _settings(task: EnvironmentFile) -> Record:
+    """The method's keys, with pairs of numbers as schedules and lists as tuples."""
+    steps = task.learner.steps
+    hparams = task.settings.specified()
+    for name, value in hparams.items():
+        if isinstance(value, tuple):
+            hparams[name] = Linear(first=value[0], last=value[1], num_steps=steps)
+        elif isinstance(value, list):
+            hparams[name] = tuple(value)
+    return hparams
+
+
+def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, bool], Agent]:
+    """The policy of a state of a learner: greedy, or with drawn actions."""
+    return lambda state, likeliest: (learner.greedy if likeliest else learner.policy)(
+        state, problem, hparams
+    )
+
+
+def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+    spec = _settings(task)
+    parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
+    network = dataclasses.replace(default_network(environment.actions), **parts)
+    problem = ppo.make_problem(environment, network=network)
+    hparams = settings(ppo.Hparams, spec)
+    return Method(
+        ppo,
+        problem,
+        hparams,
+        _acts(ppo, problem, hparams),
+        ("episode_return", "episode_length", "entropy", "explained_variance"),
+        ("parameters", "moments"),
+        hparams.num_envs * hparams.num_steps,
+        f"two networks with hidden layers {list(network.hidden)}",
+    )
+
+
+def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+    table, actions = task.settings, environment.actions
+    assert isinstance(table, CceTable)
+    outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
+    seen = jax.tree.leaves(environment.observations, is_leaf=lambda x: isinstance(x, Box))
+    inputs = sum(math.prod(x.shape) for x in seen)
+    network = make_network((inputs, *table.hidden, outputs), hidden=table.activation)
+    make = network_agent(network, environment)
+    score = episode_evaluator(
+        environment,
+        make,
+        objective=table.objective,
+        costs=table.cost or (),
+        num_episodes=table.episodes,
+        num_steps=num_steps,
+    )
+    first = diagonal_gaussian(jnp.zeros(network.num_parameters, jnp.float32), table.deviation)
+    problem = cce.make_problem(score, first, limit=table.limit)
+    hparams = settings(cce.Hparams, _settings(task))
+    return Method(
+        cce,
+        problem,
+        hparams,
+        lambda state, likeliest: make(cce.policy(state, problem, hparams)),
+        ("objective", "cost", "best_objective", "num_feasible", "max_deviation"),
+        ("family",),
+        hparams.population * table.episodes * num_steps,
+        f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters",
+    )
+
+
+def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+    table = task.settings
+    assert isinstance(table, CpoTable) and table.limit is not None
+    if not isinstance(environment.actions, Box):
+        raise ValueError(
+            "the environment has finitely many actions, and this learner needs a box: choose "
+            'method = "ppo" or "cce".'
+        )
+    if table.cost == "violation":
+        step = Partial(_costs_where_violated, environment.step)
+        environment = dataclasses.replace(environment, step=step, outcomes=None)
+    problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
+    hparams = settings(trust_region.Hparams, _settings(task))
+    return Method(
+        trust_region,
+        problem,
+        hparams,
+        _acts(trust_region, problem, hparams),
+        ("reward", "cost", "length", "deviation", "kl"),
+        ("parameters", "moments"),
+        hparams.num_trajectories * num_steps,
+        f"a Gaussian whose mean is a network with hidden layers {list(hparams.hidden)}",
+    )
+
+
+def _costs_where_violated(
+    step: Callable[..., Timestep], world: PyTree, action: PyTree, key: chex.PRNGKey
+) -> Timestep:
+    """Cost 1 where the formula is violated; its expected sum is the violation probability."""
+    timestep = Timestep(*step(world, action, key))
+    # An episode ends with the first such step.
+    return timestep._replace(cost=jnp.where(timestep.world.verdict == Verdict.VIOLATED, 1.0, 0.0))
