@@ -14,8 +14,8 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 97_916,
-    "statements": 48_664,
+    "lines": 97_918,
+    "statements": 48_665,
     "docstring lines": 16_604,
     "functions with more than 6 parameters": 28,
     "functions with more than 9 parameters": 0,

@@ -108,12 +108,14 @@ def grid(
     limits = value_limits(np.zeros(0) if panels is None else panels, limits)
     for axes in all_axes[count:]:
         axes.axis("off")
+    # 130 / fontsize letters an inch, so that no title runs into that of the next map.
+    fontsize = min(9.5, 130 * (columns * size + 0.35) / max(1, *map(len, titles)))
     for m, axes in enumerate(all_axes[:count]):
         panel = None if panels is None else panels[m]
         image = _cells(axes, kinds, panel, limits, wall, arrows is None)
         if arrows is not None:
             draw_arrows(axes, kinds.shape, arrows[m], panel, limits, actions)
-        head(axes, titles[m])
+        head(axes, titles[m], fontsize)
         keep_out_of_layout(axes)
     if panels is not None:
         scale_bar(figure, image, all_axes.tolist(), label)

@@ -159,9 +159,9 @@ class MapOptions(TypedDict, total=False):
     wall: str
 
 
-def head(axes: Axes, text: str) -> None:
+def head(axes: Axes, text: str, size: float = 9.5) -> None:
     """The title of a map."""
-    axes.set_title(text, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    axes.set_title(text, fontsize=size, color=INK, pad=5, loc="left", parse_math=False)
 
 
 def plain_axes(axes: Axes) -> None:
