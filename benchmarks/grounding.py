@@ -87,7 +87,7 @@ def make_world(size: int, rng: np.random.Generator) -> tuple[jl.MDP, np.ndarray]
     return world, np.concatenate([np.asarray(world.label), irrelevant], 1).astype(float)
 
 
-_policy = jax.jit(grounding.motive_policy)
+_policy = jax.jit(grounding.demonstrator_policy)
 
 
 def make_case(index: int) -> Case:

@@ -28,7 +28,7 @@ shapes are shown; nothing is trained.)
   >>> state = jax.eval_shape(lambda key: ppo.init(key, stages[0], hparams), jax.random.key(0))
   >>> formulas = ["F(a & F b)", "!a U b"]
   >>> plan, other = (
-  ...     many_tasks.make_plan(x, events, world.propositions, depth=3, most=2) for x in formulas)
+  ...     many_tasks.make_plan(x, events, world.propositions, depth=3, max_sequences=2) for x in formulas)
   >>> plan.length.tolist()  # of each state's sequences: first a and then b, then b, then nothing
   [[2, 0], [1, 0], [0, 0]]
   >>> many_tasks.stack_plans([plan, other]).reach.shape  # formulas, Q, M, D, E
@@ -145,12 +145,12 @@ def make_plan(
     propositions: Sequence[str],
     *,
     depth: int,
-    most: int = 16,
+    max_sequences: int = 16,
 ) -> Plan:
     """The :class:`Plan` of a `task`: a formula, its text, or an automaton; made on the host.
 
     `events`, ``bool[E, P]``, are the labels that occur, as in training, with columns `propositions`;
-    `depth` is D, as in training, and `most` is M, the number of sequences for each state. Not
+    `depth` is D, as in training, and `max_sequences` is M, the number of sequences for each state. Not
     differentiable. Raises as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
     table = sequences.reach_avoid_sequences(
@@ -158,7 +158,7 @@ def make_plan(
         events,
         validation.distinct_names("propositions", propositions),
         depth=depth,
-        most=most,
+        max_sequences=max_sequences,
     )
     return Plan(table.reach, table.avoid, table.length)
 
@@ -253,7 +253,7 @@ def sequence_policy(
     :func:`~jaxltl.core.values.evaluation.optimality_gap.tabulate_policy`. `network` and `plan` are as for
     :func:`sequence_agent`, for finitely many actions; differentiable in the network's parameters.
 
-    >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
+    >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, max_sequences=1)
     >>> def network(observation):  # logits of the events to reach
     ...     return jnp.log(1.0 + observation.sequence.reach[0]), jnp.array(0.0)
     >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
@@ -262,7 +262,7 @@ def sequence_policy(
     validation.instance("plan", plan, Plan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
         memory = validation.integer("memory", memory)
-    actions, values = _judged(
+    actions, values = _evaluate(
         validation.function("network", network), plan, observation, jnp.asarray(memory)
     )
     _actions_of(actions)
@@ -295,7 +295,7 @@ def _actions_of(parameters: PyTree) -> Finite:
     return Finite(parameters.shape[-1])
 
 
-def _judged(
+def _evaluate(
     network: Callable[..., PyTree], plan: Plan, seen: PyTree, state: jax.Array
 ) -> tuple[PyTree, jax.Array]:
     """Action parameters and values of each sequence of an automaton state."""
@@ -338,7 +338,7 @@ def _act(
     validation.instance("memory", memory, Choice, "the agent's own, agent.memory")
     require_key(key)
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
-    actions, values = _judged(network, plan, seen, state)
+    actions, values = _evaluate(network, plan, seen, state)
     best = jnp.argmax(values)
     continues = (memory.state == state) & ~(
         (best != memory.sequence) & (values[best] > memory.worth)

@@ -83,7 +83,7 @@ def ask(
         used = used_steps(model, best, nothing, demonstrations)
         return Guarantee(requested, over, best, None, nothing, None, used=used)
     if not isinstance(requested, str):
-        require_attainable(model, best, requested, over, world.place)
+        require_attainable(model, best, requested, over, world.position_text)
         if requested == 1:  # attained by optimal policies alone
             requested = "best"
     actions = optimal_actions(model, best)
@@ -209,7 +209,7 @@ def guarantee_entry(
             "step": int(t) + 1,
             "from": before,
             "to": after,
-            **world.where(int(np.asarray(demonstrations.state)[n, t])),
+            **world.position(int(np.asarray(demonstrations.state)[n, t])),
         }
     if guarantee.requested == "none":
         missing = at_starts(model, np.subtract(guarantee.best.value, solution.value), "mean")[0]

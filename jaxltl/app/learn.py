@@ -40,7 +40,7 @@ from jaxltl.app.reports.learn import (
     report as report,
     task_pictures as task_pictures,
 )
-from jaxltl.app.wording import Record, enclosure, many
+from jaxltl.app.wording import Record, enclosure, counted
 from jaxltl.core.models import Product, Trajectories, lift_policy, product, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.protocols import PyTree
@@ -390,8 +390,8 @@ def describe(setup: Setup) -> str:
     logged = setup.world.logged
     return (
         f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
-        f"{many(len(lengths), 'demonstration')} of {many(int(lengths.sum()), 'pair')}"
-        + ("" if logged is None else f", {many(logged.num_samples, 'logged transition')}")
+        f"{counted(len(lengths), 'demonstration')} of {counted(int(lengths.sum()), 'pair')}"
+        + ("" if logged is None else f", {counted(logged.num_samples, 'logged transition')}")
     )
 
 
@@ -463,7 +463,7 @@ def summary(outcome: Outcome) -> Record:
         "expected_steps": outcome.expected_steps,
         "satisfaction": _evidence(outcome.solution, model, world, starts),
         "best_achievable": _evidence(best, model, world, starts),
-        "impossible_starts": [world.where(s) for s in impossible],
+        "impossible_starts": [world.position(s) for s in impossible],
         "neg_log_likelihood": learned.neg_log_likelihood[i],
         "weights": dict(zip(learned.names, learned.weights[i].tolist(), strict=True)),
         "training": {
@@ -514,7 +514,7 @@ def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarr
         "mean": enclosure(*(at_starts(model, x, "mean")[0] for x in parts)),
         "minimum": {
             **enclosure(value[worst], lower[starts].min(), upper[worst]),
-            **world.where(worst),
+            **world.position(worst),
         },
         "num_starts": len(starts),
         "status": Status(int(solution.status)).name,

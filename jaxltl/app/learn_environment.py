@@ -53,7 +53,7 @@ from jaxltl.core.values.evaluation.evaluation import (
     checked_steps,
     evaluate,
 )
-from jaxltl.app.wording import Record, many
+from jaxltl.app.wording import Record, counted
 from jaxltl.core.policies.policy_file import read_policy_file
 from jaxltl.io.network_policy import save_network
 from jaxltl.core.models.protocols import PyTree
@@ -168,13 +168,13 @@ def describe(setup: Setup) -> str:
     )
     steps = task.learner.steps
     return (
-        f"{task.world.function}: {does}, {many(seen, 'number')} observed, "
-        f"{many(len(environment.propositions), 'label')}; {many(len(setup.automaton.delta), 'automaton state')} "
+        f"{task.world.function}: {does}, {counted(seen, 'number')} observed, "
+        f"{counted(len(environment.propositions), 'label')}; {counted(len(setup.automaton.delta), 'automaton state')} "
         f"({setup.automaton.acceptance}); {task.learner.method} with "
-        f"{setup.method.description}: {many(steps, 'step')} of at most "
+        f"{setup.method.description}: {counted(steps, 'step')} of at most "
         f"{setup.method.transitions:,} simulated steps, {steps * setup.method.transitions:,} in "
         f"total per seed; evaluated by {task.evaluation.episodes:,} fresh episodes of at most "
-        f"{many(setup.num_steps, 'step')}"
+        f"{counted(setup.num_steps, 'step')}"
     )
 
 
@@ -382,7 +382,7 @@ def _pictured(outcome: Outcome) -> Picture | None:
     from jaxltl.plot.style import to_bytes
 
     ends = [(int(np.sum(one.valid)), np.asarray(one.world.verdict)) for one in outcome.episodes]
-    titles = [f"{Verdict(int(v[t])).name.lower()} after {many(t, 'step')}" for t, v in ends]
+    titles = [f"{Verdict(int(v[t])).name.lower()} after {counted(t, 'step')}" for t, v in ends]
     try:
         figure = draw_episodes(outcome.setup.environment, outcome.episodes, titles=titles)
     except ValueError:

@@ -22,7 +22,7 @@ from jaxltl.app.protocols import Training
 from jaxltl.app.reports.drawing import drawing, Picture
 from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
-from jaxltl.app.wording import enclosure, many, Record, Result
+from jaxltl.app.wording import enclosure, counted, Record, Result
 from jaxltl.core.models import (
     project_policy,
     project_trajectories,
@@ -157,7 +157,7 @@ def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list
         labels = np.asarray(world.mdp.label)[:, columns]
         mdp = grounding.with_labels(world.mdp, labels, automaton.propositions)
         model = product(mdp, automaton)
-        policy = grounding.motive_policy(model, table.scale, table.discount)
+        policy = grounding.demonstrator_policy(model, table.scale, table.discount)
         runs = rollout(
             model,
             policy,
@@ -174,9 +174,9 @@ def describe(setup: Setup) -> str:
     """Numbers of worlds, meanings and demonstrations, as text."""
     problem, tests = setup.problem, len(setup.worlds) - len(setup.problem.observation)
     return (
-        f"{many(len(problem.observation), 'map')}, {tests} further, "
-        f"{many(len(problem.symbols), 'symbol')} of {many(len(setup.names), 'possible meaning')}, "
-        f"{many(len(problem.length), 'demonstration')} of {int(jnp.sum(problem.length))} steps"
+        f"{counted(len(problem.observation), 'map')}, {tests} further, "
+        f"{counted(len(problem.symbols), 'symbol')} of {counted(len(setup.names), 'possible meaning')}, "
+        f"{counted(len(problem.length), 'demonstration')} of {int(jnp.sum(problem.length))} steps"
     )
 
 
@@ -210,7 +210,7 @@ def _answer(setup: Setup, posterior: grounding.Posterior, members: np.ndarray, w
     labels = [labels_of(setup, posterior, i, w) for i in members]
     model = product(grounding.with_labels(mdp, labels[0], posterior.symbols), automaton)
     inside = optimal_actions(model)
-    policy = grounding.motive_policy(
+    policy = grounding.demonstrator_policy(
         with_allowed(model, inside.allowed), posterior.scale[0], setup.hparams.discount
     )
     robust = None
@@ -237,7 +237,7 @@ def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
     for n, t, gain in row.steps:
         w = int(problem.world[n])
         number = n - int(np.argmax(np.asarray(problem.world) == w)) + 1
-        where = setup.worlds[w].where(int(problem.state[n, t]))
+        where = setup.worlds[w].position(int(problem.state[n, t]))
         place = {"map": w + 1, "demonstration": number, "step": t + 1, **where}
         records.append({**place, "action": ACTIONS[int(problem.action[n, t])], "gain": gain})
     return records
@@ -270,7 +270,7 @@ def summary(outcome: Outcome) -> Record:
         "complete": posterior.complete,
         "query": {
             "map": query.world + 1,
-            **setup.worlds[query.world].where(query.state),
+            **setup.worlds[query.world].position(query.state),
             "information": query.information,
             "labels": [{"symbols": sorted(x), "weight": weight} for x, weight in query.labels],
         },

@@ -48,7 +48,7 @@ from jaxltl.app.reports.learn_todirl import (
     task_pictures as task_pictures,
 )
 from jaxltl.app.todirl_results import (
-    Judged,
+    Evaluation,
     Learned,
     LENGTH,
     Outcome,
@@ -99,23 +99,23 @@ _EXPERT_DISCOUNT = 0.99  # largest default
 
 def prepare(task: TodirlFile, seed: int) -> Setup:
     """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
-    judge, memory = load_automata(task)
+    automaton, memory = load_automata(task)
     table = task.demonstrations
-    require_cosafe(task.path, table, judge)
+    require_cosafe(task.path, table, automaton)
     with errors_in(f"{task.path}: [task] "):
-        trivial = check_formula(judge)
-    scenes, others = load_scenes(task, judge)
+        trivial = check_formula(automaton)
+    scenes, others = load_scenes(task, automaton)
     demonstrations = load_demonstrations(task, scenes) if table.files is not None else []
-    worlds = _stack(task, [*scenes, *others], judge, memory)
-    soft = judge.is_cosafe and (table.discount is not None or bool(demonstrations))
-    expert, bests = _experts(task, worlds.scenes, judge, soft=soft)
+    worlds = _stack(task, [*scenes, *others], automaton, memory)
+    soft = automaton.is_cosafe and (table.discount is not None or bool(demonstrations))
+    expert, bests = _experts(task, worlds.scenes, automaton, soft=soft)
     dropped = 0
     if not demonstrations:
         key = jax.random.fold_in(jax.random.key(seed), 0)
         for w, scene in enumerate(scenes):
             # Without padding and the learner's memory: tasks that differ only in these have the
             # same demonstrations.
-            model = product(scene.mdp, judge, label_on=task.label_on)
+            model = product(scene.mdp, automaton, label_on=task.label_on)
             own = jax.random.fold_in(key, w)
             if soft:
                 demonstrations.append(
@@ -130,13 +130,13 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
             else:
                 runs, lost = synthetic_demonstrations(task.path, table, model, own, bests[w])
                 demonstrations, dropped = [*demonstrations, runs], dropped + lost
-    if memory is not judge:
+    if memory is not automaton:
         expert = np.tile(
             expert, (1, 1, len(memory.delta), 1)
         )  # the formula's automaton state varies fastest
     setup = Setup(
         task,
-        judge,
+        automaton,
         memory,
         worlds,
         len(scenes),
@@ -150,7 +150,7 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
     if setup.requested == "none":
         return _until_mistakes(setup)
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
-    setup = replace(setup, sure=[optimal_actions(lane) for lane in lanes])
+    setup = replace(setup, optimal=[optimal_actions(lane) for lane in lanes])
     if setup.is_probability:
         check_attainable(setup)
     setup = _until_mistakes(replace(setup, bounds=step_bounds(setup)))
@@ -164,10 +164,10 @@ def _until_mistakes(setup: Setup) -> Setup:
     shortened, unused = list[Trajectories](), 0
     for w, each in enumerate(setup.demonstrations):
         mdp = setup.worlds.scenes[w].mdp
-        model = product(mdp, setup.judge, label_on=setup.task.label_on)
+        model = product(mdp, setup.automaton, label_on=setup.task.label_on)
         mistake = np.zeros(each.state.shape, bool)
-        if setup.requested == "best" and setup.sure is not None:
-            mistake = mistakes(model, np.asarray(setup.sure[w].allowed)[: mdp.num_states], each)
+        if setup.requested == "best" and setup.optimal is not None:
+            mistake = mistakes(model, np.asarray(setup.optimal[w].allowed)[: mdp.num_states], each)
         used = used_steps(model, optimal_satisfaction(model), mistake, each)
         unused += int(np.sum(each.length)) - int(used.sum())
         shortened.append(replace(each, length=to_jax(used.astype(np.int32))))
@@ -177,11 +177,11 @@ def _until_mistakes(setup: Setup) -> Setup:
 def _narrowed(setup: Setup) -> Setup:
     """Restricts a setup to optimal actions, and counts the demonstrated steps that are not."""
     task, worlds, count = setup.task, setup.worlds, 0
-    allowed = [np.asarray(one.allowed) for one in setup.sure or ()]
+    allowed = [np.asarray(one.allowed) for one in setup.optimal or ()]
     for w, trajectories in enumerate(setup.demonstrations):
         with errors_in(f"{task.path}: demonstrations in {worlds.scenes[w].name}: "):
             size = worlds.scenes[w].mdp.num_states
-            model = product(worlds.scenes[w].mdp, setup.judge, label_on=task.label_on)
+            model = product(worlds.scenes[w].mdp, setup.automaton, label_on=task.label_on)
             allowed_mask = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
         count += int(np.asarray(trajectories.mask).sum() - allowed_mask.sum())
     worlds = replace(worlds, model=restrict_stacked_actions(worlds.model, allowed))
@@ -189,7 +189,7 @@ def _narrowed(setup: Setup) -> Setup:
 
 
 def _experts(
-    task: TodirlFile, scenes: list[Scene], judge: Automaton, *, soft: bool
+    task: TodirlFile, scenes: list[Scene], automaton: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
     """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft-optimal."""
     if soft:
@@ -197,23 +197,27 @@ def _experts(
         discount = table.discount
         if discount is None:
             discount = min(task.learner.discount, _EXPERT_DISCOUNT)
-        models = stack_products([s.mdp for s in scenes], judge, label_on=task.label_on)
+        models = stack_products([s.mdp for s in scenes], automaton, label_on=task.label_on)
         return np.asarray(_expert(models, discount, table.rewards())), []
-    bests = [optimal_satisfaction(product(s.mdp, judge, label_on=task.label_on)) for s in scenes]
+    bests = [
+        optimal_satisfaction(product(s.mdp, automaton, label_on=task.label_on)) for s in scenes
+    ]
     size = max(scene.mdp.num_states for scene in scenes)
     # Actions in padding states never matter.
     chosen = [np.pad(np.asarray(x.policy), ((0, size - len(x.policy)), (0, 0))) for x in bests]
     return np.eye(len(ACTIONS))[np.stack(chosen)], bests
 
 
-def _stack(task: TodirlFile, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
+def _stack(
+    task: TodirlFile, scenes: list[Scene], automaton: Automaton, memory: Automaton
+) -> Worlds:
     """Stacks all worlds, so that one program serves them."""
     mdps = [scene.mdp for scene in scenes]
-    both = judge if memory is judge else synchronize(memory, judge)
+    both = automaton if memory is automaton else synchronize(memory, automaton)
     with errors_in(f"{task.path}: "):
         model = stack_products(mdps, memory, label_on=task.label_on)
-        judged = stack_products(mdps, both, label_on=task.label_on)
-    return Worlds(scenes, model, judged, _observations(scenes, model))
+        task_model = stack_products(mdps, both, label_on=task.label_on)
+    return Worlds(scenes, model, task_model, _observations(scenes, model))
 
 
 def _observations(scenes: list[Scene], model: Product) -> jax.Array:
@@ -271,8 +275,8 @@ def learn(setup: Setup, training: Training) -> Outcome:
         lane = replace(one_seed(learned, chosen), parameters=parameters)
         learned, chosen = _weighed(setup, problem, hparams, lane, seed), 0
     training.stage("checking")
-    judged = _judge(setup, learned, network, hparams, chosen)
-    return Outcome(setup, learned, chosen, judged, training.seed)
+    evaluation = _evaluate(setup, learned, network, hparams, chosen)
+    return Outcome(setup, learned, chosen, evaluation, training.seed)
 
 
 def _train(
@@ -329,14 +333,14 @@ def _weighed(
     return replace(attempt.learned, weight=attempt.weight)
 
 
-def _judge(
+def _evaluate(
     setup: Setup,
     learned: Learned,
     network: todirl.RewardNetwork,
     hparams: todirl.Hparams,
     chosen: int,
-) -> Judged:
-    worlds = setup.worlds
+) -> Evaluation:
+    worlds, automaton = setup.worlds, setup.automaton
     performances, policies, codes = [], [], []
     details = dict[str, np.ndarray]()  # of the chosen seed
     for i in range(len(learned.held_out)):
@@ -360,23 +364,22 @@ def _judge(
                 times = [one.steps[:3] for one in steps if one.steps is not None]
                 shares = [one.share for one in steps]
                 details |= {"steps": np.array(times), "quick_share": np.array(shares)}
-        lifted = policy if setup.memory is setup.judge else lift_memory_policy(policy, setup.judge)
-        performances.append(_probability(worlds.judged, lifted, hparams.horizon))
+        lifted = policy if setup.memory is automaton else lift_memory_policy(policy, automaton)
+        performances.append(_probability(worlds.task_model, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
         codes.append(status)
-    judged, expert = worlds.judged, setup.expert
-    available = judged.mdp.available[:, :, None]
+    model, expert = worlds.task_model, setup.expert
+    available = model.mdp.available[:, :, None]
     blind = available / jnp.sum(available, axis=-1, keepdims=True)
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
-    horizon = hparams.horizon
-    return Judged(
+    return Evaluation(
         **details,
         policy=np.asarray(policies[chosen]),
         status=np.asarray(codes[chosen]),
         performance={
             "learned": performances[chosen],
-            "expert": _probability(judged, expert, horizon),
-            "random": _probability(judged, blind.astype(expert.dtype), horizon),
+            "expert": _probability(model, expert, hparams.horizon),
+            "random": _probability(model, blind.astype(expert.dtype), hparams.horizon),
         },
         seeds=np.stack([np.asarray(performance.mean) for performance in performances]),
     )
@@ -386,7 +389,7 @@ def _plans(
     setup: Setup, network: object, parameters: PyTree, hparams: todirl.Hparams, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
-    worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])
+    worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.optimal or ()])
     plans, codes = [], np.zeros(count, np.int32)
     for mask in (np.asarray(jax.vmap(lambda model: model.available)(worlds.model)), masks):
         each = []
@@ -420,21 +423,21 @@ def _plan(
 
 
 @jax.jit
-def _expert(judged: Product, discount: float, rewards: Mapping[str, float]) -> jax.Array:
+def _expert(models: Product, discount: float, rewards: Mapping[str, float]) -> jax.Array:
     def one(model: Product) -> jax.Array:
         reward = temporal_gridworld.expert_reward(model, **rewards)
         return soft_value(model, reward, discount, method="value_iteration").policy
 
-    return lax.map(one, judged, batch_size=_BATCH)
+    return lax.map(one, models, batch_size=_BATCH)
 
 
-def _probability(judged: Product, policy: jax.Array, horizon: int | None) -> Performance:
+def _probability(model: Product, policy: jax.Array, horizon: int | None) -> Performance:
     if horizon is None:
-        return task_performances(judged, policy)
+        return task_performances(model, policy)
     if policy.ndim == 4:
         shape = (policy.shape[0], horizon, *policy.shape[1:])
         policy = jnp.broadcast_to(policy[:, None], shape)
-    return step_bounded_performances(judged, policy)
+    return step_bounded_performances(model, policy)
 
 
 def save(out: Path, outcome: Outcome) -> None:
@@ -447,13 +450,13 @@ def save(out: Path, outcome: Outcome) -> None:
         for stale in out.glob(pattern):
             stale.unlink()
     save_reward(out / "network.npz", learned_reward(outcome))
-    worlds, judged = outcome.setup.worlds, outcome.judged
+    worlds, evaluation = outcome.setup.worlds, outcome.evaluation
     for w, scene in enumerate(worlds.scenes[: outcome.setup.num_training]):
         size = scene.mdp.num_states
         model = replace(part_of(worlds.model, w), mdp=scene.mdp)
         model = replace(model, letter=model.letter[:size])
-        policy = judged.policy[w][..., :size, :, :]
-        value = judged.performance["learned"].value[w, :size]
+        policy = evaluation.policy[w][..., :size, :, :]
+        value = evaluation.performance["learned"].value[w, :size]
         save_policy(
             out / f"policy_{w + 1}.npz",
             project_policy(model, policy, actions=ACTIONS),
@@ -492,17 +495,16 @@ _HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
 def check_attainable(setup: Setup) -> None:
     """Raises ValueError for a probability that no policy attains in a world that counts."""
     task, scenes = setup.task, setup.worlds.scenes
-    assert setup.sure is not None
-    for w, (scene, sure) in enumerate(zip(scenes, setup.sure, strict=True)):
+    for w, (scene, optimal) in enumerate(zip(scenes, setup.optimal or (), strict=True)):
         if w >= setup.num_training and scene.name in task.left_out:
             continue
         try:
             require_attainable(
                 part_of(setup.worlds.model, w),
-                sure.best,
+                optimal.best,
                 float(setup.requested),
                 task.over,
-                scene.place,
+                scene.position_text,
             )
         except ValueError as error:
             kind = "training" if w < setup.num_training else "test"
@@ -514,24 +516,23 @@ def check_attainable(setup: Setup) -> None:
 
 def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
     """Mixes plans ``[W, S, Q, A]`` of all actions and of optimal ones, in the first W worlds."""
-    assert setup.sure is not None
     requested, over = float(setup.requested), setup.task.over
     return [
         reaching(
-            part_of(setup.worlds.model, w), policy[w], inside[w], sure.best, requested, over=over
+            part_of(setup.worlds.model, w), policy[w], inside[w], optimal.best, requested, over=over
         )
-        for w, sure in enumerate(setup.sure[: len(policy)])
+        for w, optimal in enumerate((setup.optimal or [])[: len(policy)])
     ]
 
 
 def step_bounds(setup: Setup) -> list[StepBound] | None:
     """The bounds on the expected steps in all worlds; None for safety formulas."""
     task, bounds = setup.task, []
-    for w, (scene, sure) in enumerate(zip(setup.worlds.scenes, setup.sure or (), strict=True)):
+    for w, (scene, best) in enumerate(zip(setup.worlds.scenes, setup.optimal or (), strict=True)):
         with errors_in(f"{task.path}: [task] in the world {scene.name}: "):
             model = part_of(setup.worlds.model, w)
             bound = step_bound(
-                model, sure, setup.requested, task.over, task.steps, task.steps_factor
+                model, best, setup.requested, task.over, task.steps, task.steps_factor
             )
         if bound is None:
             return None
@@ -561,7 +562,7 @@ def likeliest(
     """The network of greatest likelihood over some weights."""
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
 
-    def judged(learned: Learned, weight: float) -> Attempt:
+    def attempt(learned: Learned, weight: float) -> Attempt:
         policy, inside = plans(learned)
         held = np.stack([one.policy for one in hold(setup, policy, inside)])
         loss = neg_log_likelihood(held[:, : counts.shape[1]], counts)
@@ -569,9 +570,9 @@ def likeliest(
         # The least certified probability over the training worlds, before mixing.
         return Attempt(held, loss, min(each), weight, 0.0, learned)
 
-    attempts = [judged(free, 0.0)]
+    attempts = [attempt(free, 0.0)]
     if attempts[0].attained < float(setup.requested) and train is not None:
-        attempts += _bracket(lambda mu: judged(train(mu), mu), float(setup.requested))
+        attempts += _bracket(lambda mu: attempt(train(mu), mu), float(setup.requested))
     return min(attempts, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
 
 

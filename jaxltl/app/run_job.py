@@ -234,7 +234,7 @@ class _Run(Generic[T, S, O]):
             setup = job.prepare(task, options.seed)
         say(job.describe(setup))
         if group.mesh is not None:
-            say(spread(options.num_seeds, group.num_devices))
+            say(seed_distribution(options.num_seeds, group.num_devices))
         with group.together():
             self._claim(task, held)
         if group.sees(str(self.checkpoint), self.checkpoint.exists()):
@@ -322,11 +322,11 @@ def write_files(out: Path, files: Iterable[tuple[str, bytes]]) -> None:
             file.write(content)
 
 
-def spread(num_seeds: int, num_devices: int) -> str:
+def seed_distribution(num_seeds: int, num_devices: int) -> str:
     """Distribution of seeds over devices, in one line.
 
     Example:
-      >>> spread(6, 4)
+      >>> seed_distribution(6, 4)
       '6 seeds on 4 devices, at most 2 on each; 3 devices are enough for that'
     """
     if num_seeds == 1:

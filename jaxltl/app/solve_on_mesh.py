@@ -79,12 +79,12 @@ def _entry(model: ShardedMDP, seconds: float) -> Record:
     def count(x: jax.Array) -> int:
         return int(on_host(jax.jit(lambda x: (x > 0).sum())(x)))
 
-    filled = model.num_states - model.num_given
+    filled = model.num_states - model.num_unpadded
     choices = count(model.available) - filled
     ours = filled if model.place is None else model.num_devices  # transitions of padding states
     return {
-        "kind": "chain" if choices == model.num_given else "mdp",
-        "states": model.num_given,
+        "kind": "chain" if choices == model.num_unpadded else "mdp",
+        "states": model.num_unpadded,
         "choices": choices,
         "transitions": sum(count(table.probability) for table in model.tables) - ours,
         "seconds": seconds,
@@ -187,7 +187,7 @@ def _restored(
     if devices == model.num_devices:
         state = files.load(path, _state(model, bounds, 0, 0), mark)
     else:
-        count, size = model.num_given, -(-model.num_given // devices)
+        count, size = model.num_unpadded, -(-model.num_unpadded // devices)
         begins = np.arange(devices + 1) * count // devices
         each = np.concatenate(
             [np.arange(b - a) + i * size for i, (a, b) in enumerate(pairwise(begins))]

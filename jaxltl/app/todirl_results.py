@@ -35,7 +35,7 @@ class Worlds:
     # their products with the learner's memory, stacked; with a guarantee, restricted to optimal
     # actions
     model: Product
-    judged: Product  # their products with memory and formula, stacked
+    task_model: Product  # their products with memory and formula, stacked
     observation: jax.Array  # float[W, S, O]
 
     @property
@@ -53,17 +53,16 @@ class Setup:
     """A task, ready for learning."""
 
     task: TodirlFile  # the file
-    judge: Automaton  # judge, memory: the automata of the formula and of the learner's memory
-    memory: Automaton
+    automaton: Automaton  # of the formula
+    memory: Automaton  # of the learner's memory
     worlds: Worlds  # training worlds, then test worlds
     num_training: int  # number of training worlds
-    expert: jax.Array  # float[W, S, Q, A], the expert's policy in the judged products
+    expert: jax.Array  # float[W, S, Q, A], the expert's policy in the products `task_model`
     soft: bool  # whether the expert is soft-optimal for a reward, not the quickest optimal policy
     demonstrations: list[Trajectories]  # in each of the training worlds
     dropped: int  # number of simulated demonstrations that do not satisfy the formula
     requested: str | float  # the guarantee; a probability of 1 is "best"
-    # optimal actions in each world; None without a guarantee
-    sure: list[OptimalActions] | None = None
+    optimal: list[OptimalActions] | None = None  # in each world; None without a guarantee
     # bounds on the expected steps in each world; None without a guarantee and for safety formulas
     bounds: list[StepBound] | None = None
     left_out: int = 0  # number of demonstrated steps that are not optimal
@@ -73,7 +72,7 @@ class Setup:
     @property
     def loss(self) -> float:
         """Certified loss of optimal actions, the largest over worlds."""
-        return max((float(one.loss) for one in self.sure or ()), default=0.0)
+        return max((float(one.loss) for one in self.optimal or ()), default=0.0)
 
     @property
     def is_probability(self) -> bool:
@@ -102,7 +101,7 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Evaluation:
     """Policies in some worlds, and their satisfaction probabilities."""
 
     policy: np.ndarray  # float[W, S, Q, A] with the learner's memory, of the kept seed
@@ -125,7 +124,7 @@ class Outcome:
     setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
     chosen: int  # index of the kept seed, by held-out likelihood or loss
-    judged: Judged  # in all worlds
+    evaluation: Evaluation  # in all worlds
     seed: int  # the first seed
 
 
@@ -158,7 +157,7 @@ def summary(outcome: Outcome) -> Record:
             "weight": outcome.learned.weight,
         },
         "trivial": setup.trivial,
-        "acceptance": setup.judge.acceptance,
+        "acceptance": setup.automaton.acceptance,
         "expert": "soft" if setup.soft else "quickest",
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
@@ -178,16 +177,16 @@ def summary(outcome: Outcome) -> Record:
         },
     }
     time: Record | None = result["training"].get("expected_steps")
-    if time and setup.judge.is_cosafe:  # in the world of the largest multiple
+    if time and setup.automaton.is_cosafe:  # in the world of the largest multiple
         scene = setup.worlds.scenes[setup.worlds.names.index(time["worst_world"])]
-        time["front"] = front(product(scene.mdp, setup.judge, label_on=task.label_on))
+        time["front"] = front(product(scene.mdp, setup.automaton, label_on=task.label_on))
     return plain(result)
 
 
 def _about_learning(outcome: Outcome) -> Record:
     """The final figures and the history of the kept seed, and figures of all."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
-    history, seeds, counted = learned.history, outcome.judged.seeds, counted_worlds(setup)
+    history, seeds, counted = learned.history, outcome.evaluation.seeds, counted_worlds(setup)
     return {
         "learning": {
             **{k: history[k][-1][i] for k in ("loss", "neg_log_likelihood", "gradient_norm")},
@@ -216,13 +215,13 @@ def _about_learning(outcome: Outcome) -> Record:
 
 
 def _about_worlds(outcome: Outcome, part: slice) -> Record:
-    setup, judged = outcome.setup, outcome.judged
+    setup, evaluation = outcome.setup, outcome.evaluation
     scenes, names = setup.worlds.scenes[part], setup.worlds.names[part]
-    models = part_of(setup.worlds.judged, part)
+    models = part_of(setup.worlds.task_model, part)
     infeasible = [int(infeasible_starts(part_of(models, w)).sum()) for w in range(len(names))]
     leave_out = setup.task.left_out if part.start else ()
     record: Record = {"num_worlds": len(scenes)}
-    for who, performance in judged.performance.items():
+    for who, performance in evaluation.performance.items():
         mean = summarize(models, part_of(performance, part), names=names, leave_out=leave_out)
         record[who] = {
             "mean": enclosure(mean.mean, mean.lower, mean.upper),
@@ -233,14 +232,14 @@ def _about_worlds(outcome: Outcome, part: slice) -> Record:
         }
         record["infeasible"], record["left_out"] = list(mean.infeasible), list(mean.left_out)
         record["num_counted"] = mean.num_worlds
-    if judged.steps is not None and judged.quick_share is not None:
-        bounds, steps = (setup.bounds or [])[part], judged.steps[part]
+    if evaluation.steps is not None and evaluation.quick_share is not None:
+        bounds, steps = (setup.bounds or [])[part], evaluation.steps[part]
         least = np.array([b.quickest.steps.upper for b in bounds])
         possible = np.isfinite(least) & (least > 0)
         w = int(np.argmax(np.where(possible, steps[:, 2], 0) / np.where(possible, least, 1)))
         record["expected_steps"] = {
             "factor": bounds[w].factor,
-            "mixed": int((judged.quick_share[part] > 0).sum()),
+            "mixed": int((evaluation.quick_share[part] > 0).sum()),
             "worst_world": names[w],
             "learned": steps[w, 0],
             "learned_bounds": steps[w, 1:],
@@ -251,29 +250,29 @@ def _about_worlds(outcome: Outcome, part: slice) -> Record:
                 for name, each, bound in zip(names, steps, bounds, strict=True)
             ],
         }
-    record["solver"] = Status(int(judged.status[part].max())).name
+    record["solver"] = Status(int(evaluation.status[part].max())).name
     first = part.start or 0
     record["worlds"] = [
-        {**_about_world(scene, judged, first + w), "infeasible_starts": infeasible[w]}
+        {**_about_world(scene, evaluation, first + w), "infeasible_starts": infeasible[w]}
         for w, scene in enumerate(scenes)
     ]
     return record
 
 
-def _about_world(scene: Scene, judged: Judged, w: int) -> Record:
-    one = part_of(judged.performance["learned"], w)
+def _about_world(scene: Scene, evaluation: Evaluation, w: int) -> Record:
+    one = part_of(evaluation.performance["learned"], w)
     record = {
         "name": scene.name,
         "mean": enclosure(one.mean, one.lower, one.upper),
         "minimum": {
             **enclosure(one.worst, one.worst_lower, one.worst_upper),
-            **scene.where(int(one.worst_state)),
+            **scene.position(int(one.worst_state)),
         },
         "status": Status(int(one.status)).name,
-        "expert": judged.performance["expert"].mean[w],
-        "random": judged.performance["random"].mean[w],
+        "expert": evaluation.performance["expert"].mean[w],
+        "random": evaluation.performance["random"].mean[w],
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
     }
-    if judged.share is not None and judged.attained is not None:
-        record |= {"share": judged.share[w], "attained": judged.attained[w]}
+    if evaluation.share is not None and evaluation.attained is not None:
+        record |= {"share": evaluation.share[w], "attained": evaluation.attained[w]}
     return record

@@ -9,7 +9,7 @@ Result = Mapping[str, Any]  # contents of result.json
 Record = dict[str, Any]  # values by name: JSON objects, keyword arguments
 
 
-def where(state: int, shape: Sequence[int] | None) -> Record:
+def state_position(state: int, shape: Sequence[int] | None) -> Record:
     """A state's number from 0 and, on a map of a shape, its row and column from 1."""
     if shape is None:
         return {"state": int(state)}
@@ -22,13 +22,13 @@ def enclosure(*numbers: object) -> Record:
     return dict(zip(("value", "lower", "upper"), numbers, strict=True))
 
 
-def place(where: Result) -> str:
+def position_text(where: Result) -> str:
     """Text of a position: row and column on a map, else the state's name or number."""
     if "row" in where:
         return f"row {where['row']}, column {where['column']}"
     return f"state {where.get('name', where['state'])}"
 
 
-def many(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
     """Number with its noun, in the plural unless the number is 1."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -17,8 +17,8 @@ from jaxltl.algos.grounding.problem import (
     event_reward,
     forward,
     letter_log_probability,
+    mean_event_reward,
     memory_log_moves,
-    motive,
 )
 from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.envs.gridworld import gridworld
@@ -36,7 +36,7 @@ def world_of(text=MAP):
     return world, np.stack([cells == kind for kind in "abcd"], axis=1).astype(float)
 
 
-soft_policy = jax.jit(grounding.motive_policy)
+soft_policy = jax.jit(grounding.demonstrator_policy)
 
 
 def rollouts(model, policy, count, length, seed=0):
@@ -117,7 +117,7 @@ def test_likelihood_is_the_sum_over_letters_and_memory_paths():
 def test_gradient_is_that_of_differences():
     features = np.random.default_rng(0).normal(size=(1, 9, 4, 4, 2))
     problem = small_problem(features=features)
-    hparams = grounding.Hparams(scale=5.0, hardness=0.3)
+    hparams = grounding.Hparams(scale=5.0, entropy_weight=0.3)
     start = grounding.init(jax.random.key(0), problem, hparams).parameters
     flat, unravel = ravel_pytree(start)
 
@@ -151,7 +151,7 @@ def mlirl_log_likelihood(problem, kinds, scale, demonstrations):
         label=jnp.asarray(seen[:, list(kinds)] > 0), propositions=problem.symbols
     )
     model = jl.product(labelled, TASK)
-    reward = motive(
+    reward = mean_event_reward(
         labelled,
         jax.nn.one_hot(model.letter, model.automaton.delta.shape[1]),
         jnp.asarray(event_reward(model.automaton)),
@@ -237,7 +237,7 @@ def test_gradients_from_many_starts_find_the_grounding():
     world, seen = world_of("a . . b\n. c . .\n. . d .\n. c . .")
     shown = rollouts(*demonstrator(world), 15, 12)
     problem = grounding.make_problem(world, seen, shown, TASK)
-    hparams = grounding.Hparams(scale=20.0, hardness=0.01)
+    hparams = grounding.Hparams(scale=20.0, entropy_weight=0.01)
     train = jax.vmap(lambda key: grounding.train(key, problem, hparams, num_steps=60))
     state, metrics = train(jax.random.split(jax.random.key(0), 8))
     best = int(metrics.neg_log_likelihood[:, -1].argmin())
@@ -484,7 +484,7 @@ def symbols():
     problem = grounding.make_problem(mdp, np.eye(3), demonstrations, "!r U g")
     setting = partial(grounding.Hparams, discount=0.5)
     return LearnerCase(
-        grounding, problem, setting(), setting(l2=0.1, hardness=0.1, learning_rate=0.01)
+        grounding, problem, setting(), setting(l2=0.1, entropy_weight=0.1, learning_rate=0.01)
     )
 
 

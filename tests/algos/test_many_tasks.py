@@ -64,7 +64,9 @@ def episodes(environment, agent, keys):
 
 @pytest.fixture(scope="module")
 def plans():
-    return [many_tasks.make_plan(task, EVENTS, NAMES, depth=DEPTH, most=6) for task in TASKS]
+    return [
+        many_tasks.make_plan(task, EVENTS, NAMES, depth=DEPTH, max_sequences=6) for task in TASKS
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -144,7 +144,7 @@ def test_a_task_is_read(write):
     assert [scene.name for scene in test] == ["seed 0", "seed 1"]
     assert np.array_equal(training[0].colored.colors, WORLD.colors)
     assert training[0].observation.shape == (36, 45)
-    assert training[0].where(8) == {"state": 8, "row": 2, "column": 3}
+    assert training[0].position(8) == {"state": 8, "row": 2, "column": 3}
     assert test[0].mdp.label.sum(axis=0).tolist() == [1, 1, 1]
 
 

@@ -79,7 +79,10 @@ def test_the_world_is_what_was_counted(write):
         )
     )
     np.testing.assert_allclose([row[0], row[1], row[2]], np.array([50, 900, 100]) / 1050)
-    assert world.place(2) == "state pit" and world.where(1) == {"state": 1, "name": "goal"}
+    assert world.position_text(2) == "state pit" and world.position(1) == {
+        "state": 1,
+        "name": "goal",
+    }
     shown = load_demonstrations(task, world)
     assert shown.state.tolist() == [[0, 0]] and shown.action.tolist() == [[ramp, ramp]]
 

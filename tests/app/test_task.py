@@ -61,7 +61,7 @@ def test_a_task_is_read(write):
     task = MlirlFile.read(write())
     world = load_world(task.path, task.world)
     assert task.name == "task" and task.label_on == "entry"
-    assert world.cells.shape == (2, 3) and world.place(5) == "row 2, column 3"
+    assert world.cells.shape == (2, 3) and world.position_text(5) == "row 2, column 3"
     shown = load_demonstrations(task, world)
     assert shown.state.tolist() == [[3, 4]] and shown.action.tolist() == [[3, 3]]
 
@@ -261,7 +261,7 @@ def test_a_model_from_arrays(write):
     )
     world = load_world(task.path, task.world)
     assert world.actions == ("go", "wait") and world.cells is None
-    assert world.place(1) == "state 1"
+    assert world.position_text(1) == "state 1"
     path = task.path.parent / "shown.json"
     path.write_text('{"demonstrations": [{"states": [0, 0, 1], "actions": ["go", "go"]}]}')
     assert load_demonstrations(task, world).state.tolist() == [[0, 0]]

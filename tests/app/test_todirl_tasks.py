@@ -78,7 +78,7 @@ def prepared(path, seed=0):
 
 def own(setup, w):
     """The product of a world without padding."""
-    return jl.product(setup.worlds.scenes[w].mdp, setup.judge, label_on=setup.task.label_on)
+    return jl.product(setup.worlds.scenes[w].mdp, setup.automaton, label_on=setup.task.label_on)
 
 
 # --- tasks without end -------------------------------------------------------------------------
@@ -122,10 +122,10 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
     few = ("steps = 40", "steps = 2"), ("[task]", "[task]\nsteps_factor = 1.1")
     setup = prepared(write(*few, ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
     outcome = job.learn(setup, Training(0, 1))
-    assert (outcome.judged.quick_share[: setup.num_training] > 0).all()
+    assert (outcome.evaluation.quick_share[: setup.num_training] > 0).all()
     summary = job.summary(outcome)
     worlds = [x for kind in ("training", "test") for x in summary[kind]["expected_steps"]["worlds"]]
-    policies = outcome.judged.policy
+    policies = outcome.evaluation.policy
     for w, (world, policy) in enumerate(zip(worlds, policies, strict=True)):
         found = satisfaction_steps(part_of(setup.worlds.model, w), policy)
         assert world["quickest"] is not None or w == 2
@@ -151,8 +151,8 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
 )
 def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula, kind):
     setup = prepared(write((FORMULA, f'formula = "{formula}"')), seed=3)
-    assert setup.judge.acceptance == kind and not setup.soft
-    found = np.asarray(job._probability(setup.worlds.judged, setup.expert, None).value)
+    assert setup.automaton.acceptance == kind and not setup.soft
+    found = np.asarray(job._probability(setup.worlds.task_model, setup.expert, None).value)
     for w, scene in enumerate(setup.worlds.scenes):
         model, size = own(setup, w), scene.mdp.num_states
         best = jl.optimal_satisfaction(model)
@@ -161,7 +161,7 @@ def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula,
         memory = np.asarray(model.initial_memory)
         np.testing.assert_allclose(found[w, :size], value[np.arange(size), memory], atol=1e-12)
         starts = np.asarray(scene.mdp.initial) > 0
-        never = np.asarray(infeasible_starts(part_of(setup.worlds.judged, w)))
+        never = np.asarray(infeasible_starts(part_of(setup.worlds.task_model, w)))
         np.testing.assert_array_equal(
             never[:size][starts], value[np.arange(size), memory][starts] == 0
         )
@@ -187,12 +187,12 @@ def test_the_learner_is_given_what_the_task_is_not(write):
     setup = prepared(path)
     policy = np.full((3, 9, len(setup.memory.delta), 4), 0.25)
     policy[:] = np.random.default_rng(0).dirichlet(np.ones(4), policy.shape[:-1])
-    lifted = job.lift_memory_policy(jnp.asarray(policy), setup.judge)
-    found = job._probability(setup.worlds.judged, lifted, None)
-    same = job._probability(setup.worlds.judged, setup.expert, None)
+    lifted = job.lift_memory_policy(jnp.asarray(policy), setup.automaton)
+    found = job._probability(setup.worlds.task_model, lifted, None)
+    same = job._probability(setup.worlds.task_model, setup.expert, None)
     np.testing.assert_array_equal(same.mean, [1, 1, 0])
     for w in range(3):
-        model = part_of(setup.worlds.judged, w)
+        model = part_of(setup.worlds.task_model, w)
         value, _ = evaluate(model, lifted[w])
         np.testing.assert_allclose(
             found.value[w], value[np.arange(9), np.asarray(model.initial_memory)], atol=1e-12
@@ -203,7 +203,7 @@ def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
     within = ("discount = 0.9", "discount = 0.9\nhorizon = 15")
     with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends an episode .* has buchi"):
         prepared(write(within))
-    assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).judge.acceptance == "safety"
+    assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).automaton.acceptance == "safety"
 
 
 # --- a probability -----------------------------------------------------------------------------
@@ -274,7 +274,7 @@ def learned(path, seed=0):
 def check_reached(outcome, asked, over):
     """In every world that counts it has what was asked, and no more than the share gives it."""
     setup, mixed = outcome.setup, 0
-    judged = outcome.judged
+    judged = outcome.evaluation
     for w in range(setup.num_training + 2):
         model = own(setup, w)
         policy = judged.policy[w][: model.mdp.num_states]
@@ -311,7 +311,7 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     _, solution = plan_in(reward, scene.mdp, scene.observation)
     np.testing.assert_allclose(
         solution.policy,
-        outcome.judged.policy[outcome.setup.num_training][: scene.mdp.num_states],
+        outcome.evaluation.policy[outcome.setup.num_training][: scene.mdp.num_states],
         atol=1e-6,
     )
     scene = outcome.setup.worlds.scenes[3]

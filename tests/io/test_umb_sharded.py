@@ -45,7 +45,7 @@ def assert_same_on_mesh(found, expected):
             assert x.dtype == y.dtype and x.sharding == y.sharding
             np.testing.assert_array_equal(x, y, err_msg=name)
     np.testing.assert_allclose(found.initial, expected.initial, rtol=1e-15)
-    for name in ("propositions", "num_given", "mesh", "axis", "rounds"):
+    for name in ("propositions", "num_unpadded", "mesh", "axis", "rounds"):
         assert getattr(found, name) == getattr(expected, name), name
 
 

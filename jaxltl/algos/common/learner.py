@@ -382,12 +382,12 @@ class Best:
 
 
 def stop_early(
-    state: PyTree, after: PyTree, held_out: jax.Array, judged: jax.Array, patience: Numeric
+    state: PyTree, after: PyTree, held_out: jax.Array, evaluated: jax.Array, patience: Numeric
 ) -> tuple[Best, jax.Array]:
     """The :class:`Best` parameters so far, and ``bool[]``, whether patience has run out.
 
     Of the `state` before a step, with ``parameters``, ``step``, ``best`` and ``stopped``; the
-    parameters `after` it; their predecessors' negative log-likelihood `held_out`, ``float[]``; `judged`,
+    parameters `after` it; their predecessors' negative log-likelihood `held_out`, ``float[]``; `evaluated`,
     True with held-out data; and `patience`, in steps.
 
     >>> from types import SimpleNamespace
@@ -397,8 +397,8 @@ def stop_early(
     >>> stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)[1].item()
     True
     """
-    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
+    better = evaluated & (held_out < state.best.neg_log_likelihood) & ~state.stopped
     best = choose(better, Best(state.parameters, held_out, state.step), state.best)
     newest = Best(after, jnp.full_like(held_out, jnp.nan), state.step + 1)
-    stopped = state.stopped | (judged & (state.step - best.step >= patience))
-    return choose(judged, best, newest), stopped
+    stopped = state.stopped | (evaluated & (state.step - best.step >= patience))
+    return choose(evaluated, best, newest), stopped

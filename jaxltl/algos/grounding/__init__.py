@@ -49,5 +49,5 @@ from jaxltl.algos.grounding.problem import (
     Problem as Problem,
     event_reward as event_reward,
     make_problem as make_problem,
-    motive_policy as motive_policy,
+    demonstrator_policy as demonstrator_policy,
 )

@@ -13,7 +13,7 @@ Example: after the first symbol the second one.
   >>> from jaxltl.envs import gridworld
   >>> world = gridworld("a . . . b", slip=0.1)
   >>> model = jl.product(world, "F (a & F b)")
-  >>> shown = jl.models.rollout(model, grounding.motive_policy(model, 50.0, 0.9), jax.random.key(0),
+  >>> shown = jl.models.rollout(model, grounding.demonstrator_policy(model, 50.0, 0.9), jax.random.key(0),
   ...                           num_trajectories=20, num_steps=12, stop=model.final)
   >>> shown = jl.models.project_trajectories(model, shown)
   >>> found = grounding.learn_automaton(world, shown, 3, discount=0.9, num_starts=1)

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common.settings import Number, require_hparams
-from jaxltl.algos.grounding.problem import Hparams, Problem, certain_memory, motive_log_policy
+from jaxltl.algos.grounding.problem import Hparams, Problem, certain_memory, demonstrator_log_policy
 from jaxltl.core import struct
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata import Automaton, is_equivalent
@@ -315,7 +315,7 @@ def step_log_likelihood(
     models = replace(problem.model, letter=letter)
 
     def lane(model: Product) -> jax.Array:
-        return motive_log_policy(model, problem.event, scale, discount)
+        return demonstrator_log_policy(model, problem.event, scale, discount)
 
     log_policy = jax.vmap(lane)(models)
 

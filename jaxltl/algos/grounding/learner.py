@@ -1,7 +1,7 @@
 """Symbol grounding by gradients: maximum likelihood over soft groundings and a hidden memory.
 
-The demonstrator follows the soft policy of the motive in the soft product of the world and the task.
-Parameters are those of the grounding ``g(symbol | observation)``, the logarithm of the motive's scale,
+The demonstrator follows the soft policy of the event reward in the soft product of the world and the task.
+Parameters are those of the grounding ``g(symbol | observation)``, the logarithm of its scale,
 and the weights of features. The likelihood is differentiated implicitly through
 :func:`~jaxltl.core.values.discounted.soft.soft_value`. Many random starts are a ``vmap`` over keys.
 
@@ -55,7 +55,7 @@ from jaxltl.algos.grounding.problem import (
     forward,
     letter_log_probability,
     memory_log_moves,
-    motive,
+    mean_event_reward,
     soft_product,
 )
 from jaxltl.core import struct
@@ -83,7 +83,7 @@ class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
     Attributes:
-      loss: the objective, with prior and hardness.
+      loss: the objective, with the prior and the entropy.
       neg_log_likelihood: in nats, over all demonstrations.
       entropy: mean entropy of the letters in all states, in nats.
       gradient_norm: Euclidean.
@@ -122,7 +122,7 @@ def objective(
     """``-sum_n log sum_q prod_t pi(a_t | s_t, q_t) M(s_t, q_{t-1}, q_t) + penalties``.
 
     The loss ``float[]`` adds ``l2 / 2`` times the squared parameters of grounding and features and
-    ``hardness`` times the number of demonstrated steps times the mean entropy of the letters.
+    ``entropy_weight`` times the number of demonstrated steps times the mean entropy of the letters.
     Differentiable in the `parameters` of a `problem` with `hparams`, implicitly through the soft value.
     """
     log_policy, log_moves, letter, status = trees.each_world(
@@ -142,7 +142,7 @@ def objective(
     penalized = (parameters["grounding"], parameters["weights"])
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(penalized))
     loss = -jnp.sum(log_likelihoods) + hparams.l2 / 2 * squares
-    loss += hparams.hardness * jnp.sum(problem.length) * entropy
+    loss += hparams.entropy_weight * jnp.sum(problem.length) * entropy
     parts = Objective(
         log_likelihood=log_likelihoods,
         entropy=entropy,
@@ -168,7 +168,7 @@ def _lane(
     log_moves = memory_log_moves(log_letter, jnp.asarray(model.automaton.delta))
     letter = jnp.exp(log_letter)
     world = soft_product(model.mdp, jnp.exp(log_moves))
-    reward = jnp.exp(parameters["log_scale"]) * motive(model.mdp, letter, problem.event)
+    reward = jnp.exp(parameters["log_scale"]) * mean_event_reward(model.mdp, letter, problem.event)
     reward += features @ parameters["weights"]
     flat = reward.reshape(world.num_states, -1)
     solution = soft_value(world, flat, hparams.discount)

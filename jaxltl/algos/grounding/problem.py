@@ -64,9 +64,9 @@ class Problem:
       world: ``int32[N]``, the world of each demonstration.
       state, action: ``int32[N, T]``, the demonstrations, padded with zeros.
       length: ``int32[N]``, their numbers of steps.
-      event: ``float[Q, L]``, the motive: the reward of a transition of the automaton, in units of
+      event: ``float[Q, L]``, the event reward: that of a transition of the automaton, in units of
         ``scale``; see :func:`event_reward`.
-      features: ``float[W, S, Q, A, F]`` of a linear reward added to the motive; F may be 0.
+      features: ``float[W, S, Q, A, F]`` of a linear reward added to the event reward; F may be 0.
       network: the grounding, ``float[..., O] -> float[..., P]`` logits; static.
     """
 
@@ -96,7 +96,7 @@ class Hparams:
         event; default 10.
       l2: at least 0; precision of the Gaussian prior on the grounding's parameters and on the weights
         of features; default 1e-2.
-      hardness: at least 0; weight of the mean entropy of the letters, which hardens the grounding;
+      entropy_weight: at least 0; weight of the mean entropy of the letters, which hardens the grounding;
         default 0.
       learning_rate: default 0.1.
       optimizer: the name of one of optax; static; default ``"adam"``.
@@ -105,7 +105,7 @@ class Hparams:
     discount: Number = traced("discount", default=0.95)
     scale: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
     l2: Number = traced(Range(0, open_above=True), default=1e-2)
-    hardness: Number = traced(Range(0, open_above=True), default=0.0)
+    entropy_weight: Number = traced(Range(0, open_above=True), default=0.0)
     learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
     optimizer: str = static(optimizers.NAMES, default="adam")
 
@@ -128,7 +128,7 @@ def make_problem(
       task: a formula over P symbols without a meaning yet, or its automaton, co-safe, safety or Buchi.
       network: the grounding, a flax module ``float[..., O] -> float[..., P]``; default
         :class:`LinearGrounding`.
-      features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the motive;
+      features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the event reward;
         default none.
 
     Raises:
@@ -192,14 +192,14 @@ def require_task(task: Automaton | Formula | str) -> Automaton:
         )
     if automaton.is_parity:
         raise ValueError(
-            f"{text} needs parity acceptance, which has no motive of single events; give a co-safe, "
+            f"{text} needs parity acceptance, which has no reward of single events; give a co-safe, "
             "safety or Buchi task."
         )
     return automaton
 
 
 def event_reward(automaton: Automaton) -> jax.Array:
-    """The motive ``float[Q, L]``: 1 where a task is completed, -1 where it is violated.
+    """The event reward ``float[Q, L]``: 1 where a task is completed, -1 where it is violated.
 
     Of an `automaton` that is co-safe 1 on entering a final state; of a safety task -1 on leaving the final states; of
     a Buchi task 1 on each accepting transition.
@@ -317,33 +317,33 @@ def soft_product(world: MDP, moves: jax.Array) -> MDP:
     )
 
 
-def motive(world: MDP, letter: jax.Array, event: jax.Array) -> jax.Array:
+def mean_event_reward(world: MDP, letter: jax.Array, event: jax.Array) -> jax.Array:
     """Expected reward ``float[S, Q, A]`` of the next event ``float[Q, L]``, by letters ``float[S, L]``."""
     return jax.vmap(lambda row: expectation(world, letter @ row), out_axes=1)(event)
 
 
-def motive_policy(model: Product, scale: Number, discount: Number) -> jax.Array:
+def demonstrator_policy(model: Product, scale: Number, discount: Number) -> jax.Array:
     """The demonstrator's policy for a task with known labels, ``float[S, Q, A]``.
 
-    The soft policy of the motive in a `model` with the task: the events of
+    The soft policy of the event reward in a `model` with the task: the events of
     :func:`~jaxltl.algos.grounding.problem.event_reward` times `scale`, at a `discount`.
 
     >>> import jaxltl as jl
     >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]], label={"g": [1]})
-    >>> policy = motive_policy(jl.product(world, "F g"), 5.0, 0.9)
+    >>> policy = demonstrator_policy(jl.product(world, "F g"), 5.0, 0.9)
     >>> round(policy[0, 0, 0].item(), 2)
     0.69
     """
     event = jnp.asarray(event_reward(model.automaton), model.dtype)
-    return jnp.exp(motive_log_policy(model, event, scale, discount))
+    return jnp.exp(demonstrator_log_policy(model, event, scale, discount))
 
 
-def motive_log_policy(
+def demonstrator_log_policy(
     model: Product, event: jax.Array, scale: Number, discount: Number
 ) -> jax.Array:
     """Logarithm of the soft policy of events ``float[Q, L]`` in a product, ``float[S, Q, A]``."""
     letter = jax.nn.one_hot(model.letter, event.shape[1], dtype=model.dtype)
-    reward = scale * motive(model.mdp, letter, event)
+    reward = scale * mean_event_reward(model.mdp, letter, event)
     solution = soft_value(model, reward, discount, tolerance=_TOLERANCE)
     return jax.nn.log_softmax(policy_logits(model, reward, discount, solution.value), axis=-1)
 

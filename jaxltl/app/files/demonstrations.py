@@ -81,15 +81,15 @@ def _check_steps(states: list[int], actions: list[int], world: World) -> None:
     available = np.asarray(world.mdp.available)
     successor, probability = np.asarray(world.mdp.successor), np.asarray(world.mdp.probability)
     for t, (s, a) in enumerate(zip(states, actions, strict=False)):
-        step = f", step {t + 1}: {world.actions[a]!r} in {world.place(s)}"
+        step = f", step {t + 1}: {world.actions[a]!r} in {world.position_text(s)}"
         if not available[s, a]:
             options = ", ".join(np.array(world.actions)[available[s]])
             raise ValueError(f"{step} is not available there; available are {options}.")
         reached = np.unique(successor[s, a][probability[s, a] > 0])
         if t + 1 < len(states) and states[t + 1] not in reached:
-            options = " or ".join(world.place(r) for r in reached)
+            options = " or ".join(world.position_text(r) for r in reached)
             raise ValueError(
-                f"{step} cannot lead to {world.place(states[t + 1])}, which comes next; it "
+                f"{step} cannot lead to {world.position_text(states[t + 1])}, which comes next; it "
                 f"leads to {options}."
             )
 

@@ -159,7 +159,7 @@ class World:
     places: np.ndarray | None = None
     objective: Parity | None = None  # the parity condition of the game's own file, or None
 
-    def where(self, state: int) -> Record:
+    def position(self, state: int) -> Record:
         """Both robots' rows and columns from 1, or the state's number from 0."""
         if self.places is None:
             return {"state": int(state)}
@@ -178,7 +178,7 @@ class World:
         return int(system), int(environment)
 
     def describe(self, state: int) -> str:
-        where = self.where(state)
+        where = self.position(state)
         if self.places is None:
             return f"state {where['state']}"
         return ", ".join(

@@ -40,7 +40,7 @@ class Scene(World):
         return rows, columns
 
 
-def load_scenes(task: TodirlFile, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
+def load_scenes(task: TodirlFile, automaton: Automaton) -> tuple[list[Scene], list[Scene]]:
     """The training worlds and the test worlds."""
     test_maps = (task.test and task.test.maps) or []
     training = [_read_scene(task, "world", i, x) for i, x in enumerate(task.world.maps)]
@@ -53,7 +53,7 @@ def load_scenes(task: TodirlFile, judge: Automaton) -> tuple[list[Scene], list[S
                 "give all of them by [world] objects and obstacles, or alike in each map."
             )
     if task.test is not None and task.test.generate is not None:
-        test += _generate(task, task.test.generate, first, judge)
+        test += _generate(task, task.test.generate, first, automaton)
     for table, scenes in (("world", training), ("test", test)):
         names = [scene.name for scene in scenes]
         if twice := [name for name in names if names.count(name) > 1]:
@@ -155,7 +155,7 @@ def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> n
     return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)
 
 
-def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> list[Scene]:
+def _generate(task: TodirlFile, number: int, first: Scene, automaton: Automaton) -> list[Scene]:
     table, colored = task.test, first.colored
     assert table is not None and colored is not None
     objects, obstacles = _objects(task.world), _obstacles(task.world)
@@ -175,7 +175,7 @@ def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> 
     with errors_in(f"{task.path}: [test] generate: "):
         worlds = temporal_gridworld.random_worlds(
             seeds,
-            judge,
+            automaton,
             shape=table.shape or first.shape,
             objects=objects,
             obstacles=obstacles,
@@ -196,16 +196,16 @@ def _generate(task: TodirlFile, number: int, first: Scene, judge: Automaton) -> 
 def load_automata(task: TodirlFile) -> tuple[Automaton, Automaton]:
     """Automata of the formula and the memory, over the labels of all kinds of cells."""
     alphabet = _alphabet(task)
-    judge = _translate(task, "[task] formula", task.formula, alphabet)
-    if task.learner.horizon is not None and not judge.has_final_states:
+    automaton = _translate(task, "[task] formula", task.formula, alphabet)
+    if task.learner.horizon is not None and not automaton.has_final_states:
         raise ValueError(
             f"{task.path}: [learner] horizon = {task.learner.horizon} ends an episode after so "
             "many steps, which satisfy co-safe formulas and violate safety formulas only (the "
-            f"formula has {judge.acceptance} acceptance); leave it out, with a discount below 1."
+            f"formula has {automaton.acceptance} acceptance); leave it out, with a discount below 1."
         )
     if task.memory == task.formula:
-        return judge, judge
-    return judge, _translate(task, "[learner] memory", task.memory, alphabet)
+        return automaton, automaton
+    return automaton, _translate(task, "[learner] memory", task.memory, alphabet)
 
 
 def _alphabet(task: TodirlFile) -> list[frozenset[str]]:

@@ -17,7 +17,7 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
-from jaxltl.app.wording import Record, place, where
+from jaxltl.app.wording import Record, position_text, state_position
 
 if TYPE_CHECKING:
     from jaxltl.app.certify import Logged
@@ -37,13 +37,13 @@ class World:
         """Rows and columns of the map, if there is one."""
         return None if self.cells is None else self.cells.shape
 
-    def where(self, state: int) -> Record:
+    def position(self, state: int) -> Record:
         """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
-        position = where(state, self.shape)
+        position = state_position(state, self.shape)
         return position if self.logged is None else {**position, "name": self.logged.states[state]}
 
-    def place(self, state: int) -> str:
-        return place(self.where(state))
+    def position_text(self, state: int) -> str:
+        return position_text(self.position(state))
 
 
 def grid_options(table: GridTable) -> Record:

@@ -25,7 +25,7 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.wording import Record, Result, many, place
+from jaxltl.app.wording import Record, Result, counted, position_text
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict
 from jaxltl.core.values.undiscounted.mixture import from_starts
@@ -42,7 +42,7 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
             kind,
             probability(result[key][kind]["value"]),
             certified(result[key][kind]),
-            place(result[key][kind]) if kind == "minimum" else "",
+            position_text(result[key][kind]) if kind == "minimum" else "",
             result[key]["status"].lower(),
         )
         for title, key in (("learned policy", "satisfaction"), ("optimum", "best_achievable"))
@@ -84,7 +84,7 @@ def _values(result: Result) -> Record:
     if data is not None:
         from_log = (
             f"with confidence {data['confidence']:g}, from "
-            f"{many(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
+            f"{counted(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
         )
     # The likelihood is 0 if a demonstrated step has probability 0.
     never = result["guarantee"].get("never")

@@ -104,8 +104,8 @@ _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 def task_pictures(setup: Setup) -> list[Picture]:
     """Pictures of the automata of the formula and of the memory."""
-    same = setup.memory is setup.judge
-    drawings = [automaton_picture(setup.judge, "training-1" if same else "")]
+    same = setup.memory is setup.automaton
+    drawings = [automaton_picture(setup.automaton, "training-1" if same else "")]
     if not same:
         drawings.append(
             Picture(
@@ -183,17 +183,17 @@ class _Drawn:
     @property
     def policy(self) -> np.ndarray:
         """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
-        return self.outcome.judged.policy[self.w][..., : self.scene.mdp.num_states, :, :]
+        return self.outcome.evaluation.policy[self.w][..., : self.scene.mdp.num_states, :, :]
 
     @property
     def value(self) -> np.ndarray:
         """``[S]``: the satisfaction probability from an initial state."""
-        value = self.outcome.judged.performance["learned"].value[self.w]
+        value = self.outcome.evaluation.performance["learned"].value[self.w]
         return np.asarray(value)[: self.scene.mdp.num_states]
 
 
 def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
-    setup, mean = outcome.setup, np.asarray(outcome.judged.performance["learned"].mean)
+    setup, mean = outcome.setup, np.asarray(outcome.evaluation.performance["learned"].mean)
 
     def drawn(
         w: int, kind: str, stem: str, arrows: bool, demonstrations: Trajectories | None
@@ -235,7 +235,7 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
         actions=ACTIONS,
         label="satisfaction probability",
         wall=setup.task.world.wall or "#",
-        goal="the formula" if setup.memory is setup.judge else "the memory's formula",
+        goal="the formula" if setup.memory is setup.automaton else "the memory's formula",
     )
 
 
@@ -268,7 +268,7 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
     if one.policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
-        satisfied = setup.judge.is_cosafe  # by a finite prefix
+        satisfied = setup.automaton.is_cosafe  # by a finite prefix
         end = "satisfied or violated" if satisfied else f"violated, or for {LONGEST_RUN} steps"
         drawings.append(
             Picture(
@@ -293,8 +293,8 @@ def _memory_names(setup: Setup) -> dict[int, str]:
 def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
     setup, policy, count = outcome.setup, one.policy, 1
-    if setup.memory is not setup.judge:
-        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge))
-        count = len(setup.judge.delta)  # the formula's automaton state varies fastest
-    rollouts = learned_runs(part_of(setup.worlds.judged, one.w), policy, outcome.seed)
+    if setup.memory is not setup.automaton:
+        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.automaton))
+        count = len(setup.automaton.delta)  # the formula's automaton state varies fastest
+    rollouts = learned_runs(part_of(setup.worlds.task_model, one.w), policy, outcome.seed)
     return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in rollouts]

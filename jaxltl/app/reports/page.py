@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.explorer import START, Curves, Explorer, Run
-from jaxltl.app.wording import Record, Result, many, place, where
+from jaxltl.app.wording import Record, Result, counted, position_text, state_position
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -112,7 +112,7 @@ def render_text(template: str, **values: object) -> list[str]:
 @functools.cache
 def _environment() -> jinja2.Environment:
     environment = templates.environment("jaxltl.app.reports")
-    formats = (number, probability, certified, mean_deviation, rounded_down, place, many)
+    formats = (number, probability, certified, mean_deviation, rounded_down, position_text, counted)
     environment.filters |= {function.__name__: function for function in formats}
     parts = (position, layer_table, run_rows, automaton_rows, curve_table)
     environment.globals |= {function.__name__: function for function in parts}
@@ -179,7 +179,7 @@ def _memory_texts(part: Explorer) -> dict[str, str]:
 
 def position(part: Explorer, state: int) -> str:
     """The text of a state's position."""
-    return part.places.get(state) or place(where(state, part.shape))
+    return part.places.get(state) or position_text(state_position(state, part.shape))
 
 
 def layer_table(part: Explorer, key: str) -> tuple[tuple[object, ...], list[Any], str]:

@@ -51,7 +51,7 @@ def summary(synthesis: Synthesis, seconds: float) -> Record:
             "states": int(wins.sum()),
             "initial_states": won,
             "num_initial_states": int(starts.size),
-            "lost_initial_states": [world.where(s) for s in synthesis.lost_starts[:100]],
+            "lost_initial_states": [world.position(s) for s in synthesis.lost_starts[:100]],
         },
         "verdict": synthesis.verdict._asdict(),
         "strategy": _about_strategy(synthesis),
@@ -64,7 +64,7 @@ def summary(synthesis: Synthesis, seconds: float) -> Record:
                 {
                     "mover": step.mover,
                     "move": step.action,
-                    **world.where(int(synthesis.nodes.world_state[step.node])),
+                    **world.position(int(synthesis.nodes.world_state[step.node])),
                 }
                 for step in synthesis.play.steps
             ],
@@ -143,9 +143,9 @@ def describe_play(synthesis: Synthesis) -> list[str]:
     play, world = synthesis.play, synthesis.world
     if play is None:
         return []
-    rows = [["step", "mover", "move", *(world.where(0))]]
+    rows = [["step", "mover", "move", *(world.position(0))]]
     for i, step in enumerate(play.steps):
-        where = world.where(int(synthesis.nodes.world_state[step.node])).values()
+        where = world.position(int(synthesis.nodes.world_state[step.node])).values()
         cells = (f"{x['row']}, {x['column']}" if isinstance(x, dict) else str(x) for x in where)
         rows.append([str(i), step.mover, step.action, *cells])
     return [f"  {line}" for line in (*aligned(rows), _ending(play, synthesis))]

@@ -39,7 +39,7 @@ class Sequences:
     Example:
       >>> import jaxltl as jl
       >>> task = jl.to_automaton("F b", letters=[{}, {"b"}])
-      >>> found = jl.automata.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
+      >>> found = jl.automata.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, max_sequences=1)
       >>> found.reach[0, 0].tolist(), found.length.tolist()
       ([[False, True]], [[1], [0]])
     """
@@ -66,7 +66,7 @@ def reach_avoid_sequences(
     propositions: tuple[str, ...],
     *,
     depth: int = 6,
-    most: int = 16,
+    max_sequences: int = 16,
 ) -> Sequences:
     """Reach-avoid sequences that lead from each state of an automaton to acceptance.
 
@@ -81,7 +81,7 @@ def reach_avoid_sequences(
       events: bool `[E, P]`, the labels that occur in the world.
       propositions: names of the P columns; the automaton need not use all.
       depth: D, the number of steps that are kept.
-      most: M, the number of sequences that are kept; they differ within D steps, or in length.
+      max_sequences: M, the number of sequences that are kept; they differ within D steps, or in length.
 
     Returns:
       `Sequences` of arrays on the host.
@@ -94,15 +94,15 @@ def reach_avoid_sequences(
       >>> from jaxltl import to_automaton
       >>> task = to_automaton("!a U (b & F c)", letters=[{}, {"a"}, {"b"}, {"c"}])
       >>> events = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-      >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, most=1)
+      >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, max_sequences=1)
       >>> found.length[0].tolist(), found.reach[0, 0].astype(int).tolist()
       ([2], [[0, 0, 1, 0], [0, 0, 0, 1]])
       >>> found.avoid[0, 0].astype(int).tolist()
       [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
-    depth, most = (
+    depth, max_sequences = (
         validation.integer(name, number, least=1, limit=2**16)
-        for name, number in (("depth", depth), ("most", most))
+        for name, number in (("depth", depth), ("max_sequences", max_sequences))
     )
     validation.instance("automaton", automaton, Automaton, "one of to_automaton")
     propositions = validation.distinct_names("propositions", propositions)
@@ -111,8 +111,8 @@ def reach_avoid_sequences(
     tables = _Tables(delta, priority, live, _distances(delta, priority, live, done))
     moves = [_moves(*rows) for rows in zip(delta, priority, strict=True)]
     count, width = delta.shape
-    reach = np.zeros((count, most, depth, width), bool)
-    avoid, length = reach.copy(), np.zeros((count, most), np.int32)
+    reach = np.zeros((count, max_sequences, depth, width), bool)
+    avoid, length = reach.copy(), np.zeros((count, max_sequences), np.int32)
     for q in np.flatnonzero(live & ~done):
         keys: set[tuple[int, bytes, bytes]] = set()
         for stem, cycle in _paths(int(q), moves, live, done):
@@ -123,7 +123,7 @@ def reach_avoid_sequences(
             row = len(keys)
             keys.add(key)
             reach[q, row], avoid[q, row], length[q, row] = wanted, shunned, size
-            if len(keys) == most:
+            if len(keys) == max_sequences:
                 break
     return Sequences(reach, avoid, length)
 

@@ -129,7 +129,7 @@ class TracedGraph:
 
     def on_choices(self, states: jax.Array) -> jax.Array:
         """A set of states as a mask of choices: ``bool[S, 1]`` or ``bool[R]``."""
-        return choices(self.model).spread(states)
+        return choices(self.model).broadcast(states)
 
     def exists(self, region: jax.Array) -> jax.Array:
         """Mask of choices with some successor in a region: ``bool[S, A]``; False where unavailable."""

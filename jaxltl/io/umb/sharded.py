@@ -69,7 +69,7 @@ def read_sharded(
       >>> import tempfile, jax, jaxltl as jl
       >>> path = tempfile.mkdtemp() + "/coin.umb"
       >>> jl.write_model(path, jl.make_sparse(None, [0, 1], [0], [1.0]))
-      >>> read_sharded(path, jax.make_mesh((1,), ("states",))).num_given
+      >>> read_sharded(path, jax.make_mesh((1,), ("states",))).num_unpadded
       1
     """
     with opened(path) as file:

@@ -36,7 +36,7 @@ def test_who_follows_a_sequence_is_accepted(seed):
     formula = random_formula(random.Random(seed), 6, NAMES)
     automaton = to_automaton(formula, letters=LETTERS)
     depth = 40
-    found = reach_avoid_sequences(automaton, EVENTS, NAMES, depth=depth, most=4)
+    found = reach_avoid_sequences(automaton, EVENTS, NAMES, depth=depth, max_sequences=4)
     live, done = live_states(automaton), universal_states(automaton)
     assert ((found.length > 0).any(1) == (live & ~done)).all()
     assert not (found.reach & found.avoid).any()
@@ -58,7 +58,7 @@ def test_who_follows_a_sequence_is_accepted(seed):
 
 def test_a_set_back_is_avoided_and_other_progress_is_not():
     task = to_automaton("F(a & (!b U c)) & F b", letters=LETTERS)
-    found = reach_avoid_sequences(task, EVENTS, NAMES, depth=3, most=8)
+    found = reach_avoid_sequences(task, EVENTS, NAMES, depth=3, max_sequences=8)
     rows = np.flatnonzero(found.length[task.initial])
     orders = {tuple(tuple(np.flatnonzero(r)) for r in found.reach[task.initial, m]) for m in rows}
     assert ((1,), (3,), (2, 4)) in orders  # a, then c, then any b
@@ -73,7 +73,7 @@ def test_a_set_back_is_avoided_and_other_progress_is_not():
         ({"propositions": ("a", "b", "x")}, "mentions the proposition 'c'"),
         ({"events": [[1, 1, 1]]}, r"does not read the event \{a, b, c\}"),
         ({"depth": 0}, "depth=0"),
-        ({"most": 0}, "most=0"),
+        ({"max_sequences": 0}, "max_sequences=0"),
     ],
 )
 def test_bad_input_is_named(given, said):

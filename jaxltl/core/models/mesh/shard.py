@@ -193,7 +193,7 @@ def to_mesh(model: ShardedMDP, quantity: Array, fill: Array = 0) -> jax.Array:
     (2,)
     """
     quantity, index = np.asarray(quantity), model.number
-    if quantity.shape[:1] != (model.num_given,):
+    if quantity.shape[:1] != (model.num_unpadded,):
         index = _rows_of(model, quantity.shape)
     if quantity.dtype.kind == "f":
         if index is model.row or quantity.ndim > 1:
@@ -220,9 +220,9 @@ def _refuse_underflow(weight: np.ndarray, dtype: np.dtype) -> None:
 def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
     available = int(jax.jit(lambda x: x.sum())(model.available))
     # The states that fill the last device have one choice each.
-    if model.row is None or shape != (available - (model.num_states - model.num_given),):
+    if model.row is None or shape != (available - (model.num_states - model.num_unpadded),):
         raise ValueError(
-            f"the quantity has shape {shape}; expected ({model.num_given}, ...), a number for each "
+            f"the quantity has shape {shape}; expected ({model.num_unpadded}, ...), a number for each "
             "state or each pair of a state and an action, or for each choice of a sparse model."
         )
     return model.row
@@ -244,7 +244,7 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     [1.0, 2.0]
     """
     number, laid = on_host((model.number, quantity))
-    result = np.zeros((model.num_given, *laid.shape[1:]), laid.dtype)
+    result = np.zeros((model.num_unpadded, *laid.shape[1:]), laid.dtype)
     result[number[number >= 0]] = laid[number >= 0]
     return result
 
@@ -310,7 +310,7 @@ def _assembled(
         sent=tuple(layout.array(x) for x in halo.sent),
         label_rows=layout.replicated(labels),
         propositions=propositions,
-        num_given=num_states,
+        num_unpadded=num_states,
         mesh=layout.mesh,
         axis=layout.axis,
         rounds=halo.rounds,
@@ -328,7 +328,7 @@ def _checked(
     starts = piece.entry_start if piece.row_start is None else piece.row_start
     if np.size(starts) != count + 1:
         raise ValueError(f"{place} has {np.size(starts) - 1} states; it must have {count}.")
-    initial = np.full(count, 1 / layout.num_given)
+    initial = np.full(count, 1 / layout.num_unpadded)
     if piece.initial is not None:
         initial = validation.float_array("initial", piece.initial)
     label = np.zeros((count, len(names)), bool) if piece.label is None else piece.label
@@ -348,7 +348,7 @@ def _checked(
         piece.successor,
         piece.probability,
         (start, 0, 0),
-        layout.num_given,
+        layout.num_unpadded,
         label=label,
         propositions=names,
         action=piece.action,
@@ -407,14 +407,14 @@ def _halo(layout: StateLayout, parts: Mapping[int, SparseMDP]) -> _Halo:
     count, size = layout.parts, layout.size
     requested = {}
     for d, part in parts.items():
-        wanted = np.zeros(layout.num_given, bool)
+        wanted = np.zeros(layout.num_unpadded, bool)
         wanted[part.successor] = True
         wanted[slice(*layout.span(d))] = False
         requested[d] = np.flatnonzero(wanted)
     lengths = np.concatenate(
         layout.exchanged({d: np.array([x.size]) for d, x in requested.items()})
     )
-    if lengths.sum() > _HALO * layout.num_given * (count - 1):
+    if lengths.sum() > _HALO * layout.num_unpadded * (count - 1):
         return _Halo(layout, None, [], None, {})
     every = layout.exchanged(requested)
     rounds, sent, first, begins = [], [], {}, size

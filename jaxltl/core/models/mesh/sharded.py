@@ -30,17 +30,17 @@ class StateLayout(NamedTuple):
 
     mesh: Mesh
     axis: str
-    num_given: int
+    num_unpadded: int
     order: np.ndarray | None = None
 
     @property
     def starts(self) -> np.ndarray:
         """The first state of each range, and S."""
-        return np.arange(self.parts + 1) * self.num_given // self.parts
+        return np.arange(self.parts + 1) * self.num_unpadded // self.parts
 
     @property
     def size(self) -> int:
-        return -(-self.num_given // self.parts)
+        return -(-self.num_unpadded // self.parts)
 
     def place(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The range of each state, and its place there."""
@@ -139,7 +139,7 @@ class RowTable(NamedTuple):
 def _facts(model: ShardedMDP) -> tuple[str, ...]:
     rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
     return (
-        count(model.num_given, "state"),
+        count(model.num_unpadded, "state"),
         count(model.num_actions, "action"),
         f"rows {truncate(rows)}",
         propositions_text(model.propositions),
@@ -169,14 +169,14 @@ class ShardedMDP:
       number, row: ``int32[N]`` and ``int32[N, A]``, the state and the row of the original model, or -1;
         `row` only for a sparse original model, else None.
       propositions: the P names; static.
-      num_given: S, the states of the original model; static.
+      num_unpadded: S, the states of the original model; static.
       mesh, axis: the devices, and the mesh axis of the states; static.
       rounds: for each round the pairs (source, target) of devices; None: all-gather; static.
 
     >>> import jaxltl as jl
     >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
     >>> model = jl.models.shard(path, jax.make_mesh((1,), ("states",)))
-    >>> model.num_given, model.num_devices, model.num_exchanged
+    >>> model.num_unpadded, model.num_devices, model.num_exchanged
     (2, 1, 0)
     """
 
@@ -191,7 +191,7 @@ class ShardedMDP:
     number: jax.Array
     row: jax.Array | None
     propositions: tuple[str, ...] = struct.field(pytree_node=False)
-    num_given: int = struct.field(pytree_node=False)
+    num_unpadded: int = struct.field(pytree_node=False)
     mesh: Mesh = struct.field(pytree_node=False)
     axis: str = struct.field(pytree_node=False)
     rounds: tuple[tuple[tuple[int, int], ...], ...] | None = struct.field(pytree_node=False)

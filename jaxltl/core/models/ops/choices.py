@@ -81,7 +81,7 @@ class Actions:
     def layout(self) -> Columns:
         return Columns()
 
-    def spread(self, x: jax.Array) -> jax.Array:
+    def broadcast(self, x: jax.Array) -> jax.Array:
         """Broadcasts a quantity on states to choices."""
         return x[..., None]
 
@@ -134,7 +134,7 @@ class Actions:
 class Columns:
     """Padded choices as an array ``[N, ...]`` for each action; weight 0 and value -inf where unavailable."""
 
-    def spread(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
+    def broadcast(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
         """Broadcasts a quantity on states to choices."""
         return [x] * len(like)
 
@@ -198,7 +198,7 @@ class Rows:
     def size(self, quantity: jax.Array) -> int:
         return self.num_states
 
-    def spread(self, x: jax.Array, like: jax.Array | None = None) -> jax.Array:
+    def broadcast(self, x: jax.Array, like: jax.Array | None = None) -> jax.Array:
         """See :class:`Actions`; with `like`, a quantity without an axis of states is unchanged."""
         x = jnp.asarray(x)
         if like is not None and x.ndim < like.ndim:
@@ -242,11 +242,11 @@ class Rows:
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
         top = lax.stop_gradient(self.top(logits))
-        return jnp.log(self.sum(jnp.exp(logits - self.spread(top)))) + top
+        return jnp.log(self.sum(jnp.exp(logits - self.broadcast(top)))) + top
 
     def softmax(self, logits: jax.Array) -> jax.Array:
-        raised = jnp.exp(logits - self.spread(lax.stop_gradient(self.top(logits))))
-        return raised / self.spread(self.sum(raised))
+        raised = jnp.exp(logits - self.broadcast(lax.stop_gradient(self.top(logits))))
+        return raised / self.broadcast(self.sum(raised))
 
     def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
         if is_deterministic(policy):

@@ -401,9 +401,9 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     total = over.sum(masked)
     row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(masked >= 0)
     row |= ~jnp.asarray(where & unpadded_states(model))
-    uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
+    uniform = available / over.broadcast(jnp.maximum(over.sum(available), 1))
     used = jnp.where(
-        over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
+        over.broadcast(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
     )
     valid = jnp.all(row) & ~jnp.any(is_subnormal(policy))
     return Policy(used, lax.stop_gradient(masked), valid, is_representable(model))

@@ -85,13 +85,13 @@ class Factors(NamedTuple):
             if not np.isfinite(right).all():
                 return np.full(b.size, np.nan)
             x[block.order] = (
-                _swept(block.inner, right)
+                _iterative_solution(block.inner, right)
                 if block.factor is None
                 else block.factor.solve(right, trans="T")
             )
         return x
 
-    def other(self, chosen: Integers) -> Factors | None:
+    def refactorize(self, chosen: Integers) -> Factors | None:
         """The factors of another policy, in the same order unless that fills more."""
         blocks = []
         for block in self.blocks:
@@ -106,7 +106,7 @@ class Factors(NamedTuple):
             blocks.append(new._replace(fill=block.fill))
         return self._replace(blocks=tuple(blocks))
 
-    def eliminated(self, chosen: Integers) -> Factors | None:
+    def without_krylov(self, chosen: Integers) -> Factors | None:
         """The factors without Krylov methods, for policies on which these fail; None if too large."""
         if not any(x.factor is None for x in self.blocks):
             return None
@@ -330,7 +330,7 @@ def _transposed_system(matrix: SparseMatrix) -> SparseMatrix:
     return sparse.csc_array((data, indices, start), shape=matrix.shape)
 
 
-def _swept(matrix: SparseMatrix, b: Floats) -> Floats:
+def _iterative_solution(matrix: SparseMatrix, b: Floats) -> Floats:
     """Solution by BiCGSTAB (van der Vorst 1992), then by sweeps while the residual shrinks."""
     size = np.abs(b).max(initial=0)
     x, residual = np.zeros(b.size), np.array(b)
@@ -404,6 +404,6 @@ class SystemSequence:
         if self.factors is None:
             self.factors = factorize(matrix, self.label(), rows)
         else:
-            self.factors = self.factors._replace(rows=matrix).other(rows)
+            self.factors = self.factors._replace(rows=matrix).refactorize(rows)
         self.matrix = matrix
         return self.factors is not None

@@ -218,7 +218,7 @@ def _signed(
         best = np.maximum.reduceat(gain, starts)
         better = (gain == best[owner]) & (best > -extra / 2)[owner]
         chosen = first_hits(better, owner, chosen)
-        solver = solver.other(chosen)
+        solver = solver.refactorize(chosen)
     return np.full(mdp.num_states, np.inf), policy
 
 

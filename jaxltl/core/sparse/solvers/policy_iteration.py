@@ -307,7 +307,7 @@ class _CoreSolver:
                 extra = self._extra_cost(solver.solve(weight), costs, margin)
             value = solver.solve(equation.cost[policy] + sign * extra * weight)
             if not np.isfinite(value).all():
-                solver = solver.eliminated(policy)
+                solver = solver.without_krylov(policy)
                 extra = extra if np.isfinite(extra) else None
                 continue
             late = rounds % (2 * _SWEPT_ROUNDS) == 0
@@ -324,7 +324,7 @@ class _CoreSolver:
                 policy = self._improved(value, policy, extra * weight, strict)
                 if strict and (policy == before).all():
                     break  # the gains are rounding
-                solver = solver.other(policy)
+                solver = solver.refactorize(policy)
                 continue
             time = solver.solve(weight)
             attained = self._certified(policy, value, extra, weight, time)
@@ -412,7 +412,7 @@ class _CoreSolver:
 
         def solver_of(rows: Integers) -> Solver | None:
             solver = factorize(self.equation.matrix, self.label, rows)
-            return None if solver is None else (solver.eliminated(rows) or solver).solve
+            return None if solver is None else (solver.without_krylov(rows) or solver).solve
 
         return self._refined(policy, solver_of)
 

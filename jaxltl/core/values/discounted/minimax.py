@@ -40,7 +40,7 @@ from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import (
     Enclosure,
     backup_error,
-    judged,
+    make_enclosure,
     refuse,
     rounding_unit,
 )
@@ -236,12 +236,12 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
     """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
     weight, joint, valid, representable = valid_policy(game, jnp.asarray(strategy), read)
-    weight = jnp.where(over.spread(read), weight, 0)  # rows that are not read
+    weight = jnp.where(over.broadcast(read), weight, 0)  # rows that are not read
     if environment is not None:
         read = _read(game, ~game.system)
         other = valid_policy(game, jnp.asarray(environment), read)
-        weight = jnp.where(over.spread(read), other.distribution, weight)
-        joint = jnp.where(over.spread(read), other.masked, joint)
+        weight = jnp.where(over.broadcast(read), other.distribution, weight)
+        joint = jnp.where(over.broadcast(read), other.masked, joint)
         valid &= other.valid
     return _Drawn(Policy(weight, joint, valid, representable), lax.stop_gradient(weight) > 0)
 
@@ -277,12 +277,12 @@ class _Play(NamedTuple):
 
 def _chosen(over: Layout, q: Quantity, play: _Play) -> tuple[jax.Array, Quantity]:
     """Values and weights of both players' best moves."""
-    own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.spread(play.system, q), q)
+    own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.broadcast(play.system, q), q)
     best, weight = best_action(over, own, play)
     best = jnp.where(play.system, best, -best)
     if play.drawn is None:
         return best, weight
-    weight = jax.tree.map(jnp.where, over.spread(play.drawn, q), play.weight, weight)
+    weight = jax.tree.map(jnp.where, over.broadcast(play.drawn, q), play.weight, weight)
     return jnp.where(play.drawn, _mean(over, weight, q), best), weight
 
 
@@ -298,7 +298,7 @@ def _gains(
     never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
     if play.drawn is not None:
         never = jnp.where(play.drawn, 0, never)
-    to_choices = rows.choices.spread
+    to_choices = rows.choices.broadcast
     return jax.tree.map(
         lambda lives, m, r, none: jnp.where(lives, jnp.where(m, r, none), 0),
         to_choices(live, reward),
@@ -371,7 +371,7 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
     up = top * jnp.where(top > 0, horizon - 1, least) + unit * horizon
     down = bottom * jnp.where(bottom < 0, horizon - 1, least) - unit * horizon
     finite = jnp.isfinite(top - bottom) & jnp.isfinite(play.size) & ~jnp.isnan(horizon)
-    return judged(down, up, unit * horizon, play.tolerance)._replace(finite=finite)
+    return make_enclosure(down, up, unit * horizon, play.tolerance)._replace(finite=finite)
 
 
 def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
@@ -401,8 +401,8 @@ def _solve(
     sign = jnp.where(game.system, 1, -1).astype(game.dtype)
 
     def backup(value: jax.Array) -> jax.Array:
-        q = reward + over.spread(rate) * expectation(game, value)
-        best = sign * over.max(over.spread(sign) * q, moves)
+        q = reward + over.broadcast(rate) * expectation(game, value)
+        best = sign * over.max(over.broadcast(sign) * q, moves)
         if drawn is not None:
             best = jnp.where(drawn.used, over.mean(drawn.policy.distribution, q), best)
         return jnp.where(live, best, 0)
@@ -513,7 +513,7 @@ def _strategy_iteration(
             better &= ~play.drawn
         answers = better & ~play.system
         change = jnp.where(answers.any(), answers, better)
-        weight = jax.tree.map(jnp.where, over.spread(change, q), best, k.weight)
+        weight = jax.tree.map(jnp.where, over.broadcast(change, q), best, k.weight)
         unchanged = jnp.where(change.any(), 0, k.unchanged + 1)
         done = _judge(k.z, image, play)[0] | (unchanged > _UNCHANGED)
 

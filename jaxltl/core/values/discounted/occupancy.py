@@ -75,7 +75,7 @@ def _occupancy(
     start = jnp.broadcast_to(start, shape) if start.ndim < 2 else start.reshape(shape)
 
     def flow(d: jax.Array) -> jax.Array:
-        result: jax.Array = start + discount * pushforward(model, over.spread(d) * policy)
+        result: jax.Array = start + discount * pushforward(model, over.broadcast(d) * policy)
         return result
 
     system = System(sweep_operator(model), over.columns(policy), discount)
@@ -95,7 +95,7 @@ def _occupancy(
     bound = jnp.where(finite, bound, jnp.inf)
     goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
     visits = implicit(flow, visits, Transposed(linear))
-    value = over.spread(visits) * policy
+    value = over.broadcast(visits) * policy
     frozen = lax.stop_gradient(value)
     solution = Solution(
         value=value,
@@ -129,7 +129,7 @@ def _visits(
     model: PyTree, policy: Array, discount: Array, start: Array, linear: PyTree
 ) -> tuple[jax.Array, jax.Array]:
     visits, n = linear.counted(start, transposed=True)
-    flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
+    flow = start + discount * pushforward(model, choices(model).broadcast(visits) * policy)
     # One step of iterative refinement.
     more, m = linear.counted(flow - visits, transposed=True)
     return visits + more, n + m + 1

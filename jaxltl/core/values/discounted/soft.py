@@ -124,9 +124,9 @@ def soft_maximum(over: Layout, q: Quantity, parameters: PyTree) -> tuple[jax.Arr
     """``log sum_a exp q_a`` of columns, and its derivative, the softmax."""
     # Elementwise over columns: reductions over a short last axis take several times as long.
     top = over.max(q)
-    raised = jax.tree.map(lambda x, t: jnp.exp(x - t), q, over.spread(top, q))
+    raised = jax.tree.map(lambda x, t: jnp.exp(x - t), q, over.broadcast(top, q))
     total = over.sum(raised)
-    return top + jnp.log(total), jax.tree.map(jnp.divide, raised, over.spread(total, q))
+    return top + jnp.log(total), jax.tree.map(jnp.divide, raised, over.broadcast(total, q))
 
 
 def policy_logits(
@@ -151,7 +151,7 @@ def softmax_policy(
     q, over = policy_logits(model, reward, discount, value), choices(model)
     # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
     # and its derivative is 0 / 0.
-    best = over.spread(lax.stop_gradient(over.top(q)))
+    best = over.broadcast(lax.stop_gradient(over.top(q)))
     least = best + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
     q = jnp.where(over.available, jnp.maximum(q, least), q)
     return over.softmax(q)
@@ -175,7 +175,7 @@ def soft_policy_adjoint(
     is known exactly and shrinks at the rate of the discount or faster.
     """
     over = choices(model)
-    g = cotangent - policy * over.spread(over.sum(cotangent))
+    g = cotangent - policy * over.broadcast(over.sum(cotangent))
     weight, discount = over.columns(policy), jnp.asarray(discount, policy.dtype)
 
     def push(before: PyTree, discount: jax.Array, mass: PyTree) -> jax.Array:
@@ -188,7 +188,7 @@ def soft_policy_adjoint(
     def step(before: PyTree, carry: PyTree, parameters: PyTree) -> PyTree:
         (x, r), (weight, discount, _) = carry, parameters
         return x + r, push(
-            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight))
+            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.broadcast(r, weight))
         )
 
     def finished(carry: PyTree, parameters: PyTree) -> jax.Array:
@@ -206,7 +206,7 @@ def soft_policy_adjoint(
         every=_SWEEPS_BETWEEN,
         lanes="mapped" if predecessors is None else "side by side",
     )
-    return g + policy * over.spread((x + r).reshape(model.state_shape))
+    return g + policy * over.broadcast((x + r).reshape(model.state_shape))
 
 
 def boltzmann_expansion(num_actions: ArrayLike) -> Array:
@@ -346,7 +346,7 @@ def _boltzmann_value(
     policy = over.softmax(policy_logits(model, reward, discount, solution.value))
     if adjoint == "exact":
         q = action_value(model, reward, discount, solution.value)
-        policy *= 1 + q - over.spread(over.mean(policy, q))
+        policy *= 1 + q - over.broadcast(over.mean(policy, q))
     system = System(sweep_operator(model), over.columns(policy), discount)
     solution = replace(solution, value=implicit(backup, solution.value, system))
     return with_softmax(model, reward, discount, solution)
@@ -396,7 +396,7 @@ def softmax_mean(over: Layout, q: Quantity, parameters: _Criterion) -> tuple[jax
     finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
     value = over.mean(policy, finite)
     return value, jax.tree.map(
-        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite)
+        lambda p, x, v: p * (1 + x - v), policy, finite, over.broadcast(value, finite)
     )
 
 

@@ -92,10 +92,10 @@ def enclose(
     rounding = rounding / gap
     down = discount / gap * jnp.min(change, axis=0) - rounding
     up = discount / gap * jnp.max(change, axis=0) + rounding
-    return judged(down, up, rounding, tolerance)
+    return make_enclosure(down, up, rounding, tolerance)
 
 
-def judged(
+def make_enclosure(
     down: jax.Array, up: jax.Array, rounding: jax.Array, tolerance: jax.Array | None
 ) -> Enclosure:
     """The enclosure between two ends, relative to the image; `rounding` is included in both."""

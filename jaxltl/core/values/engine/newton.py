@@ -87,7 +87,7 @@ def solve(
     # next.
     # Elsewhere an exact step is no better than another.
     zero = jnp.zeros_like(value)
-    weight: Quantity = table.choices.spread(zero, backup.reward)
+    weight: Quantity = table.choices.broadcast(zero, backup.reward)
     over, none, no = table.choices, jnp.int32(0), jnp.bool_(False)
     start = _Search(
         z=value,
@@ -185,5 +185,5 @@ def _newton_step(
 def action_values(over: Layout, backup: Backup, ahead: Quantity) -> Quantity:
     """Action values ``g + c x``, with x the expected next value of each choice."""
     return jax.tree.map(
-        lambda g, c, x: g + c * x, backup.reward, over.spread(backup.scale, ahead), ahead
+        lambda g, c, x: g + c * x, backup.reward, over.broadcast(backup.scale, ahead), ahead
     )

@@ -138,7 +138,7 @@ def least_mixture(
         return mixture._replace(attained=max(mixture.attained, close))
     clock, tolerance = StepAnalysis(model), None
 
-    def judged(share: float) -> Mixture:
+    def mix(share: float) -> Mixture:
         mixed = (policy, sure)[int(share)] if share in (0, 1) else _mixed(policy, sure, share)
         taken = clock.steps(mixed)
         # The probability of a policy that takes very long is expensive.
@@ -154,17 +154,17 @@ def least_mixture(
     def suffices(mixture: Mixture) -> bool:
         return mixture.attained >= probability and upper(mixture) <= steps
 
-    mixture = judged(0)
+    mixture = mix(0)
     if suffices(mixture):
         return mixture
-    mixture = judged(1)
+    mixture = mix(1)
     low, high = 0.0, 1.0
     aim = probability + min(_AIM, (mixture.attained - probability) / 64)
     tolerance = max((aim - probability) / 4, _FINEST)
     longest = max(steps * (1 - _AIM), upper(mixture))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        tried = judged(middle)
+        tried = mix(middle)
         if not suffices(tried):
             low = middle
             continue

@@ -38,7 +38,7 @@ def reductions(model, x, w, rows):
         "first": over.first(condition),
         "all": over.all(condition),
         "some": over.max(x, condition),
-        "spread": over.spread(over.sum(x)),
+        "broadcast": over.broadcast(over.sum(x)),
         "one hot": over.one_hot(rows, x.dtype),
         "best": over.best(x)[1],
         "count": over.sum(condition),
@@ -64,7 +64,7 @@ def test_reductions_equal_loops():
         "of rows": [g[-1] for g in groups],
         "all": [(g > 0.5).all() for g in groups],
         "some": [g[h].max() if h.size else -np.inf for g, h in zip(groups, hits, strict=True)],
-        "spread": np.concatenate([np.full(g.size, g.sum()) for g in groups]),
+        "broadcast": np.concatenate([np.full(g.size, g.sum()) for g in groups]),
         "one hot": np.concatenate([np.arange(g.size) == g.size - 1 for g in groups]),
         "best": np.concatenate([np.arange(g.size) == g.argmax() for g in groups]),
         "count": [h.size for h in hits],
@@ -139,4 +139,4 @@ def test_lanes_are_an_axis_behind_the_choices():
     for i in range(3):
         np.testing.assert_allclose(both[:, i], over.mean(w, x[:, i]), atol=1e-14)
     discount = jnp.asarray([0.5, 0.6, 0.7])
-    assert over.spread(discount, x) is discount, "one number for each lane"
+    assert over.broadcast(discount, x) is discount, "one number for each lane"

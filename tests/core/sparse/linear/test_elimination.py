@@ -48,7 +48,7 @@ def test_solutions(way, monkeypatch):
         found = None
         for _ in range(3):
             chosen = 2 * np.arange(size) + rng.integers(0, 2, size)
-            found = factorize(rows, label, chosen) if found is None else found.other(chosen)
+            found = factorize(rows, label, chosen) if found is None else found.refactorize(chosen)
             b = rng.random(size)
             expected = np.linalg.solve(np.eye(size) - rows[chosen].toarray(), b)
             np.testing.assert_allclose(found.solve(b), expected, rtol=1e-10)
@@ -151,7 +151,7 @@ def test_sweeps_end_where_the_solution_is_far_larger_than_the_right_side():
     matrix = sparse.csr_array(
         (weight.ravel(), target.ravel(), np.arange(0, 3 * size + 1, 3)), shape=(size, size)
     )
-    found = elimination._swept(matrix, np.ones(size))
+    found = elimination._iterative_solution(matrix, np.ones(size))
     exact = np.linalg.solve(np.eye(size) - matrix.toarray(), np.ones(size))
     assert exact.max() > 1e5
     np.testing.assert_allclose(found, exact, rtol=1e-10)
