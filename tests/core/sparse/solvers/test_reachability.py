@@ -146,7 +146,9 @@ def way(request, monkeypatch):
     if request.param == "by value iteration":
         monkeypatch.setattr(transient, "_LARGE_CORE", 0)
     if request.param == "eliminated at last":
-        monkeypatch.setattr(elimination, "_iterative_solution", lambda _, b: np.full(b.size, np.nan))
+        monkeypatch.setattr(
+            elimination, "_iterative_solution", lambda _, b: np.full(b.size, np.nan)
+        )
     if request.param == "refined":
         monkeypatch.setattr(transient._CoreSolver, "_certified", lambda *_: None)
     return request.param
