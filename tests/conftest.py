@@ -15,7 +15,6 @@ import hashlib
 import importlib
 import os
 import platform
-import re
 import tempfile
 import threading
 from pathlib import Path
@@ -95,15 +94,9 @@ if "xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
 
 @pytest.hookimpl(tryfirst=True)  # before markers choose
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """All cases after the first n of ``few(n)`` are slow; of those that are exhaustive, none is.
-
-    Names that differ between processes are refused: sets of several texts, and addresses. Workers that
-    collect different names run nothing, and half of the time they agree by chance.
-    """
+    """All cases after the first n of ``few(n)`` are slow; of those that are exhaustive, none is."""
     seen: collections.Counter[str] = collections.Counter()
     for item in items:
-        if re.search(r"\{'[^{}:]*', '| at 0x", item.nodeid):
-            raise pytest.UsageError(f"{item.nodeid}: the name differs between workers; give ids=")
         if item.get_closest_marker("exhaustive"):
             item.own_markers = [mark for mark in item.own_markers if mark.name != "slow"]
         elif few := item.get_closest_marker("few"):

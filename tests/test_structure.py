@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 import types
@@ -229,3 +230,9 @@ assert after == before, "a setting of JAX was changed"
     )
     assert done.returncode == 0, done.stderr
     assert not done.stdout.split()
+
+
+def test_names_of_cases_are_the_same_in_all_processes(request):
+    """Each process writes a set in its own order, and workers with different names run nothing."""
+    names = [item.nodeid for item in request.session.items]
+    assert [name for name in names if re.search(r"\{'[^{}:]*', '| at 0x", name)] == []
