@@ -327,7 +327,7 @@ def simulated():
         "ending": "repeat",
         "embedding": None,
     }
-    told = {"events": events, "propositions": ("home", "goal"), "depth": 2, "most": 2}
+    told = {"events": events, "propositions": ("home", "goal"), "depth": 2, "max_sequences": 2}
     table, plan = jl.tabulate(world), many_tasks.make_plan("F goal", **told)
     return [
         (en.make_box, {"low": 0.0, "high": 1.0, "shape": (2,), "dtype": None}),
