@@ -40,7 +40,7 @@ from jaxltl.app.reports.learn import (
     report as report,
     task_pictures as task_pictures,
 )
-from jaxltl.app.wording import Record, enclosure, counted
+from jaxltl.app.wording import Record, counted, enclosure
 from jaxltl.core.models import Product, Trajectories, lift_policy, product, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.protocols import PyTree

@@ -22,7 +22,7 @@ from jaxltl.app.protocols import Training
 from jaxltl.app.reports.drawing import drawing, Picture
 from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
-from jaxltl.app.wording import enclosure, counted, Record, Result
+from jaxltl.app.wording import Record, Result, counted, enclosure
 from jaxltl.core.models import (
     project_policy,
     project_trajectories,

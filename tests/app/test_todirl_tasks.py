@@ -274,17 +274,17 @@ def learned(path, seed=0):
 def check_reached(outcome, asked, over):
     """In every world that counts it has what was asked, and no more than the share gives it."""
     setup, mixed = outcome.setup, 0
-    judged = outcome.evaluation
+    evaluation = outcome.evaluation
     for w in range(setup.num_training + 2):
         model = own(setup, w)
-        policy = judged.policy[w][: model.mdp.num_states]
+        policy = evaluation.policy[w][: model.mdp.num_states]
         np.testing.assert_allclose(policy.sum(-1), 1)
         value, _ = evaluate(model, policy)
         reached, _ = at_starts(model, value, over)
-        assert judged.attained[w] == pytest.approx(reached, abs=1e-9)
+        assert evaluation.attained[w] == pytest.approx(reached, abs=1e-9)
         assert reached >= asked - 1e-12
-        share = judged.share[w]
-        assert share == 0 or asked <= judged.attained[w] <= asked + WINDOW
+        share = evaluation.share[w]
+        assert share == 0 or asked <= evaluation.attained[w] <= asked + WINDOW
         mixed += share > 0
     return mixed
 

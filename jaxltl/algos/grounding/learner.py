@@ -1,8 +1,8 @@
 """Symbol grounding by gradients: maximum likelihood over soft groundings and a hidden memory.
 
 The demonstrator follows the soft policy of the event reward in the soft product of the world and the task.
-Parameters are those of the grounding ``g(symbol | observation)``, the logarithm of its scale,
-and the weights of features. The likelihood is differentiated implicitly through
+Parameters are those of the grounding ``g(symbol | observation)``, the logarithm of the
+reward's scale, and the weights of features. The likelihood is differentiated implicitly through
 :func:`~jaxltl.core.values.discounted.soft.soft_value`. Many random starts are a ``vmap`` over keys.
 
 Example: the goal is not labelled, but what is seen there differs.
