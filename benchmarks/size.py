@@ -1,7 +1,7 @@
 """Size of the package: lines, statements, docstrings, annotations, parameters, modules and names.
 
 Run with ``python -m benchmarks.size [FOLDER ...]``; several folders give one column each, so that
-two checkouts can be compared. ``tests/test_limits.py`` holds the package to its limits.
+two checkouts can be compared. ``tests/test_limits.py`` limits the structure alone.
 """
 
 from __future__ import annotations
