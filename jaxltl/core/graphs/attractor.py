@@ -16,6 +16,7 @@ import numpy as np
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, on_graph
 from jaxltl.core.models.ops.array_namespace import jax_array
+from jaxltl.core.models.ops.choices import choice_mask, state_mask
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
@@ -71,7 +72,8 @@ def attractor(
       :class:`Attractor`. Boolean: there is no derivative.
 
     Raises:
-      ValueError: unknown rule or chance.
+      ValueError: unknown rule or chance, or a mask of another shape, or with other values than True
+        and False (or 0 and 1).
 
     Example:
       >>> from jaxltl import from_dense
@@ -84,9 +86,11 @@ def attractor(
             raise ValueError(f"rule={rule!r}; choose exists or forall, or give bool[S].")
         exists: Array | bool = rule == "exists"
     else:
-        exists = rule
+        exists = state_mask(model, "rule", rule)
     if chance not in ("some", "all"):
         raise ValueError(f"chance={chance!r}; choose some or all.")
+    goal, among = state_mask(model, "goal", goal), state_mask(model, "among", among)
+    allowed = choice_mask(model, "allowed", allowed)
     return on_graph(partial(attract, chance=chance), model, goal, allowed, exists, among)
 
 
@@ -130,6 +134,7 @@ def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -
       >>> avoidable(fork, np.array([False, True, False])).tolist()
       [True, False, True]
     """
+    goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
     return jax_array(on_graph(avoid, model, goal, allowed))
 
 
@@ -165,6 +170,7 @@ def almost_surely_reaching(
       >>> almost_surely_reaching(fork, np.array([False, True, False])).region.tolist()
       [False, True, False]
     """
+    goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
     return on_graph(surely, model, goal, allowed, reaching)
 
 

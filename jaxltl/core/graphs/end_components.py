@@ -10,6 +10,7 @@ import numpy as np
 from jaxltl.core.graphs.attractor import avoid, attract
 from jaxltl.core.graphs.graph import Graph, graph_of, on_graph, take
 from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
+from jaxltl.core.models.ops.choices import choice_mask, state_mask
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, Array
 from jaxltl.core.pretty_print import brief
@@ -59,6 +60,7 @@ def end_components(
       >>> end_components(fork, np.ones(3, bool)).inside.tolist()
       [[False, True], [True, False], [False, False]]
     """
+    region, allowed = state_mask(model, "region", region), choice_mask(model, "allowed", allowed)
     return on_graph(components_within, model, region, allowed)
 
 
@@ -75,7 +77,7 @@ def components_within(graph: Graph, region: Array, allowed: Array | None = None)
 
 def bottom_components(model: Model, allowed: jax.Array) -> EndComponents:
     """Bottom strongly connected components of the chain that takes all allowed actions."""
-    return on_graph(closed_components, model, allowed)
+    return on_graph(closed_components, model, choice_mask(model, "allowed", allowed))
 
 
 def closed_components(graph: Graph, allowed: Array) -> EndComponents:

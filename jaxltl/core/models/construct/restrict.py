@@ -15,6 +15,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
+from jaxltl.core.models.ops.choices import choice_mask
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
 from jaxltl.core.validation import first_true
@@ -144,7 +145,8 @@ def restrict(
         raise ValueError("restrict needs successor lists; convert the world by from_dense.")
     initial = _start(model, initial)
     available = np.asarray(model.available)
-    allowed = available if allowed is None else available & np.asarray(allowed)
+    mask = choice_mask(model, "allowed", allowed)
+    allowed = available if mask is None else available & mask
     allowed = allowed.reshape(-1, model.num_actions)
     successor, used = np.asarray(world.successor), support(world)
     step, label_on = np.zeros((world.num_states, 1), np.int32), "entry"
@@ -180,7 +182,15 @@ def restrict(
 
 
 def _start(model: Model, initial: chex.Array | None) -> np.ndarray:
-    start = np.asarray(model.initial if initial is None else initial).ravel()
+    start = np.asarray(model.initial)
+    if initial is not None:
+        own, start = start, validation.float_array("initial", initial)
+        if start.shape not in (own.shape, (own.size,)) or not (start >= 0).all():
+            raise ValueError(
+                f"initial is {validation.shorten(start)} of shape {list(start.shape)}; give weights "
+                f"of the states, {list(own.shape)}."
+            )
+    start = start.ravel()
     if not (start > 0).any():
         raise ValueError("the initial distribution is zero; give a state to start from.")
     return start
@@ -218,7 +228,7 @@ def _restrict_sparse(
     start = _start(model, initial)
     rows = np.ones(sparse.num_rows, bool)
     if allowed is not None:
-        rows = np.asarray(allowed)
+        rows = validation.boolean_array("allowed", allowed)
         if rows.shape != (sparse.num_rows,):
             raise ValueError(
                 f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "

@@ -16,7 +16,8 @@ from jax import lax
 from numpy.typing import DTypeLike
 
 from jaxltl.core.models.ops import kernels
-from jaxltl.core.models.protocols import Model, PyTree
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core import struct, validation
 
@@ -341,6 +342,32 @@ def choice_shape(model: Model) -> tuple[int, ...]:
 @choice_shape.register
 def _(model: SparseMDP) -> tuple[int, ...]:
     return (model.num_rows,)
+
+
+def state_mask(model: Model, name: str, value: Array | None) -> Array | None:
+    """A set of states ``bool[S]`` as an argument; ValueError for another shape or other values."""
+    if not hasattr(model, "state_shape"):
+        raise ValueError(validation.unsupported_model(model))
+    return _mask(name, value, model.state_shape, "a state")
+
+
+def choice_mask(model: Model, name: str, value: Array | None) -> Array | None:
+    """A set of choices ``bool[S, A]``, or ``bool[R]`` of a sparse model, as an argument."""
+    return _mask(name, value, choice_shape(model), "a choice")
+
+
+def _mask(name: str, value: Array | None, shape: tuple[int, ...], of: str) -> Array | None:
+    if value is None:
+        return None
+    traced = is_traced(value)
+    # The operators of sets negate bitwise, so that integers 0 and 1 would be other sets.
+    mask = value if traced else validation.boolean_array(name, value)
+    if mask.shape != shape or mask.dtype != bool:
+        raise ValueError(
+            f"{name} has shape {list(mask.shape)} and type {mask.dtype}; "
+            f"give bool{list(shape)}, whether it contains {of}."
+        )
+    return mask
 
 
 def action_columns(num_actions: int, quantity: jax.Array) -> list[jax.Array]:

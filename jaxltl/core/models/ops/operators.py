@@ -30,6 +30,7 @@ from jaxltl.core.models.ops.choices import (
     first_action as first_action,
     is_deterministic as is_deterministic,
     row_entries,
+    state_mask,
 )
 from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
@@ -81,7 +82,8 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> exists_successor(fork, np.array([False, True, False])).tolist()  # one for each choice
       [True, False, True, False]
     """
-    return combined(model, jnp.asarray(region), kernels.positive_hits, jnp.logical_or)
+    region = jnp.asarray(state_mask(model, "region", region))
+    return combined(model, region, kernels.positive_hits, jnp.logical_or)
 
 
 @singledispatch
@@ -103,6 +105,7 @@ def forall_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> forall_successor(fork, np.array([False, True, True])).tolist()  # one for each choice
       [True, False, True, True]
     """
+    region = jnp.asarray(state_mask(model, "region", region))
     return ~exists_successor(model, jnp.logical_not(region))
 
 
