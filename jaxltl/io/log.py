@@ -191,19 +191,30 @@ def read_columns(
 ) -> Iterator[tuple[int, Fields]]:
     """Line numbers and fields of the requested columns of a UTF-8 CSV table with a header.
 
-    Fields may be quoted, and blanks around them are removed. A column of counts is appended, of
-    ones if the table has none. Lines of equal fields are checked once, and share a tuple.
+    Fields may be quoted, and blanks around them are removed, but not those inside quotes. A column of
+    counts is appended, of ones if the table has none. Lines of equal fields are checked once, and
+    share a tuple.
     """
     name, number, empty = str(path), 0, 0
     distinct: dict[Fields, Fields] = {}
     header: Fields = ()
-    reader = csv.reader(_lines(path), strict=True, skipinitialspace=True)
+    text = ""
+
+    def lines() -> Iterator[str]:
+        nonlocal text
+        for text in _lines(path):  # noqa: UP028
+            yield text  # while `text` is the line that is read
+
+    reader = csv.reader(lines(), strict=True, skipinitialspace=True)
     try:
         for number, row in enumerate(reader, 1):
             if reader.line_num > number:
                 raise _error(name, number, "a quote is not closed on its line.")
+            has_quotes = '"' in text
+            if has_quotes:
+                row = _stripped(text, row)
             if number == 1:
-                header = tuple(map(str.strip, row))
+                header = tuple(row) if has_quotes else tuple(map(str.strip, row))
                 _check_header(name, header, columns)
                 wanted = (*columns, count) if count in header else tuple(columns)
                 picked = itemgetter(*(header.index(x) for x in wanted))
@@ -215,8 +226,10 @@ def read_columns(
             elif len(row) != len(header):
                 message = f"has {len(row)} fields, and the header {len(header)}."
                 raise _error(name, number, message)
-            elif (fields := distinct.get(key := picked(row))) is None:
-                fields = tuple(map(str.strip, key))
+            elif (
+                fields := distinct.get(key := (*picked(row), '"') if has_quotes else picked(row))
+            ) is None:
+                fields = key[:-1] if has_quotes else tuple(map(str.strip, key))
                 if fields == wanted:
                     raise _error(name, number, "this line repeats the header; remove it.")
                 if "" in fields:
@@ -230,6 +243,15 @@ def read_columns(
         raise _error(name, number + 1, f"{error}.") from None
     if not number:
         raise _error(name, 1, f"the file is empty; it should begin with {','.join(columns)}.")
+
+
+_FIELD = re.compile(r'(?:^|,) *("(?:[^"]|"")*"|[^,]*)')
+
+
+def _stripped(line: str, row: list[str]) -> list[str]:
+    """The fields of a line without the blanks around them; those inside quotes are kept."""
+    fields = _FIELD.findall(line)
+    return [x if y.startswith('"') else x.strip() for x, y in zip(row, fields, strict=True)]
 
 
 def _check_header(name: str, header: Fields, columns: Sequence[str]) -> None:
