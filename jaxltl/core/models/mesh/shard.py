@@ -127,7 +127,10 @@ def shard(
             row=row,
         )
 
-    return _assembled(part, ordered, host.num_states, mesh, axis, sparse.propositions)
+    # An action that is available nowhere has no rows, but a column in rewards and policies.
+    num_actions = 1 if isinstance(model, SparseMDP) else model.num_actions
+    layout = state_layout(host.num_states, mesh, axis)._replace(order=ordered)
+    return _assembled(part, layout, sparse.propositions, num_actions)
 
 
 def model_from_parts(
@@ -163,7 +166,8 @@ def model_from_parts(
         raise ValueError(
             f"num_states is {validation.shorten(num_states)}; give a whole number of at least 1."
         )
-    return _assembled(part, None, int(num_states), mesh, axis, tuple(propositions))
+    layout = state_layout(int(num_states), mesh, axis)._replace(order=None)
+    return _assembled(part, layout, tuple(propositions))
 
 
 def ranges_of(num_states: int, mesh: Mesh, axis: str | None = None) -> list[tuple[int, int]]:
@@ -278,17 +282,15 @@ def _order(model: SparseMDP, order: ArrayLike) -> np.ndarray:
 
 def _assembled(
     part: Callable[[int, int], ModelPart],
-    ordered: Array,
-    num_states: int,
-    mesh: Mesh,
-    axis: str | None,
+    layout: StateLayout,
     propositions: tuple[str, ...],
+    num_actions: int = 1,
 ) -> ShardedMDP:
-    layout = state_layout(num_states, mesh, axis)._replace(order=ordered)
     parts, rows = {}, {}
     for d in layout.mine:
         parts[d], rows[d] = _checked(part, layout, d, propositions)
     facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
+    facts[:, _ACTIONS] = np.maximum(facts[:, _ACTIONS], num_actions)
     halo = _halo(layout, parts)
     total = facts[:, _INITIAL].sum()
     if abs(total - 1) > validation.ROW_SUM_TOLERANCE:
@@ -310,7 +312,7 @@ def _assembled(
         sent=tuple(layout.array(x) for x in halo.sent),
         label_rows=layout.replicated(labels),
         propositions=propositions,
-        num_unpadded=num_states,
+        num_unpadded=layout.num_unpadded,
         mesh=layout.mesh,
         axis=layout.axis,
         rounds=halo.rounds,

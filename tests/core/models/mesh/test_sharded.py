@@ -11,13 +11,14 @@ from jaxltl.core.games.objective import safety
 from jaxltl.core.games.permissive import permissive_strategy
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import to_padded
-from jaxltl.core.models.mdp import make_mdp, to_dense
+from jaxltl.core.models.mdp import from_dense, make_mdp, to_dense
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.values.average.average_reward import mean_payoff
+from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.prepared.prepared import prepare
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from tests.sparse_models import random_sparse
@@ -304,3 +305,18 @@ def test_parts_equal_the_whole():
 def test_what_is_wrong_is_told(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_an_action_that_is_available_nowhere_keeps_its_column(dense):
+    rng = np.random.default_rng(0)
+    transition = rng.dirichlet(np.ones(3), (3, 4))
+    transition[:, [1, 3]] = 0  # unavailable, the last action too
+    world = from_dense(transition)
+    world = to_dense(world) if dense else world
+    sharded = shard(world, jax.make_mesh((2,), ("states",)))
+    assert sharded.num_actions == world.num_actions == 4
+    reward = rng.random((3, 4))
+    expected = optimal_value(world, reward, 0.9).value
+    found = optimal_value(sharded, to_mesh(sharded, reward), 0.9).value
+    np.testing.assert_allclose(from_mesh(sharded, found), expected, rtol=1e-9)
