@@ -9,7 +9,7 @@ from typing import Unpack
 import numpy as np
 
 from jaxltl.core.array_types import PyTree
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import Automaton, named_propositions
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.automata.runs import Verdict
 from jaxltl.core.environments.task_environment import TaskOptions, TaskTables, make_task_tables
@@ -55,7 +55,7 @@ def gymnasium_task(
     (48, 0)
     """
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
-    names = tuple(automaton.propositions if propositions is None else propositions)
+    names = named_propositions(automaton) if propositions is None else tuple(propositions)
     if "embedding" in options:
         raise ValueError("embedding: observations of a gymnasium product are one-hot.")
     return _wrapper()(env, make_task_tables(automaton, names, **options), labels, names)

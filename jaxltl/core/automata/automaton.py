@@ -295,6 +295,18 @@ def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> N
     return array
 
 
+def named_propositions(automaton: Automaton) -> tuple[str, ...]:
+    """The names of the columns of the letters; ValueError for an automaton without them."""
+    names, count = automaton.propositions, np.shape(automaton.letters)[-1]
+    if len(names) != count:  # a compiled program keeps arrays only
+        raise ValueError(
+            f"the automaton has {len(names)} names for {count} propositions: a function under jit "
+            "returns its arrays alone. Use the automaton from outside of jit, or name them: "
+            "dataclasses.replace(automaton, propositions=...)."
+        )
+    return names
+
+
 def make_alphabet(
     names: Sequence[str], letters: Iterable[Letter] | None, place: str
 ) -> NDArray[np.bool_]:
@@ -334,7 +346,7 @@ def letter_index(automaton: Automaton, letter: Letter) -> int:
 
 
 def _read(automaton: Automaton, word: Iterable[Letter], place: str) -> list[int]:
-    names = automaton.propositions
+    names = named_propositions(automaton)
     index = {
         frozenset(name for name, holds in zip(names, row, strict=True) if holds): i
         for i, row in enumerate(automaton.letters)

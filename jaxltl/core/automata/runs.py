@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import Automaton, run
+from jaxltl.core.automata.automaton import Automaton, named_propositions, run
 from jaxltl.core.automata.products import (
     EVEN,
     ODD,
@@ -44,9 +44,10 @@ def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
 
     The letters combine a letter of `a` and one of `b` that agree on the shared propositions.
     """
-    shared = [name for name in a.propositions if name in b.propositions]
+    names_of_a, names_of_b = named_propositions(a), named_propositions(b)
+    shared = [name for name in names_of_a if name in names_of_b]
     read_by_a, read_by_b = _agreeing(_columns(a, shared), _columns(b, shared))
-    names = tuple(sorted({*a.propositions, *b.propositions}))
+    names = tuple(sorted({*names_of_a, *names_of_b}))
     rows = np.zeros((len(read_by_a), len(names)), bool)
     for automaton, letter in ((a, read_by_a), (b, read_by_b)):
         own = [name for name in names if name in automaton.propositions]

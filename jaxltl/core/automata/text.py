@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import CONDITIONS, Automaton, extent_text, make_automaton
+from jaxltl.core.automata.automaton import (
+    CONDITIONS,
+    Automaton,
+    extent_text,
+    make_automaton,
+    named_propositions,
+)
 from jaxltl.core.logic.diagram import FALSE, TRUE, Cube, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import proposition_text
 
@@ -30,7 +36,7 @@ def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
 
 def _guards(automaton: Automaton, marks: NDArray[Any]) -> dict[tuple[int, int, int], str]:
     """A guard for each (state, successor, mark), with the marks `[Q, L]` of transitions."""
-    literals = [proposition_text(name) for name in automaton.propositions]
+    literals = [proposition_text(name) for name in named_propositions(automaton)]
     # As numbers of any size, for automata over many propositions and few letters.
     numbers = [
         sum(1 << p for p in np.flatnonzero(row).tolist()) for row in np.asarray(automaton.letters)
@@ -158,7 +164,7 @@ def to_dict(automaton: Automaton) -> dict[str, Any]:
         "initial": int(automaton.initial),
         table: getattr(automaton, table).tolist(),
         "letters": automaton.letters.tolist(),
-        "propositions": list(automaton.propositions),
+        "propositions": list(named_propositions(automaton)),
         "acceptance": automaton.acceptance,
         "state_names": list(automaton.state_names),
     }

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxltl.core import struct, validation
 from jaxltl.core.automata import Automaton, to_automaton
+from jaxltl.core.automata.automaton import named_propositions
 from jaxltl.core.automata.runs import (
     Verdict as Verdict,
     lasso_verdicts as lasso_verdicts,
@@ -262,7 +263,7 @@ def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[
     names = validation.distinct_names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     text = "the automaton" if isinstance(formula, Automaton) else f"the formula {str(formula)!r}"
-    require_known(automaton.propositions, names, text)
+    require_known(named_propositions(automaton), names, text)
     count = len(automaton.propositions)
     code = np.asarray(automaton.letters) @ (1 << np.arange(count))
     missing = np.setdiff1d(np.arange(1 << count), code)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
 
-from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
@@ -228,8 +228,9 @@ def product(
         raise ValueError(
             f"task is {validation.shorten(task)}; give a formula, its text, or an automaton."
         )
-    require_known(task.propositions, world.propositions, "the task")
-    column = [world.propositions.index(p) for p in task.propositions]
+    names = named_propositions(task)
+    require_known(names, world.propositions, "the task")
+    column = [world.propositions.index(p) for p in names]
     labels = distinct_labels(world)
     rows, letter = distinct_rows(labels[:, column])
     index = np.array(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import Automaton, make_alphabet
+from jaxltl.core.automata.automaton import Automaton, make_alphabet, named_propositions
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.logic.diagram import Cube
@@ -108,7 +108,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       >>> write_hoa(to_automaton("F a")).split("--BODY--")[1].split()[:6]
       ['State:', '0', '"F', 'a"', '[!0]', '0']
     """
-    names = automaton.propositions
+    names = named_propositions(automaton)
     lines = header_lines(name, len(automaton.delta), int(automaton.initial), names)
     if automaton.is_parity:
         count = int(automaton.priority.max()) + 1

@@ -321,3 +321,25 @@ def test_a_name_split_into_operators_is_explained():
     assert jl.product(world, 'F "Goal"').automaton.propositions == ("Goal",)
     with pytest.raises(ValueError, match="Did you mean 'a'"):
         jl.product(world, "F aa")
+
+
+NEEDS_NAMES = {
+    "is_equivalent": lambda one, _: jl.automata.is_equivalent(one, "F a"),
+    "is_equivalent to itself": lambda one, _: jl.automata.is_equivalent(one, one),
+    "is_included": lambda one, _: jl.automata.is_included("F a", one),
+    "find_difference": lambda one, _: jl.automata.find_difference(one, "F a"),
+    "synchronize": lambda one, _: jl.automata.synchronize(one, "F a"),
+    "accepts_lasso": lambda one, _: jl.automata.accepts_lasso(one, [], [{"a"}]),
+    "write_hoa": lambda one, _: jl.io.write_hoa(one),
+    "product": lambda one, world: jl.product(world, one),
+    "optimal_satisfaction": lambda one, world: jl.optimal_satisfaction(jl.to_sparse(world), one),
+}
+
+
+@pytest.mark.parametrize("name", NEEDS_NAMES)
+def test_an_automaton_without_names_is_refused_where_they_count(name):
+    """A compiled program returns the arrays of an automaton alone."""
+    world = jl.from_dense([[[0.5, 0.5]], [[0, 1]]], label={"a": [1]})
+    arrays = jax.jit(lambda x: x)(jl.product(world, "F a")).automaton
+    with pytest.raises(ValueError, match="0 names for 1 propositions"):
+        NEEDS_NAMES[name](arrays, world)

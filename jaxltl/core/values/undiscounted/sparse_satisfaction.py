@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import as_formula
@@ -250,7 +250,7 @@ def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.n
         letters, number = state_letters(model, task.propositions)
         task = to_automaton(task, letters=letters)
     else:
-        letters, number = state_letters(model, task.propositions)
+        letters, number = state_letters(model, named_propositions(task))
     index = np.array([letter_index(task, letter) for letter in letters], np.int64)
     automaton = replace(
         task,
