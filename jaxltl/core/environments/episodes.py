@@ -151,7 +151,7 @@ def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: 
     >>> right = make_agent(lambda seen, key: 3)
     >>> run = jax.jit(lambda key: run_episode(key, world, right, num_steps=3))
     >>> run(jax.random.key(0)).reward.tolist()
-    [0.0, 1.0, 1.0]
+    [0.0, 0.0, 1.0]
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, limit=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)

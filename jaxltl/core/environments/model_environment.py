@@ -15,12 +15,14 @@ from jaxltl.core.validation import first_true
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models import MDP, DenseMDP, Game, SparseMDP, sample_successor, to_padded
+from jaxltl.core.models.construct.padded import pad_rows
+from jaxltl.core.models.sparse import Rewards, choice_reward
 
 
 def model_environment(
     model: MDP | DenseMDP | SparseMDP | Game,
     *,
-    reward: ArrayLike | None = None,
+    reward: ArrayLike | Rewards | str | None = None,
     observe: PyTree = None,
     opponent: ArrayLike | None = None,
 ) -> Environment:
@@ -31,7 +33,9 @@ def model_environment(
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
-      reward: ``float[S]``, of the successor state, or ``float[S, A]``, of the action; default: zero.
+      reward: ``float[S, A]``, of the action, or ``float[S]``, of the state in which it is taken, as for
+        all solvers; of a sparse model also what
+        :func:`~jaxltl.core.models.sparse.choice_reward` takes or returns, ``float[R]``. Default: zero.
       observe: ``state -> observation``; default: one-hot.
       opponent: ``float[S, A]``, the policy of the game's environment; default: uniform.
 
@@ -51,7 +55,11 @@ def model_environment(
     owner = model.system if isinstance(model, Game) else None
     model = model.mdp if isinstance(model, Game) else model
     if isinstance(model, SparseMDP):
-        model = to_padded(model)
+        sparse, model = model, to_padded(model)
+        if isinstance(reward, str | Rewards):
+            reward = choice_reward(sparse, reward)
+        if np.shape(reward) == (sparse.num_rows,) != (sparse.num_states,):
+            reward = pad_rows(sparse, validation.float_array("reward", reward))
     if not isinstance(model, MDP | DenseMDP):
         raise ValueError(
             f"model_environment: {type(model).__name__} is no world; simulate the MDP under it, and "
@@ -64,7 +72,7 @@ def model_environment(
             f"reward has shape {list(table.shape)} and type {table.dtype}; give numbers [{size}], "
             f"of states, or [{size}, {num_actions}], of their actions."
         )
-    table = table.astype(jnp.result_type(float))
+    table = np.broadcast_to(table.T, (num_actions, size)).T.astype(jnp.result_type(float))
     step, outcomes = Partial(_step, model, table), Partial(_outcomes, model, table)
     if owner is not None:
         other = _opponent(model, np.asarray(owner), opponent)
@@ -98,7 +106,7 @@ def _step(
     model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array, key: Key
 ) -> Timestep:
     after = sample_successor(model, key, state, action).astype(jnp.int32)
-    return Timestep(after, _earned(reward, state, action, after), terminated=jnp.bool_(False))
+    return Timestep(after, jnp.asarray(reward)[state, action], terminated=jnp.bool_(False))
 
 
 def _outcomes(
@@ -109,13 +117,8 @@ def _outcomes(
         after = jnp.asarray(model.successor)[state, action].astype(jnp.int32)
     else:
         after = jnp.arange(model.num_states, dtype=jnp.int32)
-    earned = jax.vmap(lambda t: _earned(reward, state, action, t))(after)
+    earned = jnp.broadcast_to(jnp.asarray(reward)[state, action], after.shape)
     return Timestep(after, earned, terminated=jnp.bool_(False)), probability
-
-
-def _earned(reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
-    table = jnp.asarray(reward)
-    return table[after] if table.ndim == 1 else table[state, action]
 
 
 def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None) -> np.ndarray:

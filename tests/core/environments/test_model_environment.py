@@ -13,6 +13,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
+from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
@@ -85,7 +86,7 @@ def test_rewards_are_of_states_or_actions():
     key = jax.random.key(0)
     state, action = np.argwhere(MODEL.available)[-1]
     found = model_environment(world(), reward=of_states).step(state, action, key)
-    assert float(found.reward) == int(found.world)
+    assert float(found.reward) == state
     found = model_environment(world(), reward=of_actions).step(state, action, key)
     assert float(found.reward) == of_actions[state, action]
     for reward in (np.zeros(S + 1), np.zeros((A, S)), np.array(["x"] * S)):
@@ -163,3 +164,25 @@ def test_a_game_is_played_against_its_opponent():
 def test_bad_models_are_named(model, options, text):
     with pytest.raises(ValueError, match=text):
         model_environment(model(), **options)
+
+
+@pytest.mark.parametrize("chain", [True, False])
+def test_rewards_of_sparse_models_are_paid_by_the_choice(chain):
+    rng = np.random.default_rng(int(chain))
+    starts = None if chain else [0, 2, 3, 4]
+    model = make_sparse(
+        starts,
+        np.arange(4 if chain else 5),
+        rng.permutation(3 if chain else 4) % 3,
+        np.ones(3 if chain else 4),
+        rewards={"r": Rewards(state=rng.random(3), transition=rng.random(3 if chain else 4))},
+    )
+    earned = choice_reward(model, "r")
+    for reward in (earned, "r", model.rewards["r"]):
+        environment = model_environment(model, reward=reward)
+        for row, state in enumerate(model.host.state):
+            action = model.rank[row]
+            step = environment.step(state, action, jax.random.key(0))
+            assert float(step.reward) == pytest.approx(earned[row])
+            told, _ = environment.outcomes(state, action)
+            np.testing.assert_allclose(told.reward, earned[row])
