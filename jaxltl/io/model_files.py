@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -65,6 +65,7 @@ def read_model(
     *,
     constants: Constants = None,
     max_states: int | None = None,
+    coalition: Sequence[str] | None = None,
 ) -> SparseMDP | IntervalMDP | Game:
     """Model of a file, with the format detected by suffix or contents.
 
@@ -77,6 +78,8 @@ def read_model(
       path: the file.
       constants: of a program, values in a dict or as a text such as ``"N=64,MAX=4"``.
       max_states: of a program, the largest number of states; default 10 million.
+      coalition: of a game, the names of the players that are its system; default: the first one of
+        two players.
 
     Returns:
       A SparseMDP, a Game over one, or an IntervalMDP. :func:`~jaxltl.io.pgsolver.objective_of`
@@ -94,11 +97,11 @@ def read_model(
       ('heads',)
     """
     if is_program(path):
-        return read_program_model(path, constants, max_states)
-    if constants is not None or max_states is not None:
+        return read_program_model(path, constants, max_states, coalition)
+    if not (constants is None and max_states is None and coalition is None):
         raise ValueError(
-            f"{str(path)!r} is no program; constants and max_states are for programs in the PRISM "
-            f"language ({', '.join(SUFFIXES)})."
+            f"{str(path)!r} is no program; constants, max_states and coalition are for programs in "
+            f"the PRISM language ({', '.join(SUFFIXES)})."
         )
     return (_by_name(path) or _by_beginning(path)).read(path)
 

@@ -11,6 +11,8 @@ import jaxltl as jl
 from jaxltl.app import solve as solving
 from jaxltl.app.files.game import GameFile, load_game
 from jaxltl.cli import main
+from jaxltl.core.logic.comparisons import program_definitions
+from jaxltl.core.logic.properties import parse_property
 from jaxltl.io.prism.program import constants_of
 
 WALK = """// a walk with two kinds of steps
@@ -94,7 +96,7 @@ def test_constants_are_given_in_a_dict_or_a_text(walk, tmp_path):
         jl.read_model(walk)
     with pytest.raises(ValueError, match="more than 3 states"):
         jl.read_model(walk, constants="N=9", max_states=3)
-    with pytest.raises(ValueError, match="is no program; constants and max_states"):
+    with pytest.raises(ValueError, match="is no program; constants, max_states"):
         jl.read_model(tmp_path / "walk.umb", constants="N=9")
     with pytest.raises(ValueError, match="programs are read, not written"):
         jl.write_model(walk, first)
@@ -159,3 +161,47 @@ def test_game_files_take_programs(tmp_path):
     world = load_game(GameFile.read(path))
     system = np.asarray(world.game.system)
     assert (system.size, system.sum()) == (12, 6)  # x in 0, 1, 2 and y in 0, 1, at each turn
+
+
+@pytest.mark.parametrize("players", [2, 3, 4])
+def test_players_are_merged_where_the_coalition_is_given(tmp_path, players):
+    modules = "".join(
+        f"module m{i} x{i} : [0..1]; [] t={i} -> (t'=(t+1 > last ? 0 : t+1)); endmodule "
+        f"player p{i} m{i} endplayer "
+        for i in range(players)
+    )
+    path = tmp_path / "game.smg"
+    path.write_text(f"smg const int last = {players - 1}; global t : [0..last]; {modules}")
+    names = [f"p{i}" for i in range(players)]
+    if players == 2:
+        np.testing.assert_array_equal(
+            jl.read_model(path).system, jl.read_model(path, coalition=["p0"]).system
+        )
+    else:
+        with pytest.raises(ValueError, match=rf"{players} players, {', '.join(names)}.*coalition"):
+            jl.read_model(path)
+    game = jl.read_model(path, coalition=names[1:])
+    assert np.asarray(game.system)[:players].tolist() == [False] + [True] * (players - 1)
+    for wrong in ("p0", ["p9"]):
+        with pytest.raises(ValueError, match="player"):
+            jl.read_model(path, coalition=wrong)
+
+
+def test_rewards_without_names_are_called_by_position(tmp_path):
+    path = tmp_path / "walk.prism"
+    path.write_text(
+        "dtmc module m x : [0..2]; [] x<2 -> (x'=x+1); [] x=2 -> true; endmodule "
+        'rewards x<2 : 1; endrewards rewards "b" x<2 : 5; endrewards rewards x<2 : 7; endrewards'
+    )
+    model = jl.read_model(path)
+    assert list(model.rewards) == ["1", "b", "3"]
+    program = jl.io.read_program(path)
+    for text, value in {
+        "R{1}=? [ F x=2 ]": 2,
+        "R{3}=? [ F x=2 ]": 14,
+        'R{"3"}=? [ F x=2 ]': 14,
+    }.items():
+        prop = parse_property(text, program_definitions(program))
+        assert jl.solve_property(model, prop).value.tolist() == [value]
+    with pytest.raises(ValueError, match="'1', 'b', '3'"):
+        jl.solve_property(model, "R=? [ F x=2 ]")

@@ -29,6 +29,7 @@ from jaxltl.core.language.syntax import (
     Module,
     Program,
     RenamedModule,
+    RewardStructure,
     Syntax,
     Variable,
 )
@@ -121,7 +122,7 @@ class _Resolver:
         modules = [_changed(m, fold) for m in modules]
         variables = [self.variable(_changed(d, both), None) for d in syntax.variables]
         variables += [self.variable(d, i) for i, m in enumerate(modules) for d in m.declarations]
-        rewards = _changed(tuple(syntax.rewards), both)
+        rewards = _changed(_numbered(syntax.rewards), both)
         used: set[str] = set()
         for e in (
             *(e for m in modules for c in m.commands for e in c.expressions),
@@ -169,7 +170,7 @@ class _Resolver:
         places += [(d.name, d.place) for d in syntax.variables]
         places += [(d.name, d.place) for m in modules for d in m.declarations]
         _check_distinct(places, "the name {} is declared twice.")
-        structures = [(r.name, r.place) for r in syntax.rewards]
+        structures = [(r.name, r.place) for r in _numbered(syntax.rewards)]
         _check_distinct(structures, 'there are two reward structures "{}".')
         if unknown := sorted(self.given.keys() - self.table.keys()):
             listed = ", ".join(self.table) or "none"
@@ -322,6 +323,13 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
     copy = _changed(base, rename, names)
     placed = tuple(replace(d, place=renaming.place) for d in copy.declarations)
     return replace(copy, name=renaming.name, declarations=placed, place=renaming.place)
+
+
+def _numbered(rewards: Sequence[RewardStructure]) -> tuple[RewardStructure, ...]:
+    """Reward structures with distinct names: of several without one, the name is the position."""
+    if sum(not r.name for r in rewards) < 2:
+        return tuple(rewards)
+    return tuple(replace(r, name=r.name or str(i)) for i, r in enumerate(rewards, 1))
 
 
 class _Checker:

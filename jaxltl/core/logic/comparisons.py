@@ -100,7 +100,7 @@ class Definitions:
     Attributes:
       names: the value of each constant and the expression of each formula.
       variables: the variables of the model.
-      rewards: the names of the reward structures in their order, for ``R{2}`` and ``R=?``.
+      rewards: the names of the reward structures in their order, for ``R{2}``.
       constant_values: values of constants that a property file declares without one.
 
     Example:

@@ -42,7 +42,7 @@ class Property:
       nature: the second of two directions, `"max"` in `Pminmax`: the direction in which nature optimises the number
         within intervals; None where only one is said, or none.
       relation, threshold: the comparison, None for `=?`.
-      reward: for `"R"`, the name, or None for the only one that the model has.
+      reward: for `"R"`, the name, or None for the one without a name, or the only one of the model.
       path: for `"P"` a formula or a bounded one, for `"T"` and `"R"` `F` of a state formula or
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
@@ -98,7 +98,8 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
-    `&&` and `||`. So temporal operators reach as far as they can, as in PRISM and Storm:
+    `&&` and `||`, which is for state formulas only. So temporal operators reach as far as they can,
+    as in PRISM and Storm:
     `G F "a" & "b"` is `G F ("a" & "b")`. A property may have a name, `"p1": ...`, and `//`
     begins a comment.
 
@@ -241,11 +242,9 @@ class _Parser(TokenStream):
             raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA or multi(...)")
         self.take()
         fields: dict[str, Any] = {"operator": "LRA" if match[1] == "S" else match[1]}
-        if match[1] == "R":
-            fields["reward"] = self.known.rewards[0] if self.known.rewards else None
-            if self.accept("{"):
-                fields["reward"] = self.reward_name()
-                self.expect("}")
+        if match[1] == "R" and self.accept("{"):
+            fields["reward"] = self.reward_name()
+            self.expect("}")
         # R{"name"}max has max after the name.
         both = start.text[len(match[1]) :] or self.accept(*_DIRECTIONS) or ""
         fields |= {"objective": both[:3] or None, "nature": both[3:] or None}
@@ -318,7 +317,21 @@ class _Parser(TokenStream):
     # --- paths, from loosest to tightest ---
 
     def path(self) -> _Path:
-        return self.chain("||", "|", lambda: self.chain("&&", "&", self.until))
+        operands, sign = [self.conjunction()], self.token
+        while self.accept("||"):
+            operands.append(self.conjunction())
+        paths = [x for x in operands if isinstance(x, Bounded) or not is_boolean(x)]
+        self.require(
+            len(operands) == 1 or not paths,
+            "one path: || of two paths is the conditional probability of the first given the second "
+            "in Storm, which is not solved for; for the probability of at least one of them, write "
+            "(PATH) | (PATH)",
+            sign,
+        )
+        return operands[0] if len(operands) == 1 else Formula("|", tuple(map(self.plain, operands)))
+
+    def conjunction(self) -> _Path:
+        return self.chain("&&", "&", self.until)
 
     def until(self) -> _Path:
         left = self.prefixed()

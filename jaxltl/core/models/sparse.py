@@ -188,8 +188,8 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
     Args:
       model: the sparse model.
       reward: the name of one of its rewards, a structure, or an array on states ``[S]``, choices
-        ``[R]`` or transitions ``[T]``, the first of these shapes that fits; default: the only
-        reward of the model.
+        ``[R]`` or transitions ``[T]``, the first of these shapes that fits; default: the reward
+        without a name, or the only one.
 
     Returns:
       ``float64[R]``; of traced arguments a JAX array in the model's precision, differentiable in the
@@ -221,9 +221,7 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
 def reward_structure(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> Rewards:
     """A reward as a structure, from any form that :func:`choice_reward` accepts."""
     if reward is None:
-        if len(model.rewards) != 1:
-            raise ValueError(f"name the reward: the model has {_listed(model.rewards)}.")
-        reward = next(iter(model.rewards))
+        reward = default_reward(model.rewards)
     if isinstance(reward, str):
         if reward not in model.rewards:
             raise ValueError(
@@ -260,6 +258,13 @@ def _traced_reward(model: SparseMDP, reward: Rewards) -> Array:
         earned = model.probability * jnp.asarray(reward.transition)
         total += segment_reduce(jnp.add, earned, row, model.num_rows)
     return total
+
+
+def default_reward(rewards: Mapping[str, object]) -> str:
+    """The name of the reward that is meant without one: that without a name, or the only one."""
+    if "" in rewards or len(rewards) == 1:
+        return "" if "" in rewards else next(iter(rewards))
+    raise ValueError(f"name the reward: the model has {_listed(rewards)}.")
 
 
 def _listed(names: Mapping[str, object]) -> str:

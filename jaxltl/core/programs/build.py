@@ -58,7 +58,7 @@ def build_model(
 
     Args:
       program: of :func:`~jaxltl.core.language.resolve.read_program`, without parameters.
-      coalition: players of an smg that are the system of the game; default: the first one.
+      coalition: players of an smg that are the system of the game; default: the first one of two.
       max_states: the largest number of states, and a hundredth of that of transitions.
       progress: is called with the numbers of states that are found and expanded.
 
@@ -67,7 +67,8 @@ def build_model(
 
     Raises:
       ValueError: too many states, parameters, an update that leaves the range of a variable or is
-        no distribution, or a state of a game with choices of two players.
+        no distribution, a state of a game with choices of two players, or a game of three players
+        without a coalition.
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
@@ -290,7 +291,15 @@ def _players(program: Program, coalition: Sequence[str] | None) -> list[int]:
     """Numbers of the players of a coalition."""
     names = [p.name for p in program.players]
     if coalition is None:
+        if len(names) > 2:
+            raise ValueError(
+                f"the game has {len(names)} players, {', '.join(names)}, and a Game two: give "
+                "coalition=[...], the names of those that are its system; the others are its "
+                "environment."
+            )
         return [0]
+    if isinstance(coalition, str):
+        raise ValueError(f"coalition={coalition!r}; give a list of names of players.")
     for name in coalition:
         if name not in names:
             raise ValueError(f"there is no player {name!r}; the players are {', '.join(names)}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from jaxltl.core.language.parser import parse_program
 from jaxltl.core.language.resolve import resolve
@@ -97,8 +97,12 @@ def read_syntax(path: str | os.PathLike[str]) -> Syntax:
 
 
 def read_program_model(
-    path: str | os.PathLike[str], constants: Constants = None, max_states: int | None = None
+    path: str | os.PathLike[str],
+    constants: Constants = None,
+    max_states: int | None = None,
+    coalition: Sequence[str] | None = None,
 ) -> SparseMDP | IntervalMDP | Game:
     """The model of a program in a file; see :func:`~jaxltl.core.programs.build.build_model`."""
     program = read_program(path, constants)
-    return build_model(program, max_states=MAX_STATES if max_states is None else max_states)
+    max_states = MAX_STATES if max_states is None else max_states
+    return build_model(program, max_states=max_states, coalition=coalition)

@@ -36,8 +36,9 @@ READ_AS = {
     '(G F "a") & G !"b"': "(G F a) & (G !b)",
     '"a" | F "b" & "c"': "a | F (b & c)",
     '"a" U (X "b" & X "c")': "a U X (b & X c)",
-    'F "a" || F "b"': "(F a) | (F b)",
-    'F "a" || "b"': "(F a) | b",
+    '"a" || "b"': "a | b",
+    'F ("a" || "b")': "F (a | b)",
+    '(F "a") | F "b"': "(F a) | (F b)",
     'F F "a"': "F F a",
     'GF"a"': "G F a",
     'F ("a" <=> "b" => "c")': "F ((a <-> b) -> c)",
@@ -330,6 +331,6 @@ def test_names_of_a_program_are_used_in_properties():
         "T",
         "(x <= 1)",
     ]
-    assert [found[i].reward for i in (1, 2)] == ["", "b"]
+    assert [found[i].reward for i in (1, 2)] == [None, "b"]
     assert (found[3].path.reward, found[3].path.limit) == ("b", 4)
     assert len(found) == 6

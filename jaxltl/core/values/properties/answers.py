@@ -61,7 +61,8 @@ class Answer(NamedTuple):
     """The result of a property.
 
     Attributes:
-      states: ``int[I]``; ``[-1]`` for a filter of no single state, such as a sum.
+      states: ``int[I]``; ``[-1]`` for a filter of no single state, such as a sum, and ``[-1, -1]`` for
+        a range, whose values are the least and the largest one.
       value, lower, upper: ``float64[I]``, with certified bounds.
       holds: truth of a threshold in each state; None where the bounds do not decide it.
       status: CONVERGED if all bounds are within the tolerance, or decide the threshold.
@@ -123,8 +124,11 @@ def with_definitions(
     return replace(model, nominal=more) if isinstance(model, IntervalMDP) else more
 
 
+_NUMBERS = ("value", "lower", "upper")
+
+
 def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
-    """The aggregate of an answer over its states; ``states`` is ``[-1]`` if it is of no single one."""
+    """The aggregate of an answer over its states; ``states`` are -1 if it is of no single one."""
     kind, count = prop.aggregate, answer.states.size
     lower, upper, value = answer.lower, answer.upper, answer.value
     if kind == "print":
@@ -140,10 +144,17 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
     whole = answer._replace(states=np.array([-1]), strategy=None)
     if answer.holds is not None:
         return _truth(whole, kind, answer.holds)
-    if kind == "range":
-        low, high = np.max(lower) - np.min(upper), np.max(upper) - np.min(lower)
-        ends = max(0.0, math.nextafter(low, -math.inf)), math.nextafter(high, math.inf)
-        return _number(prop, whole, (ends[0], np.ptp(value), ends[1]), tolerance)
+    if kind == "range":  # the interval of the values, as in PRISM
+        ends = [
+            _number(prop, whole, (end(lower), end(value), end(upper)), tolerance)
+            for end in (np.min, np.max)
+        ]
+        parts = (np.concatenate([getattr(x, key) for x in ends]) for key in _NUMBERS)
+        return whole._replace(
+            states=np.array([-1, -1]),
+            status=max(x.status for x in ends),
+            **dict(zip(_NUMBERS, parts, strict=True)),
+        )
     divisor = count if kind == "avg" else 1
     # The sum of fsum is the nearest double.
     low, high = (

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from jaxltl.core import validation
 from jaxltl.core.logic.labels import is_boolean, satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
@@ -23,6 +24,7 @@ from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Array, PyTree
+from jaxltl.core.models.sparse import default_reward
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.properties.solve_property import TOLERANCE_SHARES, Answer, as_answer
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -133,14 +135,12 @@ def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
     if prop.operator == "T":
         result: jax.Array = jax.jit(lambda x: jnp.ones(x.shape, model.dtype))(model.available)
         return result
-    names = [prop.reward] if prop.reward is not None else list(model.rewards)
-    if len(names) != 1 or names[0] not in model.rewards:
-        named = "" if prop.reward is None else f" {prop.reward!r}"
-        raise ValueError(
-            f"{prop.text}: which reward{named}? The model has "
-            f"{', '.join(map(repr, model.rewards)) or 'none'}."
-        )
-    return model.rewards[names[0]]
+    with validation.errors_in(f"{prop.text}: "):
+        name = default_reward(model.rewards) if prop.reward is None else prop.reward
+        if name not in model.rewards:
+            listed = ", ".join(map(repr, model.rewards)) or "none"
+            raise ValueError(f"there is no reward {name!r}; the model has {listed}.")
+    return model.rewards[name]
 
 
 def first_bounds(model: ShardedMDP, question: Question) -> Bounds:

@@ -200,7 +200,7 @@ def _filter(
     if not among.size:
         raise ValueError(f"{prop.text}: no state satisfies {prop.among}, the states of the filter.")
     # So that sums of bounds are as narrow as the tolerance.
-    shares = {"sum": len(among), "range": 2}
+    shares = {"sum": len(among)}
     part = replace(prop, aggregate=None, definitions=())
     fine = tolerance / shares.get(str(prop.aggregate), 1)
     relative = isinstance(tolerance, RelativeTolerance)

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 import jaxltl as jl
 from jaxltl import solve_property
+from jaxltl.core.logic.properties import parse_property
 from jaxltl.core.types import Status
+from jaxltl.core.values.properties.solve_on_mesh import _reward
 
 
 def model(seed=0, count=9, chain=False):
@@ -91,8 +94,10 @@ def test_filters_aggregate_over_states():
             assert found.lower <= found.value <= found.upper and found.status == Status.CONVERGED
             assert found.upper - found.lower <= 1e-6 * max(1, found.upper[0])
         spread = solve_property(world, f"filter(range, {prop})")
-        np.testing.assert_allclose(spread.value, np.ptp(every), atol=1e-6)
-        assert spread.lower <= np.ptp(every) <= spread.upper
+        ends = np.array([every.min(), every.max()])
+        np.testing.assert_allclose(spread.value, ends, atol=1e-6)
+        assert (spread.lower <= ends).all() and (ends <= spread.upper).all()
+        assert spread.status == Status.CONVERGED and spread.states.tolist() == [-1, -1]
         least = solve_property(world, f"filter(min, {prop}, x>0)")
         assert every[least.states[0]] == every[part].min()
         shown = solve_property(world, f"filter(print, {prop}, x>0)")
@@ -146,3 +151,30 @@ def test_mistakes_are_named(text, message):
         solve_property(model(), text)
     with pytest.raises(ValueError, match="leave states out"):
         solve_property(model(), 'filter(min, Pmax=? [ F "a" ])', states=[0])
+
+
+@pytest.mark.parametrize("names", [("",), ("x",), ("", "x"), ("x", ""), ("x", "y"), ()])
+def test_a_reward_without_a_name_is_the_unnamed_or_the_only_one(names):
+    """In properties, solvers and over a mesh alike; else all names are listed."""
+    rewards = {n: jl.models.Rewards(state=[float(i + 1), 0, 0]) for i, n in enumerate(names)}
+    world = jl.make_sparse(
+        None, range(4), [1, 2, 2], [1, 1, 1], initial=[1, 0, 0], label={"a": [2]}, rewards=rewards
+    )
+    sharded = jl.models.shard(world, jax.make_mesh((1,), ("states",)))
+    target = np.arange(3) == 2
+    asked = {
+        "property": lambda: solve_property(world, 'R=? [ F "a" ]').value[0],
+        "steps": lambda: solve_property(world, "R=? [ C<=3 ]").value[0],
+        "average": lambda: solve_property(world, "R=? [ S ]").value[0] + expected,
+        "several": lambda: solve_property(world, 'multi(Rmax=? [ F "a" ], P>=0 [ F "a" ])').value,
+        "mesh": lambda: _reward(sharded, parse_property('R=? [ F "a" ]'))[0, 0],
+        "total_reward": lambda: jl.total_reward(world, None, target).value[0],
+        "cumulative_reward": lambda: jl.values.cumulative_reward(world, None, 3).value[0],
+    }
+    expected = names.index("") + 1 if "" in names else 1
+    for name, ask in asked.items():
+        if "" in names or len(names) == 1:
+            assert ask() == pytest.approx(expected), name
+        else:
+            with pytest.raises(ValueError, match=", ".join(map(repr, names)) or "none"):
+                ask()
