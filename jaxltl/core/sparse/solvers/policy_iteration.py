@@ -389,6 +389,8 @@ class _CoreSolver:
         """
         equation, sign = self.equation, self.equation.sign
         unit = self.unit + self.outer_error
+        if not np.isfinite(time).all():
+            return None
         slack = unit * (equation.cost + equation.matrix @ np.abs(value))
         if not (sign * equation.backup(value) + slack <= sign * value[equation.owner]).all():
             return None

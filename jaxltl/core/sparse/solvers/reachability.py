@@ -85,6 +85,29 @@ def reachability(
     return _solve(reduced, tolerance)
 
 
+def avoidance(
+    mdp: HostMDP,
+    target: Booleans,
+    *,
+    maximize: bool,
+    stay: Booleans | None = None,
+    tolerance: float = 1e-6,
+    depth: int = 0,
+) -> Enclosure:
+    """Optimal probability of the complement of :func:`reachability`, with small relative errors.
+
+    The residual problem is the same, with 1 where the target is never reached and 0 where it is
+    reached almost surely, so that no probability is subtracted from 1.
+    """
+    reduced = reduce_reachability(mdp, target, maximize=not maximize, stay=stay, depth=depth)
+    known, problem = 1 - reduced.known_value, reduced.problem
+    if problem is not None:
+        end = np.where(problem.interior, 0.0, 1 - problem.terminal_value)
+        problem = replace(problem, terminal_value=end)
+    reduced = replace(reduced, known_value=known, problem=problem, maximize=maximize)
+    return _solve(reduced, tolerance)
+
+
 def total_reward(
     mdp: HostMDP,
     reward: Floats,

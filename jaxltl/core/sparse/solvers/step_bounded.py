@@ -225,6 +225,36 @@ def until(
     return Steps(value, error, _policy(mdp, backup, row), iterate.num_steps)
 
 
+def avoidance(
+    mdp: HostMDP, target: Booleans, stay: Booleans, num_steps: int, operation: np.ufunc
+) -> Steps | None:
+    """Optimal complement of :func:`until`, with small relative errors; None for many steps."""
+    if num_steps > _LONG:
+        return None
+    open_ = stay & ~target
+    if num_steps >= _MANY:
+        open_ &= _near(mdp, target, open_, num_steps)
+    backup = backup_on(mdp, np.flatnonzero(open_), operation)
+    places, value = backup.places, (~target).astype(np.float64)
+    cost = backup.taken @ np.where(open_, 0, value)
+    iterate = backup.iterate(cost, np.ones(places.size), num_steps, lambda _: False)
+    if not (iterate.is_fixed or iterate.num_steps == num_steps):
+        return None
+    value[places] = iterate.value
+    relative = relative_error(backup_unit(mdp), num_steps)
+    error = np.where(open_ & (num_steps > 0), np.minimum(value * relative + UNDERFLOW, 1), 0)
+    # The graph decides which values are exactly zero or one.
+    leads = mdp.support.some_successor_in
+    choose = np.logical_and if operation is np.maximum else np.logical_or
+    if num_steps and open_.any():
+        sets = target, open_
+        one = open_ & ~reached_within(mdp, sets, num_steps, choose, leads)
+        zero = open_ & reached_within(mdp, sets, num_steps, choose, lambda x: ~leads(~x))
+        value, error = np.where(one, 1, np.where(zero, 0, value)), np.where(one | zero, 0, error)
+    row = backup.greedy(cost, iterate.before)
+    return Steps(value, error, _policy(mdp, backup, row), iterate.num_steps)
+
+
 class Limit(Protocol):
     """Bounds ``float64[S]`` of a step-bounded probability that hold for many steps."""
 

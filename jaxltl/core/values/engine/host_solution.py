@@ -26,10 +26,13 @@ from jaxltl.core.values.engine.state_quantities import finite_reward
 def status_between(
     low: np.ndarray, high: np.ndarray, tolerance: float, *, relative: bool
 ) -> Status:
-    """CONVERGED if bounds are as narrow as the tolerance, or both infinite; else PRECISION."""
+    """CONVERGED if bounds are as narrow as the tolerance, or both infinite; else PRECISION.
+
+    A relative tolerance is a share of the lower bound, and so at most the same of the value.
+    """
     finite = np.isfinite(high)
     width = np.where(finite, high, 0) - np.where(finite, low, 0)
-    scale = np.where(finite, high, 1) if relative else 1
+    scale = np.where(finite, low, 1) if relative else 1
     narrow = (width <= tolerance * scale) & (finite | (low == high))
     return Status.CONVERGED if narrow.all() else Status.PRECISION
 

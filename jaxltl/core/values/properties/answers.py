@@ -202,7 +202,10 @@ def _number(
         width = np.where(lower == upper, 0.0, upper - lower)[0]
     relative = prop.operator in ("R", "T") or isinstance(tolerance, RelativeTolerance)
     scale = max(abs(numbers[0]), abs(numbers[2])) if relative else 1.0
-    # Rounding of the aggregate itself is not counted.
-    narrow = width <= float(tolerance) * scale + 1e-14 * abs(numbers[1])
+    # Rounding of the aggregate itself is not counted, unless the width is a share of the value.
+    limit = float(tolerance) * scale + 1e-14 * abs(numbers[1])
+    if isinstance(tolerance, RelativeTolerance):
+        limit = float(tolerance) * min(abs(numbers[0]), abs(numbers[2]))
+    narrow = width <= limit
     status = answer.status if narrow else max(answer.status, Status.PRECISION)
     return answer._replace(value=value, lower=lower, upper=upper, status=status)

@@ -26,17 +26,22 @@ def exact_reachability(
     stay: Booleans | None = None,
     policy: Integers | None = None,
     objective: str = "max",
+    complement: bool = False,
 ) -> Bounds | None:
     """Reachability bounds of a chain, or of an MDP by a policy `int[S]` of rows that is optimal.
 
+    With `complement`, bounds of the probability of the complementary event.
     The value of a policy is optimal if it solves the optimality equation: it is at least the least
     solution, the maximum; the minimum is the only solution that is 0 where a policy avoids the
     target (Baier and Katoen 2008, section 10.6.1). None if the policy is not, or the model large.
     """
     inner = ~target if stay is None else stay & ~target
     value = _eliminated(mdp if policy is None else mdp.chain(policy), target, inner)
-    if value is None or policy is None:
-        return None if value is None else _bounds(value)
+    if value is None:
+        return None
+    bounds = _bounds([1 - x for x in value] if complement else value)
+    if policy is None:
+        return bounds
     if mdp.successor.size > MAX_TERMS:
         return None
     best = _backup(mdp, value, objective)
@@ -44,7 +49,7 @@ def exact_reachability(
     if objective == "min":
         avoided = ~positive_under_all_policies(mdp, target, among=inner | target)
         optimal &= not any(value[s] for s in np.flatnonzero(avoided))
-    return _bounds(value) if optimal else None
+    return bounds if optimal else None
 
 
 def exact_steps(
@@ -54,9 +59,11 @@ def exact_steps(
     *,
     stay: Booleans | None = None,
     num_steps: int = 1,
+    complement: bool = False,
 ) -> Bounds | None:
     """Step-bounded reachability bounds, without `stay` of being at a target after these steps.
 
+    With `complement`, bounds of the complementary event.
     None if the model or the number of steps is large.
     """
     if num_steps * mdp.successor.size > MAX_TERMS:
@@ -67,7 +74,7 @@ def exact_steps(
         if stay is not None:
             states = zip(target, stay, value, strict=True)
             value = [Fraction(1) if t else x if s else Fraction(0) for t, s, x in states]
-    return _bounds(value)
+    return _bounds([1 - x for x in value] if complement else value)
 
 
 def _backup(mdp: HostMDP, value: list[Fraction], objective: str) -> list[Fraction]:

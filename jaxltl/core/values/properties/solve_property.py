@@ -19,8 +19,8 @@ from jaxltl.core.logic.ltl import Formula, TRUE
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.protocols import Array, PyTree
-from jaxltl.core.models.sparse import Reward, SparseMDP, choice_reward
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import Reward, SparseMDP
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.average.average_reward import average_reward
@@ -30,9 +30,7 @@ from jaxltl.core.values.interval.robust import requested_width
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
-    Objective,
     Pareto,
-    multi_objective,
 )
 from jaxltl.core.values.properties.answers import (
     Answer as Answer,
@@ -40,9 +38,13 @@ from jaxltl.core.values.properties.answers import (
     filtered,
     with_definitions,
 )
+from jaxltl.core.values.properties.several_objectives import solve_multi_objective
 from jaxltl.core.values.properties.exact_reachability import Bounds, exact_reachability, exact_steps
 from jaxltl.core.values.undiscounted import step_bounded as bounded
-from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.reachability import (
+    avoidance_probability,
+    reachability_probability,
+)
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import at_states, starting_states
 from jaxltl.core.values.undiscounted.total_reward import total_reward
@@ -174,13 +176,7 @@ def solve_property(
     solve = partial(_solved, _Query(model, states, prop.text), prop, _aim(model, prop))
     result = solve(width(tolerance))
     if prop.relation is None:
-        answer = _answer(prop, states, result, None, width(tolerance))
-        least = answer.lower.min()
-        if relative and answer.status == Status.PRECISION and 0 < least < 1:
-            # A complementary event: its width is relative to the other probability.
-            result = solve(width(tolerance * least / 2))
-            answer = _answer(prop, states, result, None, width(tolerance))
-        return answer
+        return _answer(prop, states, result, None, width(tolerance))
     verdicts = _verdicts(prop, result)
     for share in TOLERANCE_SHARES[1:]:
         if None not in verdicts or _is_exact(result):
@@ -249,8 +245,10 @@ def _status(prop: Property, result: _Result, tolerance: float) -> Status:
         limit: Array = float(tolerance)
         relative = isinstance(tolerance, RelativeTolerance)
         if prop.operator in ("R", "T") or relative:
-            limit = limit * np.maximum(np.abs(lower), np.abs(upper))
-            limit = limit if relative else np.maximum(limit, TINY)
+            if relative:
+                limit = limit * np.minimum(np.abs(lower), np.abs(upper))
+            else:
+                limit = np.maximum(limit * np.maximum(np.abs(lower), np.abs(upper)), TINY)
         narrow = (width == 0) | ((width <= limit) & np.isfinite(width))
     # An average near zero is narrow as a share of the rewards that cancel out in it.
     proven_narrow = prop.path == Earned("average") and status == Status.CONVERGED
@@ -416,7 +414,7 @@ class _Query(NamedTuple):
         if is_boolean(path):
             return self.state_formula(path)
         if path.operator == "!":
-            return self.opposite(path.operands[0], aim, tolerance)
+            return self.negation(path.operands[0], aim, tolerance)
         if not all(is_boolean(f) for f in path.operands):
             return self.automaton(path, aim, tolerance)
         first, right = path.operands[0], path.operands[-1]
@@ -431,11 +429,11 @@ class _Query(NamedTuple):
             case "U":
                 return self.until(first, right, aim, tolerance)
             case "G":
-                return self.opposite(Formula("F", (~right,)), aim, tolerance)
+                return self.until(TRUE, ~right, aim, tolerance, complement=True)
             case "W":
-                return self.opposite(Formula("U", (~right, ~first & ~right)), aim, tolerance)
+                return self.until(~right, ~first & ~right, aim, tolerance, complement=True)
             case "R":
-                return self.opposite(Formula("U", (~first, ~right)), aim, tolerance)
+                return self.until(~first, ~right, aim, tolerance, complement=True)
         raise AssertionError(path.operator)
 
     def state_formula(self, path: Formula) -> _Result:
@@ -446,19 +444,60 @@ class _Query(NamedTuple):
             Solution(holds, no_policy, holds, holds, zero, zero, zero, method="the label"), None
         )
 
-    def opposite(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
-        result = self.probability(path, aim.opposite, tolerance)
-        return result._replace(solution=complement_event(result.solution))
+    def negation(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
+        """The probability that a formula with temporal operators is false."""
+        first, right = path.operands[0], path.operands[-1]
+        if path.operator == "!":
+            return self.probability(first, aim, tolerance)
+        if not all(is_boolean(f) for f in path.operands):
+            return self.automaton(~path, aim, tolerance)
+        match path.operator:
+            case "X":
+                return self.probability(Formula("X", (~right,)), aim, tolerance)
+            case "F":
+                return self.until(TRUE, right, aim, tolerance, complement=True)
+            case "U":
+                return self.until(first, right, aim, tolerance, complement=True)
+            case "G":
+                return self.until(TRUE, ~right, aim, tolerance)
+            case "W":
+                return self.until(~right, ~first & ~right, aim, tolerance)
+            case "R":
+                return self.until(~first, ~right, aim, tolerance)
+        raise AssertionError(path.operator)
 
-    def until(self, first: Formula, right: Formula, aim: _Aim, tolerance: float) -> _Result:
+    def until(
+        self,
+        first: Formula,
+        right: Formula,
+        aim: _Aim,
+        tolerance: float,
+        *,
+        complement: bool = False,
+    ) -> _Result:
+        """The probability of until, or of its complement."""
+        relative = isinstance(tolerance, RelativeTolerance)
+        if complement and not relative:
+            return _opposite(self.until(first, right, aim.opposite, tolerance))
         target: Array = self.where(right)
         stay: Array = None if first == TRUE else self.where(first)
-        solution = reachability_probability(
-            self.model, target, stay=stay, tolerance=tolerance, **aim.directions
-        )
+        # One minus a probability near one has no relative accuracy.
+        if complement and isinstance(self.model, SparseMDP):
+            solution = avoidance_probability(
+                self.model, target, stay=stay, objective=aim.policy, tolerance=tolerance
+            )
+        else:
+            solution = reachability_probability(
+                self.model, target, stay=stay, tolerance=tolerance, **aim.directions
+            )
         policy = None if self.model.is_chain else np.asarray(solution.policy)
         exact = partial(
-            exact_reachability, target=target, stay=stay, policy=policy, objective=aim.policy
+            exact_reachability,
+            target=target,
+            stay=stay,
+            policy=policy,
+            objective=(aim.opposite if complement else aim).policy,
+            complement=complement,
         )
         return self.exact(self.result(solution), tolerance, exact)
 
@@ -472,10 +511,10 @@ class _Query(NamedTuple):
         return _Result(replace(result.solution, method=method), strategy)
 
     def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Result:
-        if path.operator == "R":
+        complement, asked = path.operator == "R", aim
+        if complement:
             negated = TRUE if path.left.operator == "false" else ~path.left
-            until = replace(path, operator="U", left=negated, right=~path.right)
-            return self.opposite(until, aim, tolerance)
+            path, aim = replace(path, operator="U", left=negated, right=~path.right), aim.opposite
         target, stay = self.where(path.right), self.where(path.left)
         if path.reward is not None:
             assert path.limit is not None
@@ -485,85 +524,34 @@ class _Query(NamedTuple):
             solution = bounded.reward_bounded_reachability(
                 model, target, path.reward or None, limit, stay=stay, objective=aim.policy
             )
-            return self.result(solution, by="reward")
+            result = self.result(solution, by="reward")
+            return _opposite(result) if complement else result
         if path.lower or path.upper is None:
             if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
                 raise ValueError(
                     f"{self.text}: a lower bound on steps is solved for up to "
                     f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller."
                 )
-            return self.probability(unfolded(path), aim, tolerance)
-        solution = bounded.bounded_reachability(
-            self.model, target, path.upper, stay=stay, **aim.directions
-        )
+            return self.probability(
+                ~unfolded(path) if complement else unfolded(path), asked, tolerance
+            )
         exact = partial(
             exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
         )
-        return self.exact(self.result(solution, by="steps"), tolerance, exact)
-
-
-def solve_multi_objective(
-    model: SparseMDP, prop: Property, tolerance: float
-) -> Achievable | ConstrainedOptimum | Pareto:
-    """Solution of ``multi(...)``."""
-    parts = [_objective(model, x) for x in prop.parts]
-    return multi_objective(model, parts, tolerance=tolerance)
-
-
-def _objective(model: SparseMDP, prop: Property) -> Objective:
-    direction = prop.objective
-    if prop.relation is not None:
-        if prop.relation in (">", "<"):
-            raise ValueError(
-                f"{prop.text}: strict thresholds are not supported inside multi(...); "
-                f"write {prop.relation}=."
+        if complement and isinstance(tolerance, RelativeTolerance):
+            avoided = bounded.bounded_avoidance(
+                self.model, target, path.upper, stay=stay, objective=asked.policy
             )
-        wanted = "max" if prop.relation == ">=" else "min"
-        if direction not in (None, wanted):
-            raise ValueError(
-                f"{prop.text}: inside multi(...) one strategy must meet the "
-                f"threshold; write {prop.operator}{prop.relation}."
-            )
-        direction = wanted  # type: ignore[assignment]
-    if direction is None:
-        raise ValueError(
-            f"{prop.text}: inside multi(...), ask for {prop.operator}max=? or "
-            f"{prop.operator}min=?, or give a threshold."
+            if avoided is not None:
+                exact = partial(exact, complement=True)
+                return self.exact(self.result(avoided, by="steps"), tolerance, exact)
+        solution = bounded.bounded_reachability(
+            self.model, target, path.upper, stay=stay, **aim.directions
         )
-    quantity = _event(model, prop) if prop.operator == "P" else _sum(model, prop)
-    return Objective(direction=direction, threshold=prop.threshold, **quantity)
+        result = self.exact(self.result(solution, by="steps"), tolerance, exact)
+        return _opposite(result) if complement else result
 
 
-def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
-    path = prop.path
-    if isinstance(path, Bounded):
-        if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
-            raise ValueError(
-                f"{prop.text}: inside multi(...) a bound must be on at most "
-                f"{MAX_UNFOLDED_STEPS} steps."
-            )
-        path = unfolded(path)
-    assert isinstance(path, Formula)
-
-    if path.operator not in ("F", "G", "U") or not all(is_boolean(f) for f in path.operands):
-        return {"formula": path}
-    stay, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))
-    if path.operator == "G":
-        return {"avoid": ~right}
-    if path.operator == "F":
-        return {"target": right}
-    return {"target": right, "stay": stay}
-
-
-def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
-    path = prop.path
-    if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
-        raise ValueError(
-            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
-            "and T are supported."
-        )
-    reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
-    if isinstance(path, Formula):
-        target = states_satisfying(model, path.operands[0], prop.text)
-        return {"reward": reward, "target": target}
-    return {"reward": reward}
+def _opposite(result: _Result) -> _Result:
+    """The result of the complementary event."""
+    return result._replace(solution=complement_event(result.solution))

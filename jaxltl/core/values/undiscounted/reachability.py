@@ -222,6 +222,21 @@ def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[
     return requested, requested
 
 
+def avoidance_probability(
+    model: SparseMDP,
+    target: Booleans,
+    *,
+    stay: Booleans | None,
+    objective: str,
+    tolerance: float,
+) -> Solution:
+    """Complement of :func:`reachability_probability`, to a width relative to the value."""
+    enclosure = solver.avoidance(
+        model.host, target, maximize=objective == "max", stay=stay, tolerance=tolerance
+    )
+    return solution_from_enclosure(model, model, enclosure, float(tolerance), relative=True)
+
+
 def rows_of_model(model: Model) -> SparseMDP:
     """The sparse rows of a concrete model or game; a float32 model means its normalised rows."""
     return _rows(model.mdp if isinstance(model, Game) else model)

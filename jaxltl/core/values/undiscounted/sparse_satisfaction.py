@@ -22,7 +22,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief, count, nested_repr
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
-from jaxltl.core.sparse.solvers.reachability import reachability
+from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
@@ -162,17 +162,22 @@ def _best(
         aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
     whole = sparse_mdp_of_product(product)
     requested = default_tolerance(whole) if tolerance is None else as_width(tolerance)
+    relative = isinstance(requested, RelativeTolerance)
+    # One minus a probability near one has no relative accuracy.
+    solve, maximize = (
+        (avoidance, aim == "min") if opposite and relative else (reachability, aim == "max")
+    )
     solution = solution_from_enclosure(
         whole,
         whole,
-        reachability(product.host, goal, maximize=aim == "max", tolerance=requested, depth=depth),
+        solve(product.host, goal, maximize=maximize, tolerance=requested, depth=depth),
         float(requested),
-        relative=isinstance(requested, RelativeTolerance),
+        relative=relative,
     )
     row = np.asarray(solution.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
-    return (complement_event(solution) if opposite else solution), row
+    return (complement_event(solution) if opposite and not relative else solution), row
 
 
 def product_satisfaction(

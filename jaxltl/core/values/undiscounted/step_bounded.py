@@ -135,6 +135,17 @@ def bounded_reachability(
     return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
 
 
+def bounded_avoidance(
+    model: Model, target: Array, num_steps: int, *, stay: Array, objective: str = "max"
+) -> Solution | None:
+    """Complement of :func:`bounded_reachability`, relatively exact; None for many steps."""
+    model, operation = _problem(model, objective, num_steps)
+    values = host.avoidance(model.host, target, stay, num_steps, operation)
+    if values is None:
+        return None
+    return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
+
+
 def cumulative_reward(
     model: Model,
     reward: Array | str,

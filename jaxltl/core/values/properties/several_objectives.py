@@ -1,0 +1,87 @@
+"""Properties of several objectives: ``multi(...)`` as the arguments of the solver."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxltl.core.logic.bounded import Bounded, unfolded
+from jaxltl.core.logic.labels import is_boolean
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property
+from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.sparse import SparseMDP, choice_reward
+from jaxltl.core.values.multi_objective.multi_objective import (
+    Achievable,
+    ConstrainedOptimum,
+    Objective,
+    Pareto,
+    multi_objective,
+)
+
+
+def solve_multi_objective(
+    model: SparseMDP, prop: Property, tolerance: float
+) -> Achievable | ConstrainedOptimum | Pareto:
+    """Solution of ``multi(...)``."""
+    parts = [_objective(model, x) for x in prop.parts]
+    return multi_objective(model, parts, tolerance=tolerance)
+
+
+def _objective(model: SparseMDP, prop: Property) -> Objective:
+    direction = prop.objective
+    if prop.relation is not None:
+        if prop.relation in (">", "<"):
+            raise ValueError(
+                f"{prop.text}: strict thresholds are not supported inside multi(...); "
+                f"write {prop.relation}=."
+            )
+        wanted = "max" if prop.relation == ">=" else "min"
+        if direction not in (None, wanted):
+            raise ValueError(
+                f"{prop.text}: inside multi(...) one strategy must meet the "
+                f"threshold; write {prop.operator}{prop.relation}."
+            )
+        direction = wanted  # type: ignore[assignment]
+    if direction is None:
+        raise ValueError(
+            f"{prop.text}: inside multi(...), ask for {prop.operator}max=? or "
+            f"{prop.operator}min=?, or give a threshold."
+        )
+    quantity = _event(model, prop) if prop.operator == "P" else _sum(model, prop)
+    return Objective(direction=direction, threshold=prop.threshold, **quantity)
+
+
+def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
+    path = prop.path
+    if isinstance(path, Bounded):
+        if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
+            raise ValueError(
+                f"{prop.text}: inside multi(...) a bound must be on at most "
+                f"{MAX_UNFOLDED_STEPS} steps."
+            )
+        path = unfolded(path)
+    assert isinstance(path, Formula)
+
+    if path.operator not in ("F", "G", "U") or not all(is_boolean(f) for f in path.operands):
+        return {"formula": path}
+    stay, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))
+    if path.operator == "G":
+        return {"avoid": ~right}
+    if path.operator == "F":
+        return {"target": right}
+    return {"target": right, "stay": stay}
+
+
+def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
+    path = prop.path
+    if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
+        raise ValueError(
+            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
+            "and T are supported."
+        )
+    reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
+    if isinstance(path, Formula):
+        target = states_satisfying(model, path.operands[0], prop.text)
+        return {"reward": reward, "target": target}
+    return {"reward": reward}
