@@ -53,7 +53,8 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
 from jaxltl.core.values import Objective, satisfaction_probability
 from jaxltl.core.values.multi_objective.front_search import FrontSearch
-from jaxltl.core.values.multi_objective.front_search import Front
+from jaxltl.core.values.multi_objective.query import multi_objective_query
+from jaxltl.core.values.multi_objective.answers import Front
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
 MAX_MEMBERS = 8  # objectives at once, see Objective
@@ -102,7 +103,7 @@ class RobustPolicy(NamedTuple):
       upper: no policy has a larger minimum over the groundings.
       share: initial probabilities of the policies of `front`, which are drawn once.
       front: policies with the memory of all groundings' automata; see
-        :class:`~jaxltl.core.values.multi_objective.front_search.Front`.
+        :class:`~jaxltl.core.values.multi_objective.answers.Front`.
       initial: ``float[S]``, the initial distribution.
     """
 
@@ -231,7 +232,7 @@ def robust_policy(
         names += own
         columns.append(np.asarray(label, bool)[: world.num_states])
     joint = with_labels(world, np.concatenate(columns, axis=1), names)
-    search = FrontSearch(joint, objectives, tolerance / 8)
+    search = FrontSearch(multi_objective_query(joint, objectives), tolerance / 8)
     wanted = np.ones(len(labels))
     while True:
         lower = search.lower

@@ -41,7 +41,7 @@ class WeightedProblem(NamedTuple):
     priority: Integers
     gain: Floats  # float64[K, R], at least 0: rewards to maximise
     cost: Floats  # float64[C, R], at least 0: rewards to minimise
-    ended: Booleans  # bool[N], where all rewards with a target have reached it
+    ended: Booleans  # bool[N], where all costs with a target have reached it
 
 
 class FinalComponents(NamedTuple):
@@ -52,12 +52,12 @@ class FinalComponents(NamedTuple):
     inside: list[Booleans]  # for each set, the rows of end components in which it can be satisfied
 
 
-def final_components(sums: WeightedProblem) -> FinalComponents | None:
-    """Final components; None if some initial state does not reach them almost surely."""
+def final_components(sums: WeightedProblem, rows: Booleans | None = None) -> FinalComponents | None:
+    """Final components among `rows`; None if some initial state does not reach them almost surely."""
     mdp = sums.mdp
     free = (sums.cost == 0).all(0) & sums.ended[mdp.state]
-    homes = end_components(mdp, rows=free)
-    inside, rows = almost_sure_reachability(mdp, homes.region(mdp))
+    homes = end_components(mdp, rows=free if rows is None else free & rows)
+    inside, rows = almost_sure_reachability(mdp, homes.region(mdp), rows)
     if (sums.start > 0)[~inside].any():
         return None
     count = len(sums.priority)
@@ -171,6 +171,8 @@ def _solved(
     highest = quotient.known.max() if costs else 0.0
     amount = np.where(moves, loss, highest - quotient.known) if costs else gain
     amount[-1] = 0
+    if not amount.any():  # without the rounding of a solver
+        return np.full(end.size, highest if costs else 0.0), first
     problem = ShortestPathProblem(mdp, ~end, np.zeros(end.size), amount, proper_policy=first)
     enclosure = policy_iteration(problem, maximize=not costs, tolerance=tolerance, relative=False)
     return (highest - enclosure.lower if costs else enclosure.upper), enclosure.row

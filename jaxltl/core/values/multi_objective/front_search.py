@@ -13,179 +13,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.protocols import Model
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
-from jaxltl.core.sparse.multi_objective.weighted_sum import (
-    FinalComponents,
-    final_components,
-    weighted_optimum,
-)
-from jaxltl.core.sparse.product import SparseProduct
+from jaxltl.core.sparse.multi_objective.weighted_sum import weighted_optimum
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Status
 from jaxltl.core.values.engine.host_solution import induced_chain
-from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
+from jaxltl.core.values.multi_objective.objectives import Part
+from jaxltl.core.values.multi_objective.answers import (
+    ConstrainedOptimum,
+    Front,
+    NearestMixture,
+    impossible,
+)
+from jaxltl.core.values.multi_objective.query import Query, bounds_of, multi_objective_query
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
 
-@brief
-class Front(NamedTuple):
-    """Points that policies attain and half-spaces that none leaves, for n objectives.
-
-    Attributes:
-      points: ``float64[N, n]``, values of policies from the initial distribution.
-      lower, upper: ``float64[N, n]``, their certified bounds.
-      normals, bounds: ``float64[K, n]``, ``[K]``: every policy has ``normals @ value <= bounds``
-        (a minimised objective has a negative normal).
-      policies: for each point the weights of the product's rows, ``float64[R']``.
-      product: the model with the memory of the objectives; rows are the model's `base_row`.
-
-    Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, pareto
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> both = [Objective(target="a"), Objective(target="b")]
-      >>> front = pareto(model, both).front
-      >>> front.points.tolist(), bool((front.normals @ front.points.T <= front.bounds[:, None]).all())
-      ([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], True)
-    """
-
-    points: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    normals: np.ndarray
-    bounds: np.ndarray
-    policies: tuple[np.ndarray, ...]
-    product: SparseProduct
-
-
-@brief
-class NearestMixture(NamedTuple):
-    """Mixture of policies nearest to thresholds that are neither met nor excluded.
-
-    Attributes:
-      share: the probabilities with which the front's policies are drawn initially.
-      lower, upper: ``float64[n]``, certified bounds of its values.
-      gap: ``float64[n]``, a bound on how far it misses each threshold.
-
-    Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, achievable
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> both = [Objective(target="a"), Objective(target="b")]
-      >>> unknown = achievable(model, both, [0.5, 0.6], max_points=2)
-      >>> unknown.holds, unknown.nearest.lower.round(6).tolist()
-      (None, [0.45, 0.55])
-    """
-
-    share: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    gap: np.ndarray
-
-
-@brief
-class Achievable(NamedTuple):
-    """Answer to an achievability query.
-
-    Attributes:
-      holds: True, False, or None if unknown.
-      share: if True, the probabilities with which the front's policies are drawn initially.
-      normal: if False, the number of a half-space of the front that excludes the thresholds.
-      front: the evidence.
-      status: CONVERGED if known.
-      nearest: if unknown, the mixture of policies nearest to the thresholds.
-
-    Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, achievable
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> both = [Objective(target="a"), Objective(target="b")]
-      >>> found = achievable(model, both, [0.5, 0.5])
-      >>> found.holds, found.share.round(6).tolist()
-      (True, [0.5, 0.5])
-      >>> refused = achievable(model, both, [0.5, 0.6])
-      >>> refused.holds, refused.front.normals[refused.normal].tolist()  # a + b is at most 1
-      (False, [0.5, 0.5])
-    """
-
-    holds: bool | None
-    share: np.ndarray | None
-    normal: int | None
-    front: Front
-    status: Status
-    nearest: NearestMixture | None = None
-
-
-@brief
-class ConstrainedOptimum(NamedTuple):
-    """Optimal value of one objective under thresholds on the others.
-
-    Attributes:
-      value, lower, upper: the value and its certified bounds; NaN if the thresholds cannot be met.
-        If that is unknown, they hold provided that they can; one bound is infinite.
-      holds: True if the thresholds can be met; None if unknown.
-      share: initial probabilities of the front's policies that attain the safe bound, or None.
-      front: the evidence.
-      status: CONVERGED if the bounds are narrow, or the thresholds cannot be met.
-      nearest: if `holds` is unknown, the best of the mixtures nearest to the thresholds.
-
-    Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, multi_objective
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> both = [Objective(target="a"), Objective(target="b", threshold=0.25)]
-      >>> best = multi_objective(model, both)
-      >>> round(best.lower, 6), round(best.upper, 6), best.status.name
-      (0.75, 0.75, 'CONVERGED')
-    """
-
-    value: float
-    lower: float
-    upper: float
-    holds: bool | None
-    share: np.ndarray | None
-    front: Front
-    status: Status
-    nearest: NearestMixture | None = None
-
-
-@brief
-class Pareto(NamedTuple):
-    """Pareto curve: values that no policy improves in one objective without loss in another.
-
-    Attributes:
-      points: ``float64[V, n]``, attained points of the curve; so are their mixtures.
-      front: all points and half-spaces, with bounds.
-      gap: a bound on the distance of values beyond the mixtures, in each objective relative to its
-        largest size (absolute for probabilities).
-      status: CONVERGED if the gap is at most the tolerance.
-
-    Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, pareto
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> both = [Objective(target="a"), Objective(target="b")]
-      >>> curve = pareto(model, both)
-      >>> curve.points.tolist(), curve.gap < 1e-4
-      ([[0.0, 1.0], [1.0, 0.0]], True)
-    """
-
-    points: np.ndarray
-    front: Front
-    gap: float
-    status: Status
-
-
+_NEGLIGIBLE = 1e-12  # the width of the bounds of a reward that is narrow without being relative
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
 
 
@@ -211,21 +57,14 @@ class _Sum(NamedTuple):
 class FrontSearch:
     """Known points and half-spaces, all objectives maximised: `signs` is -1 for minimised ones."""
 
-    def __init__(self, model: Model, objectives: Sequence[Objective], tolerance: float) -> None:
-        if not objectives:
-            raise ValueError("there is no objective; give at least one.")
-        problem = weighted_problem(to_sparse(model), objectives)
-        self.problem, self.parts, self.product = problem
-        ends = final_components(self.problem)
+    def __init__(self, query: Query, tolerance: float) -> None:
+        ends, endless = query.ends, query.infinite_reward()
         if ends is None:
-            names = " and ".join(str(p.number + 1) for p in self.parts if p.kind == "cost")
-            raise ValueError(
-                f"the expected reward of objective {names or 1} is infinite under every policy: "
-                "what it counts goes on for ever, or its target is not reached almost surely."
-            )
-        self.ends: FinalComponents = ends
-        self._require_finite()
-        self.signs = np.array([p.sign for p in self.parts])
+            raise ValueError(query.infinite_costs())
+        if endless is not None:
+            raise ValueError(endless)
+        self.problem, self.parts, self.product = query.problem, query.parts, query.product
+        self.query, self.ends, self.signs = query, ends, query.signs
         self.tolerance = tolerance
         self.solved: list[_Sum] = []
         self.scale = np.ones(len(self.parts))
@@ -242,25 +81,6 @@ class FrontSearch:
     def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Normals and bounds, ``float64[K, n]`` and ``float64[K]``."""
         return np.stack([x.normal for x in self.solved]), np.array([x.bound for x in self.solved])
-
-    def _require_finite(self) -> None:
-        mdp = self.problem.mdp
-        cyclic = end_components(mdp, rows=self.ends.rows).inside
-        everywhere = end_components(mdp).inside
-        for part in self.parts:
-            if part.kind != "gain":
-                continue
-            earns = (cyclic & (self.problem.gain[part.place] > 0)).any()
-            if earns or (part.pending is not None and (everywhere & part.pending[mdp.state]).any()):
-                why = (
-                    "reward is earned for ever in an end component"
-                    if earns
-                    else "some policy does not reach its target"
-                )
-                raise ValueError(
-                    f"the largest expected reward of objective {part.number + 1} is infinite: "
-                    f"{why}; make it small, or take that end component out of the model."
-                )
 
     def _rescale(self) -> None:
         reach = np.abs(self.lower).max(0)
@@ -326,7 +146,9 @@ class FrontSearch:
         if part.kind == "cost":
             return -value, -high, -low
         # The policy made the opposite event's probability large.
-        return (value - 1, *((low - 1, high - 1) if exact else (low - 1 - 1e-16, high - 1 + 1e-16)))
+        if not exact:
+            low, high = max(low - 1e-16, 0.0), min(high + 1e-16, 1.0)
+        return value - 1, low - 1, high - 1
 
     def front(self) -> Front:
         """The points and half-spaces with the signs of the objectives."""
@@ -408,40 +230,72 @@ class FrontSearch:
         front, used = self.front(), share > 0
         low = frontier.mixture(front.lower[used], share[used])
         high = -frontier.mixture(-front.upper[used], share[used])
+        most = [1.0 if p.kind == "sure" else np.inf for p in self.parts]
+        low, high = np.maximum(low, 0.0), np.minimum(high, most)
         missed = wanted - self.signs * np.where(self.signs > 0, low, high)
         return NearestMixture(share, low, high, np.maximum(missed, 0))
 
-    def best(self, index: int, wanted: Thresholds, max_points: int) -> ConstrainedOptimum:
+    def best(
+        self, index: int, limits: Sequence[float | Fraction | None], max_points: int
+    ) -> ConstrainedOptimum:
         """The optimal value of one objective under thresholds on the others."""
-        sign, tolerance = self.signs[index], self.tolerance
+        wanted, sign, tolerance = self.thresholds(limits), self.signs[index], self.tolerance
         enough = np.array(wanted)
         enough[:, index] = self.lower[:, index].min() - self.scale[index]
         holds, share, _ = self.decide(Thresholds(*enough), max_points)
         if holds is False:
-            nan = float("nan")
-            return ConstrainedOptimum(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
+            return impossible(self.front())
+        kind = self.parts[index].kind
         while True:
             lower = self.lower
             known = frontier.largest(lower, self.half_spaces, index, wanted, self.scale, share)
-            size = max(1.0 if self.parts[index].kind == "sure" else abs(known.upper), 1e-300)
+            size = 1.0 if kind == "sure" else max(abs(known.upper), _NEGLIGIBLE / tolerance)
             narrow = known.upper - known.lower <= tolerance * size
             if narrow or known.vector is None or len(lower) >= max_points:
                 break
             if not self.ask_anew(frontier.separation(lower, known.vector, self.scale).normal):
                 break
-        met = np.isfinite(known.lower)
         low, high = sorted((float(sign * known.lower), float(sign * known.upper)))
-        if self.parts[index].kind == "sure":
-            low, high = max(low, 0.0), min(high, 1.0)
-        if met:
+        low, high = max(0.0, low), min(1.0, high) if kind == "sure" else max(0.0, high)
+        if np.isfinite(known.lower):
             status = Status.CONVERGED if narrow else Status.PRECISION
-            return ConstrainedOptimum(
+            optimum = ConstrainedOptimum(
                 (low + high) / 2, low, high, True, known.share, self.front(), status
             )
-        nearest = self.nearest(wanted.hard, index)
-        value = float(np.clip((nearest.lower[index] + nearest.upper[index]) / 2, low, high))
+        else:
+            nearest = self.nearest(wanted.hard, index)
+            value = float(np.clip((nearest.lower[index] + nearest.upper[index]) / 2, low, high))
+            optimum = ConstrainedOptimum(
+                value, low, high, holds, None, self.front(), Status.PRECISION, nearest
+            )
+        ends = low == 0 or (kind == "sure" and high == 1)
+        if (optimum.status == Status.CONVERGED and not (ends and low < high)) or (
+            len(self.solved) >= max_points
+        ):
+            return optimum
+        return self._exactly(optimum, index, limits)
+
+    def _exactly(
+        self, optimum: ConstrainedOptimum, index: int, limits: Sequence[float | Fraction | None]
+    ) -> ConstrainedOptimum:
+        """An optimum from rational arithmetic, or one of zero from the graph, where that is possible."""
+        answer = self.query.exact(limits, index)
+        if answer is not None and not answer.holds:
+            return impossible(self.front())
+        value = None if answer is None else answer.value
+        if answer is None and self.parts[index].kind == "cost" and optimum.lower == 0:
+            free = [0 if i == index else x for i, x in enumerate(limits)]
+            query = multi_objective_query(self.query.model, self.query.objectives, free)
+            if query.ends is not None and query.infinite_reward() is None:
+                search = FrontSearch(query, self.tolerance)
+                if search.decide(search.thresholds(limits), len(self.solved))[0]:
+                    value = Fraction(0)
+        if value is None:
+            return optimum
+        low, high = bounds_of(value)
+        share = optimum.share if optimum.nearest is None else optimum.nearest.share
         return ConstrainedOptimum(
-            value, low, high, holds, None, self.front(), Status.PRECISION, nearest
+            float(value), low, high, True, share, self.front(), Status.CONVERGED
         )
 
     def close(self, tolerance: float, max_points: int) -> float:

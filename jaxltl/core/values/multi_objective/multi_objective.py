@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 
@@ -14,14 +15,16 @@ from jaxltl.core import validation
 from jaxltl.core.values.multi_objective.objectives import Objective
 from jaxltl.core.values.engine.state_quantities import TOLERANCE
 
-from jaxltl.core.values.multi_objective.front_search import (
+from jaxltl.core.values.multi_objective.answers import (
     Achievable,
     ConstrainedOptimum,
     Front,
-    FrontSearch,
     NearestMixture,
     Pareto,
+    impossible,
 )
+from jaxltl.core.values.multi_objective.front_search import FrontSearch
+from jaxltl.core.values.multi_objective.query import bounds_of, multi_objective_query
 
 __all__ = [
     "Achievable",
@@ -49,7 +52,8 @@ def achievable(
 
     Each weighted sum adds a point that its policy attains and a half-space that no policy leaves
     (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a mixture of points meets them, and
-    not if a half-space excludes them.
+    not if a half-space excludes them. On the boundary, small models are decided by a linear program
+    in fractions, those that their doubles stand for: 0.1 is one tenth.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
@@ -62,7 +66,8 @@ def achievable(
       :class:`Achievable`, with the front as evidence. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: an invalid objective, or an expected reward that is infinite.
+      ValueError: an invalid objective, or a maximal expected reward that is infinite in a model
+        that is too large for fractions.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -80,13 +85,36 @@ def achievable(
             f"thresholds={list(thresholds)}; give one finite number for each of the "
             f"{len(objectives)} objectives."
         )
-    search = FrontSearch(model, objectives, tolerance)
-    wanted = search.thresholds(thresholds)
+    return _achievable(model, objectives, thresholds, tolerance, max_points)
+
+
+def _achievable(
+    model: Model,
+    objectives: Sequence[Objective],
+    limits: Sequence[float | Fraction | None],
+    tolerance: float,
+    max_points: int,
+) -> Achievable:
+    query = multi_objective_query(model, objectives, limits)
+    if query.ends is None:
+        return Achievable(False, None, None, query.empty_front(), Status.CONVERGED)
+    endless = query.infinite_reward()
+    if endless is not None:
+        answer = query.exact(limits)
+        if answer is None:
+            raise ValueError(endless)
+        return Achievable(answer.holds, None, None, query.empty_front(), Status.CONVERGED)
+    search = FrontSearch(query, tolerance)
+    wanted = search.thresholds(limits)
     holds, share, normal = search.decide(wanted, max_points)
-    if holds is None:
-        nearest = search.nearest(wanted.hard)
+    if holds is not None:
+        return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
+    nearest = search.nearest(wanted.hard)
+    answer = query.exact(limits) if len(search.solved) < max_points else None
+    if answer is None:
         return Achievable(None, None, None, search.front(), Status.PRECISION, nearest)
-    return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
+    share = nearest.share if answer.holds else None
+    return Achievable(answer.holds, share, None, search.front(), Status.CONVERGED)
 
 
 @validated()
@@ -94,6 +122,8 @@ def pareto(
     model: Model, objectives: Sequence[Objective], *, tolerance: float = 1e-4, max_points: int = 200
 ) -> Pareto:
     """Pareto curve of two or more objectives, up to a tolerance.
+
+    It is that of the policies whose minimised rewards are finite.
 
     Args:
       model, objectives: as for :func:`achievable`.
@@ -104,7 +134,8 @@ def pareto(
       :class:`Pareto`. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: as for :func:`achievable`.
+      ValueError: as for :func:`achievable`, for models of any size, or no policy has finite
+        minimised rewards.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -115,7 +146,7 @@ def pareto(
       [[0.0, 1.0], [1.0, 0.0]]
     """
     _require(model, objectives)
-    search = FrontSearch(model, objectives, tolerance / 8)
+    search = FrontSearch(multi_objective_query(model, objectives), tolerance / 8)
     gap = search.close(tolerance, max_points)
     front = search.front()
     lower, margin = search.lower, search.tolerance * search.scale
@@ -188,6 +219,42 @@ def multi_objective(
                 "but one of them (the best value), to all (achievability) or to none (the curve)."
             )
         return pareto(model, objectives, tolerance=max(tolerance, 1e-6), max_points=max_points)
-    search = FrontSearch(model, objectives, tolerance)
-    wanted = search.thresholds([o.threshold for o in objectives])
-    return search.best(free[0], wanted, max_points)
+    return _optimum(model, objectives, free[0], tolerance, max_points)
+
+
+def _optimum(
+    model: Model, objectives: Sequence[Objective], index: int, tolerance: float, max_points: int
+) -> ConstrainedOptimum:
+    """The optimum of one objective, infinite if no policy with a finite value meets the thresholds."""
+    limits = [o.threshold for o in objectives]
+    query = multi_objective_query(model, objectives, limits)
+    endless = query.infinite_reward()
+    front = query.empty_front()
+    if endless is not None:
+        answer = query.exact(limits, index)
+        if answer is None:
+            raise ValueError(endless)
+        if answer.holds:
+            value = math.inf if answer.value is None else float(answer.value)
+            bounds = bounds_of(answer.value)
+            return ConstrainedOptimum(value, *bounds, True, None, front, Status.CONVERGED)
+    elif query.ends is not None:
+        optimum = FrontSearch(query, tolerance).best(index, limits, max_points)
+        if optimum.holds is not False:
+            return optimum
+        front = optimum.front
+    if query.parts[index].kind != "cost":
+        return impossible(front)
+    # Other policies may meet the thresholds, with an infinite value.
+    kept = [i for i in range(len(objectives)) if i != index]
+    if not kept:
+        return ConstrainedOptimum(math.inf, math.inf, math.inf, True, None, front, Status.CONVERGED)
+    rest = _achievable(
+        model, [objectives[i] for i in kept], [limits[i] for i in kept], tolerance, max_points
+    )
+    if rest.holds is False:
+        return impossible(front)
+    front = rest.front.with_unknown(kept, len(objectives))
+    return ConstrainedOptimum(
+        math.inf, math.inf, math.inf, rest.holds, rest.share, front, rest.status
+    )

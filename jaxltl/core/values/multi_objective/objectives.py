@@ -38,8 +38,8 @@ class Objective:
     """One of several objectives: a probability or an expected reward.
 
     Give one of ``formula`` (the probability of an LTL formula), ``avoid`` (never to enter a set),
-    ``reward`` (the expected total; with a target until that is reached, almost surely under every
-    policy that counts), or ``target`` alone (to reach a set, through `stay`).
+    ``reward`` (the expected total; with a target until that is reached, infinite if it is missed with
+    positive probability), or ``target`` alone (to reach a set, through `stay`).
 
     Attributes:
       formula: a formula, its text, or an automaton.
@@ -129,7 +129,8 @@ def weighted_problem(
             counted = reward[product.base_row]
             if tracker is not None and memory is not None:
                 pending = ~tracker.decided[memory]
-                ended &= ~pending
+                if sign < 0:  # a maximised reward without its target is infinite, which is allowed
+                    ended &= ~pending
                 counted = np.where(pending[mdp.state], counted, 0)
         else:
             assert tracker is not None and memory is not None

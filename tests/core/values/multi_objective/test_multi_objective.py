@@ -295,19 +295,24 @@ def test_storm_finds_the_same(seed):
     )
 
 
-def arc(corners):
-    """Choices whose rewards lie on a quarter of a circle; every one is a corner of the curve."""
+def arc(corners, delay=0):
+    """Choices whose rewards lie on a quarter of a circle; every one is a corner of the curve.
+
+    The choice is made after some steps; each of them is a state.
+    """
     angle = np.linspace(0, np.pi / 2, corners)
-    x, y = (np.append(f(angle), 0.0) for f in (np.cos, np.sin))
+    x, y = f = np.cos(angle), np.sin(angle)
+    rewards = (np.concatenate([np.zeros(delay), z, [0.0]]) for z in f)
+    size = delay + corners + 1
     model = make_sparse(
-        [0, corners, corners + 1],
-        np.arange(corners + 2),
-        np.ones(corners + 1, int),
-        np.ones(corners + 1),
-        initial=[1, 0],
-        rewards={"x": Rewards(choice=x), "y": Rewards(choice=y)},
+        np.concatenate([np.arange(delay + 1), [size - 1, size]]),
+        np.arange(size + 1),
+        np.concatenate([np.arange(1, delay + 1), np.full(corners + 1, delay + 1)]),
+        np.ones(size),
+        initial=start_at(delay + 2),
+        rewards={name: Rewards(choice=z) for name, z in zip("xy", rewards, strict=True)},
     )
-    return model, x[:-1], y[:-1]
+    return model, x, y
 
 
 @pytest.mark.few(1)
@@ -332,7 +337,7 @@ def test_a_border_of_many_corners(corners):
 
 
 def test_what_is_attained_nearest_to_a_border_is_told():
-    model, x, y = arc(200)
+    model, x, y = arc(200, delay=60)  # too large for fractions
     for k in (60, 150):
         thresholds = np.array([x[k], y[k]])
         found = achievable(model, [Objective(reward="x"), Objective(reward="y")], thresholds)

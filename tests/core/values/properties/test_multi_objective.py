@@ -1,5 +1,7 @@
 """`multi(...)` is answered as Storm answers it, and thresholds mean the fractions written."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,23 @@ def fork(chance=0.5):
         [1, 1, chance, 1 - chance, 1, 1],
         initial=[1, 0, 0],
         label={"a": [1], "b": [2]},
+    )
+
+
+def delayed(model, steps):
+    """The model after some steps, each of which is a state after its own ones."""
+    mdp, size = model.host, model.num_states
+    ahead = np.append(np.arange(size + 1, size + steps), 0)  # the initial state is the first one
+    return make_sparse(
+        np.append(mdp.row_start, mdp.num_rows + 1 + np.arange(steps)),
+        np.append(mdp.entry_start, mdp.num_transitions + 1 + np.arange(steps)),
+        np.append(mdp.successor, ahead),
+        np.append(mdp.probability, np.ones(steps)),
+        initial=np.arange(size + steps) == size,
+        label={
+            name: np.flatnonzero(np.asarray(column))
+            for name, column in zip(model.propositions, np.asarray(model.label).T, strict=True)
+        },
     )
 
 
@@ -54,13 +73,27 @@ def test_the_best_value_beside_thresholds():
     assert none.holds is False and np.isnan(none.value)
 
 
-def test_a_threshold_that_no_double_is_is_not_guessed():
-    # 1/3 and 2/3 can just be met, but no double says so.
+def test_thresholds_on_the_curve_are_decided_in_fractions():
     found = solve_property(fork(), 'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    assert found.holds is True and found.status == Status.CONVERGED
+    np.testing.assert_allclose(found.share @ found.front.points, [1 / 3, 2 / 3], rtol=1e-14)
+    beyond = "0.66666666666666666667"
+    found = solve_property(fork(), f'multi(P>=1/3 [ F "a" ], P>={beyond} [ F "b" ])')
+    assert found.holds is False and found.status == Status.CONVERGED
+    best = solve_property(fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    assert best.holds and best.status == Status.CONVERGED
+    assert Fraction(best.lower) <= Fraction(2, 3) <= Fraction(best.upper)
+    assert best.upper - best.lower <= 2e-16
+
+
+def test_a_threshold_that_no_double_is_is_not_guessed():
+    # 1/3 and 2/3 can just be met, but no double says so, and the model is too large for fractions.
+    model = delayed(fork(), 60)
+    found = solve_property(model, 'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert found.holds is None and found.status == Status.PRECISION
     np.testing.assert_allclose(found.nearest.lower, [1 / 3, 2 / 3], rtol=1e-14)
     assert (found.nearest.gap <= 1e-14).all() and found.nearest.gap.any()
-    best = solve_property(fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    best = solve_property(model, 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert best.holds is None and (best.nearest.gap <= 1e-14).all()
     assert best.nearest.gap[0] == 0 and best.nearest.lower[0] <= 2 / 3 <= best.nearest.upper[0]
 
