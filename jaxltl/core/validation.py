@@ -240,6 +240,13 @@ def distinct_names(name: str, value: object) -> tuple[str, ...]:
 def unsupported_model(model: object) -> str:
     """The error message for a model without exact probabilities on one device."""
     name = type(model).__name__
+    if hasattr(model, "system") and hasattr(model, "mdp"):
+        return (
+            "the model is a Game, which is not supported here: convert the model on which it is, as "
+            "make_game(to_sparse(game.mdp), game.system.ravel()) or "
+            "make_game(to_padded(game.mdp), game.system), or give game.mdp, whose actions are all "
+            "one player's."
+        )
     if hasattr(model, "nominal"):
         return (
             f"{name} has intervals for its probabilities, which are not supported here; use a "

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, on_graph
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.ops.array_namespace import jax_array
 from jaxltl.core.models.ops.choices import choice_mask, state_mask
 from jaxltl.core.models.protocols import Model, PyTree
@@ -116,6 +117,7 @@ def attract(
     )
 
 
+@of_one_player
 def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
@@ -143,6 +145,7 @@ def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
     return ~attract(graph, goal, allowed, rule=False).region
 
 
+@of_one_player
 def almost_surely_reaching(
     model: Model,
     goal: jax.Array,

@@ -28,6 +28,14 @@ from jaxltl.core.policies.finite_memory import (
 from jaxltl.core.sparse.product import SparseProduct
 
 
+def _product_of(model: Model) -> Product:
+    """The product, also that of a game on one."""
+    lazy = model.mdp if isinstance(model, Game) else model
+    if not isinstance(lazy, Product):
+        raise ValueError(f"model is a {type(lazy).__name__}; give product(world, formula).")
+    return lazy
+
+
 def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
     """Trajectories of the base model with the automaton states along them.
 
@@ -47,6 +55,7 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
       >>> lift_trajectories(jl.product(path, "F a"), runs).state.tolist()  # s * Q + q
       [[0, 3, 5]]
     """
+    model = _product_of(model)
     require_states(trajectories, model.mdp)
     if is_traced((model, trajectories)):
         return _lifted(model, trajectories)
@@ -95,6 +104,7 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
       >>> project_trajectories(prod, runs).state.tolist()
       [[0, 1]]
     """
+    model = _product_of(model)
     require_states(trajectories, model)
     return replace(
         trajectories,
@@ -146,7 +156,7 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
       >>> lift_policy(prod, jnp.array([0, 0])).shape
       (2, 2)
     """
-    return jnp.repeat(policy[:, None], model.num_memory, axis=1)
+    return jnp.repeat(policy[:, None], _product_of(model).num_memory, axis=1)
 
 
 @runtime_checkable

@@ -52,7 +52,7 @@ _PER = ("move", "system_move")
 _METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
 
 
-@validated(per=_PER, method=_METHODS)
+@validated(games=True, per=_PER, method=_METHODS)
 def minimax_value(
     game: Model,
     reward: chex.Array,
@@ -127,7 +127,7 @@ def minimax_value(
     )
 
 
-@validated(per=_PER, method=_METHODS, environment=("adversarial",))
+@validated(games=True, per=_PER, method=_METHODS, environment=("adversarial",))
 def strategy_value(
     game: Model,
     strategy: chex.Array,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
+from jaxltl.core.models.one_player import refuse_game
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
@@ -31,8 +32,13 @@ class SolverOptions(TypedDict, total=False):
     start: tuple[jax.Array, jax.Array] | None
 
 
-def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`."""
+def validated(
+    *, games: bool = False, **words: tuple[str, ...]
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`.
+
+    A game is refused unless `games` says that the solver knows who moves.
+    """
     # Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
     # argument out of range is replaced by the least valid number, so that the solver ends, and the
     # solution has the status :func:`argument_status`, NaN for its value, and infinite bounds. (An
@@ -45,6 +51,8 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
         @wraps(solve)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
             bound = signature.bind(*args, **kwargs)
+            if not games:
+                refuse_game(solve.__name__, bound.arguments.items())
             arguments = dict(bound.arguments)
             options = {k: x for k, x in arguments.pop("options", {}).items() if x is not None}
             arguments.update(options)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.statistics.confidence_sets import (
     Graph,
     LeastProbability,
@@ -82,6 +83,7 @@ class DataGuarantee:
         return describe_graph(self.graph)
 
 
+@of_one_player
 def learn_guarantee(
     model: RowModel,
     counts: TransitionCounts | ConfidenceSets | np.ndarray,
@@ -245,6 +247,7 @@ def _gain(
     return gain
 
 
+@of_one_player
 def guarantee_curve(
     model: RowModel,
     counts: TransitionCounts | np.ndarray,

@@ -10,9 +10,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core.array_types import Integers
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
@@ -64,7 +66,7 @@ def refuse_nature(nature: str | None) -> None:
         )
 
 
-@validated()
+@validated(games=True)
 def robust_reachability(
     model: Model,
     target: Array | str,
@@ -114,7 +116,7 @@ def robust_reachability(
     return robust_solution(world, sides, values, requested, relative=False)
 
 
-@validated()
+@validated(games=True)
 def robust_total_reward(
     model: Model,
     reward: Reward,
@@ -159,7 +161,7 @@ def robust_total_reward(
     return robust_solution(world, sides, values, requested, relative=True)
 
 
-@validated()
+@validated(games=True)
 def robust_discounted_value(
     model: Model,
     reward: Reward,
@@ -206,6 +208,7 @@ def robust_discounted_value(
     return robust_solution(world, sides, values, requested, relative=False)
 
 
+@of_one_player
 def robust_expectation(
     model: IntervalMDP, value: ArrayLike, *, objective: str = "max", nature: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -349,12 +352,19 @@ def sides_of(
 def world_of(model: Model) -> tuple[IntervalMDP, np.ndarray | None]:
     """The interval model, and in a game the states of the system."""
     world = model.mdp if isinstance(model, Game) else model
+    if is_traced(model):
+        raise ValueError(
+            f"model is a {type(world).__name__} with traced arrays, and values of games and of "
+            "intervals are found on the host: call this outside jit, vmap and grad; inside, use "
+            "solve_prepared of an IntervalMDP, or minimax_value of a game without intervals."
+        )
     if isinstance(world, SparseMDP) and isinstance(model, Game):
         world = make_interval(world, world.probability, world.probability)
     if not isinstance(world, IntervalMDP):
         raise ValueError(
-            f"{type(world).__name__} has no intervals; give an IntervalMDP, or a game "
-            "on one or on a SparseMDP."
+            f"model is a {'Game on a ' * isinstance(model, Game)}{type(world).__name__}; give an "
+            "IntervalMDP, or a game on one or on a SparseMDP, such as "
+            "make_game(to_sparse(game.mdp), game.system.ravel())."
         )
     return world, np.asarray(model.system, bool) if isinstance(model, Game) else None
 

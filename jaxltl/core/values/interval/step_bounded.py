@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxltl.core.models.interval import IntervalMDP, require_interval
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.solvers.step_bounded import Steps
@@ -25,6 +26,7 @@ from jaxltl.core.values.engine.state_quantities import (
 )
 
 
+@of_one_player
 def robust_next_probability(
     model: IntervalMDP, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
@@ -60,6 +62,7 @@ def robust_next_probability(
     )
 
 
+@of_one_player
 def robust_bounded_reachability(
     model: IntervalMDP,
     target: Array | str,
@@ -105,6 +108,7 @@ def robust_bounded_reachability(
     )
 
 
+@of_one_player
 def robust_cumulative_reward(
     model: IntervalMDP,
     reward: Reward,
@@ -141,6 +145,7 @@ def robust_cumulative_reward(
     return _earned(model, earned, np.zeros(world.num_states), num_steps, objective, nature)
 
 
+@of_one_player
 def robust_instantaneous_reward(
     model: IntervalMDP,
     reward: Reward,

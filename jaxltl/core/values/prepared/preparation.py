@@ -12,6 +12,7 @@ from jaxltl.core import struct
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, refuse_underflow
@@ -105,6 +106,7 @@ class Prepared:
         return self.segments[2].last
 
 
+@of_one_player
 def prepare(
     model: Model | IntervalMDP,
     target: chex.Array,

@@ -22,6 +22,7 @@ from jax import lax
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.attractor import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.ops.array_namespace import jax_array, jit, namespace, to_jax
 from jaxltl.core.models.ops.double_word import normalised_rows
 from jaxltl.core.models.ops.operators import (
@@ -78,6 +79,7 @@ class Performance:
     status: jax.Array
 
 
+@of_one_player
 def task_performance(
     model: Product,
     policy: jax.Array,
@@ -252,6 +254,7 @@ def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:
 # --- many worlds ------------------------------------------------------------------------------
 
 
+@of_one_player
 def task_performances(
     models: Product,
     policies: jax.Array,

@@ -25,6 +25,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.one_player import refuse_game
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
@@ -144,7 +145,7 @@ def optimal_satisfaction(
 ) -> Satisfaction: ...
 
 
-@validated()
+@validated(games=True)
 def optimal_satisfaction(
     model: Product | Model | IntervalMDP | Game,
     task: Task | None = None,
@@ -222,6 +223,7 @@ def optimal_satisfaction(
             label_on="entry" if label_on is None else label_on,
             tolerance=tolerance,
         )
+    refuse_game("optimal_satisfaction", [("model", model)])
     if states is not None or label_on is not None:
         raise ValueError("states and label_on are for a model and a task, not for a product.")
     model = _as_product(model)

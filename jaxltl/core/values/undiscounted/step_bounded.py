@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.sparse.solvers import step_bounded as host
@@ -44,6 +45,7 @@ def _has_intervals(
     return True
 
 
+@of_one_player
 def next_probability(
     model: Model, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
@@ -84,6 +86,7 @@ def next_probability(
     return solution_from_error(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
 
 
+@of_one_player
 def bounded_reachability(
     model: Model,
     target: Array | str,
@@ -146,6 +149,7 @@ def bounded_avoidance(
     return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
 
 
+@of_one_player
 def cumulative_reward(
     model: Model,
     reward: Array | str,
@@ -186,6 +190,7 @@ def cumulative_reward(
     return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
+@of_one_player
 def instantaneous_reward(
     model: Model,
     reward: Array | str,
@@ -229,6 +234,7 @@ def instantaneous_reward(
     return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
+@of_one_player
 def reward_bounded_reachability(
     model: Model,
     target: Array | str,

@@ -17,6 +17,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
+from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
@@ -131,6 +132,7 @@ def total_reward(
     )
 
 
+@of_one_player
 def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float64]:
     """Expected number of steps of a policy until a set is reached, on the host.
 
@@ -264,7 +266,7 @@ def _least_reward(model: ActionModel, world: World, reward: Array) -> tuple[jax.
     return jnp.min(least), number[jnp.argmin(least)]
 
 
-@validated()
+@validated(games=True)
 def worst_case_steps(game: Game, goal: Array, strategy: Array) -> Solution:
     """Worst-case expected number of moves until a goal state ``bool[S]`` is entered next.
 

@@ -1,0 +1,79 @@
+"""The refusal of games by solvers for one player, which would answer as if the environment helped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.product import Product
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_ROWS = (
+    "of a game on a SparseMDP or an IntervalMDP "
+    "(make_game(to_sparse(game.mdp), game.system.ravel()) if it is on padded actions)"
+)
+_DISCOUNTED = (
+    "minimax_value(game, reward, discount), or robust_discounted_value of one on intervals"
+)
+_STRATEGY = "strategy_value(game, strategy, reward, discount), the worst case of a strategy"
+_REACHING = (
+    f"winning_region(game, objective), or robust_reachability(game, target, policy=...), {_ROWS}"
+)
+_REWARD = f"robust_total_reward(game, reward, target), {_ROWS}"
+_FORMULA = f"winning_region(game, formula), or optimal_satisfaction(game, formula), {_ROWS}"
+
+# What to ask of a game instead, for each solver; games have no counterpart of the others.
+_INSTEAD = {
+    "optimal_value": _DISCOUNTED,
+    "policy_value": _STRATEGY,
+    "soft_value": _DISCOUNTED,
+    "boltzmann_value": _DISCOUNTED,
+    "boltzmann_fixed_points": _DISCOUNTED,
+    "occupancy_measure": _STRATEGY,
+    "average_reward": "mean_payoff(game, reward), of a deterministic game",
+    "total_reward": _REWARD,
+    "hitting_time": _REWARD,
+    "reachability_probability": _REACHING,
+    "prepare": _REACHING,
+    "almost_surely_reaching": _REACHING,
+    "avoidable": "attractor(game, goal, rule=~game.system), outside of which the system avoids it",
+    "satisfaction_probability": _FORMULA,
+    "optimal_satisfaction": _FORMULA,
+    "optimal_actions": "permissive_strategy(game, formula), whose actions keep the system winning; "
+    + _FORMULA,
+    "solve_property": _FORMULA,
+    "task_performance": _FORMULA,
+}
+_OTHERWISE = (
+    "what can be asked of a game is minimax_value, strategy_value, mean_payoff, winning_region, and "
+    "robust_reachability, robust_total_reward, robust_discounted_value and optimal_satisfaction "
+    f"with a formula, {_ROWS}"
+)
+
+
+def refuse_game(function: str, arguments: Iterable[tuple[str, object]]) -> None:
+    """Raises ValueError if an argument is a game, with what to ask instead."""
+    for name, value in arguments:
+        if not isinstance(value, Game | Product):
+            continue
+        if isinstance(value, Game) or isinstance(value.mdp, Game):
+            instead = _INSTEAD.get(function, _OTHERWISE)
+            raise ValueError(
+                f"{function}: {name} is a Game, and the actions here are those of one player; ask "
+                f"for {instead}. If one player chooses all actions, give game.mdp."
+            )
+
+
+def of_one_player(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of functions that refuse games, by :func:`refuse_game`."""
+
+    @wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_game(function.__name__, [("model", x) for x in args[:1]] + list(kwargs.items()))
+        return function(*args, **kwargs)
+
+    return wrapper
