@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, on_graph
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.array_namespace import jax_array
 from jaxltl.core.models.ops.choices import choice_mask, state_mask
 from jaxltl.core.models.protocols import Model, PyTree
@@ -117,11 +117,11 @@ def attract(
     )
 
 
-@of_one_player
 def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
     The complement of the ``"forall"`` attractor: the minimal reachability probability is zero exactly there.
+    In a game the policy is the system's, against every environment.
 
     Args:
       model, goal, allowed: as of :func:`attractor`.
@@ -137,15 +137,21 @@ def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -
       [True, False, True]
     """
     goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
-    return jax_array(on_graph(avoid, model, goal, allowed))
+    return jax_array(on_graph(avoid, model, goal, allowed, _system(model)))
 
 
-def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
+def _system(model: Model) -> Array | bool:
+    """The states in which the policy chooses."""
+    return model.system if isinstance(model, Game) else True
+
+
+def avoid(
+    graph: Graph, goal: Array, allowed: Array | None = None, system: Array | bool = True
+) -> Array:
     """:func:`avoidable` on a graph."""
-    return ~attract(graph, goal, allowed, rule=False).region
+    return ~attract(graph, goal, allowed, rule=graph.xp.logical_not(system)).region
 
 
-@of_one_player
 def almost_surely_reaching(
     model: Model,
     goal: jax.Array,
@@ -156,7 +162,7 @@ def almost_surely_reaching(
     """States from which some policy reaches the goal with probability one.
 
     The greatest X such that within X, by actions that surely stay in X, the goal is
-    reachable (de Alfaro 1997).
+    reachable (de Alfaro 1997). In a game the policy is the system's, against every environment.
 
     Args:
       model, goal, allowed: as of :func:`attractor`.
@@ -174,28 +180,33 @@ def almost_surely_reaching(
       [False, True, False]
     """
     goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
-    return on_graph(surely, model, goal, allowed, reaching)
+    return on_graph(surely, model, goal, allowed, reaching, _system(model))
 
 
 def surely(
-    graph: Graph, goal: Array, allowed: Array | None = None, reaching: Attractor | None = None
+    graph: Graph,
+    goal: Array,
+    allowed: Array | None = None,
+    reaching: Attractor | None = None,
+    system: Array | bool = True,
 ) -> Attractor:
     """:func:`almost_surely_reaching` on a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
 
     def inner(region: Array) -> Attractor:
         # First all states that are forced out, then those that cannot reach the goal inside.
-        outside = attract(graph, ~region, allowed, rule=False, among=~goal).region
-        return attract(graph, goal, allowed & graph.forall(~outside))
+        outside = attract(graph, ~region, allowed, graph.xp.logical_not(system), ~goal).region
+        return attract(graph, goal, allowed & graph.forall(~outside), system, ~outside)
 
     def body(carry: PyTree) -> PyTree:
         attractor, _ = carry
         smaller = inner(attractor.region)
         return smaller, graph.xp.any(smaller.region != attractor.region)
 
-    start = attract(graph, goal, allowed) if reaching is None else reaching
+    start = attract(graph, goal, allowed, system) if reaching is None else reaching
     # A state that cannot reach the goal at all is what removes others.
-    result: Attractor = graph.repeat(body, (start, ~graph.xp.all(start.region)))[0]
+    some = ~graph.xp.all(start.region) | ~graph.xp.all(system)
+    result: Attractor = graph.repeat(body, (start, some))[0]
     return result
 
 

@@ -39,8 +39,6 @@ _INSTEAD = {
     "hitting_time": _REWARD,
     "reachability_probability": _REACHING,
     "prepare": _REACHING,
-    "almost_surely_reaching": _REACHING,
-    "avoidable": "attractor(game, goal, rule=~game.system), outside of which the system avoids it",
     "satisfaction_probability": _FORMULA,
     "optimal_satisfaction": _FORMULA,
     "optimal_actions": "permissive_strategy(game, formula), whose actions keep the system winning; "

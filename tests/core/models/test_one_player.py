@@ -1,6 +1,7 @@
 """No function that is for one player answers for a game, as if the environment helped."""
 
 import inspect
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxltl.core.models import Game
 FOR_GAMES = {
     "minimax_value", "strategy_value", "mean_payoff", "robust_reachability", "robust_total_reward",
     "robust_discounted_value", "optimal_satisfaction", "winning_region", "permissive_strategy",
-    "verify", "almost_sure_buchi",
+    "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
 }  # fmt: skip
 # Analyses of the graph and operations on models, which are not about who chooses.
 NOT_ABOUT_CHOICE = {
@@ -80,21 +81,25 @@ def test_games_are_refused_by_solvers_for_one_player(name):
     given = {x: GIVEN[x] for x in required}
     for kind in ("padded", "sparse", "interval", "product"):
         model = game(kind)
-        calls = [lambda: solve(model, **given)]
+        refused(solve, model, **given)
         if "stay" in inspect.signature(solve).parameters:
-            calls.append(lambda: solve(model, **given, stay=~GOAL))
+            refused(solve, model, **given, stay=~GOAL)
         if kind != "interval":
-            calls.append(lambda: jax.eval_shape(lambda m: solve(m, **given), model))
+            traced = partial(solve, **given)
             batch = jax.tree.map(lambda x: jnp.stack([x, x]), model)
-            calls.append(lambda: jax.eval_shape(jax.vmap(lambda m: solve(m, **given)), batch))
-        for call in calls:
-            with pytest.raises(ValueError, match=rf"^{name}: models? is a Game, .*ask for .*game"):
-                call()
+            refused(partial(jax.eval_shape, traced), model, name=name)
+            refused(partial(jax.eval_shape, jax.vmap(traced)), batch, name=name)
+
+
+def refused(solve, model, name=None, **given):
+    name = solve.__name__ if name is None else name
+    with pytest.raises(ValueError, match=rf"^{name}: models? is a Game, .*ask for .*game"):
+        solve(model, **given)
 
 
 def test_conversions_name_the_game_and_the_remedy():
     for convert in (jl.to_sparse, jl.to_padded):
-        with pytest.raises(ValueError, match="the model is a Game.*make_game"):
+        with pytest.raises(ValueError, match=r"the model is a Game.*make_game"):
             convert(game("sparse"))
 
 

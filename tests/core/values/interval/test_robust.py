@@ -444,7 +444,7 @@ def test_bad_questions():
     for discount in (None, 1.0, [0.5]):
         with pytest.raises(ValueError, match=r"discount=.*below 1"):
             robust_discounted_value(model, [0, 1, 0], discount)
-    with pytest.raises(ValueError, match="SparseMDP has no intervals"):
+    with pytest.raises(ValueError, match="model is a SparseMDP; give an IntervalMDP"):
         robust_expectation(COIN, [0, 1, 0])
     with pytest.raises(ValueError, match="not finite"):
         robust_expectation(model, [0, np.nan, 0])
