@@ -109,7 +109,9 @@ def options(case: Case, aims: Aims, policy: np.ndarray | None) -> list[tuple[lis
         owner = aims.system if case.system[s] else aims.environment
         fixed = policy is not None and (case.system[s] or aims.environment == 0)
         actions = [policy[s]] if fixed else np.flatnonzero(case.available[s])
-        rows = [[(p, case.reward[s, a]) for p in vertices(case, s, a, aims.intervals)] for a in actions]
+        rows = [
+            [(p, case.reward[s, a]) for p in vertices(case, s, a, aims.intervals)] for a in actions
+        ]
         same = aims.nature == owner or aims.nature == 0 or all(len(r) == 1 for r in rows)
         if same:
             flat = [x for row in rows for x in row]
@@ -132,9 +134,7 @@ def optimum(case: Case, aims: Aims, value, policy: np.ndarray | None = None) -> 
     tables = options(case, aims, policy)
     outer = list(itertools.product(*(range(len(t)) for t in tables)))
     inner = list(itertools.product(*(range(len(t[0])) for t in tables)))
-    chosen = [
-        [tables[s][i[s]][j[s]] for s in range(case.num_states)] for i in outer for j in inner
-    ]
+    chosen = [[tables[s][i[s]][j[s]] for s in range(case.num_states)] for i in outer for j in inner]
     matrices = np.array([[row for row, _ in one] for one in chosen])
     rewards = np.array([[paid for _, paid in one] for one in chosen])
     values = value(matrices, rewards)
