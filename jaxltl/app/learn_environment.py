@@ -103,6 +103,11 @@ def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | No
     del seed
     loaded = load_world(task) if world is None else world
     dynamics = loaded if isinstance(loaded, Dynamics) else None
+    if dynamics is not None and task.task.ending is not None:
+        raise ValueError(
+            f"{task.path}: [task] ending = {task.task.ending!r}: dynamics define by outside= what leaving the "
+            "domain means, for episodes and the proof alike; remove ending."
+        )
     world = load_environment(task, loaded)
     with errors_in(f"{task.path}: [task] formula: "):
         automaton = to_automaton(task.formula)

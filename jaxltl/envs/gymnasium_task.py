@@ -120,9 +120,7 @@ class _Steps:
         seen, earned, ended, cut, info = self.env.step(action)
         tables, before, letter = self._tables, self._memory, self._letter(seen, info)
         after = int(tables.delta[before, letter])
-        verdict = tables.verdict[after]
-        if ended and verdict == Verdict.UNDECIDED:
-            verdict = tables.repeated[after, letter]
+        verdict = tables.repeated[after, letter] if ended else tables.verdict[after]
         decided, discount = verdict != Verdict.UNDECIDED, float(tables.discount[before, letter])
         ended = bool(ended or decided)
         reward = tables.decided[verdict] if decided else tables.reward[before, letter]

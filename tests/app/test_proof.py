@@ -94,6 +94,10 @@ WORLD = 'dynamics = "shuttle.py:make"'
             "no dynamics; let it return",
         ),
         (("gust = 0.02", "wind = 1"), "unexpected keyword argument 'wind'"),
+        (
+            ('formula = "', 'ending = "repeat"\nformula = "'),
+            "dynamics define by outside= what leaving",
+        ),
         (("[80, 80]", "[]"), "it must be a list of numbers of cells"),
     ],
 )

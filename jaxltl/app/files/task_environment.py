@@ -117,8 +117,9 @@ class TaskTable(FormulaTable):
         '"distance"',
     ] = None
     ending: TomlKey[
-        Literal["repeat", "violated", "undecided"] | None,
-        "Verdict where the world ends; default repeat, of its last label.",
+        Literal["repeat", "violated", "undecided", "rejected"] | None,
+        "Verdict where the world ends; default repeat, of its last label, or what the dynamics "
+        "define.",
         '"violated"',
     ] = None
 
@@ -246,7 +247,9 @@ class ProofTable(TomlTable):
     """``[proof]``: bounds of the learned policy's satisfaction probability, in worlds of dynamics."""
 
     cells: TomlKey[
-        Cells | None, "Cells along each axis at first; default about 20,000 in all.", "[200, 200]"
+        Cells | None,
+        "Cells along each axis at first; default about 20,000 in all, at most 1,000 along an axis.",
+        "[200, 200]",
     ] = None
     tolerance: TomlKey[Confidence | None, "Width of the bounds; default 0.001.", "0.01"] = None
     threshold: TomlKey[

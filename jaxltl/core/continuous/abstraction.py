@@ -15,7 +15,11 @@ from jaxltl.core.continuous.grid import Grid, count_in, covered, cumulative, vol
 from jaxltl.core.continuous.images import Images, NoiseBox, Step, image_boxes
 from jaxltl.core.continuous.noise import Distribution
 from jaxltl.core.continuous.task_product import TaskProduct, task_product
-from jaxltl.core.continuous.transition_bounds import TransitionBounds, transition_bounds
+from jaxltl.core.continuous.transition_bounds import (
+    TooManyProbabilitiesError,
+    TransitionBounds,
+    transition_bounds,
+)
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
 
@@ -327,14 +331,20 @@ class Abstraction:
     seconds: dict[str, float] = field(default_factory=dict)  # wall time by stage
 
     def bounds(self, grid: Grid) -> Bounds:
-        """Bounds after refinement; an interrupt leaves those of the last finished grid."""
-        bounds = refined = self._first(grid)
+        """Bounds after refinement; an interrupt leaves those of the last finished grid, and so does
+        a finer one with more transition probabilities than memory should hold."""
+        bounds = refined = first = self._first(grid)
         limits = self.limits
         while True:
             try:
                 bounds = self._improved(refined)
             except KeyboardInterrupt:
                 limits.report("interrupted: the bounds proven so far are kept")
+                return bounds
+            except TooManyProbabilitiesError as reason:
+                if refined is first:
+                    raise
+                limits.report(f"the bounds proven so far are kept: {reason}")
                 return bounds
             lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
             limits.report(
@@ -371,8 +381,7 @@ class Abstraction:
         for i, name in enumerate(names):
             if name in dynamics.labels:
                 certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
-        outside = None if dynamics.outside in ("violates", "clip") else dynamics.outside
-        task = task_product(self.formula, names, certain, possible, outside)
+        task = task_product(self.formula, names, certain, possible, dynamics.outside)
         # The initial boxes are closed: a cell that only touches the upper edge of one is initial too.
         closed = replace(dynamics.initial, high=np.nextafter(dynamics.initial.high, np.inf))
         shape = (task.num_memory, grid.num_cells)

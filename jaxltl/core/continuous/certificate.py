@@ -172,7 +172,7 @@ def learned_policy(policy: Policy, dynamics: Dynamics, formula: str | Formula) -
 
 
 HOW = {SURE: "surely", ALMOST_SURE: "almost surely", ITERATED: "by value iteration"}
-FIRST_CELLS = 20_000  # of the default grid; finer grids follow
+FIRST_CELLS, FIRST_LENGTH = 20_000, 1_000  # of the default grid in all and along an axis
 _BYTES = 400  # of memory for a cell and action, about
 PAIRS = 2**24  # of cells and actions on one grid
 
@@ -258,7 +258,8 @@ class ProofOptions(TypedDict, total=False):
     """Options of proofs.
 
     Attributes:
-      cells: number of cells of the first grid along each axis; default: about 20,000 in all.
+      cells: number of cells of the first grid along each axis; default: about 20,000 in all, at most
+        1,000 along an axis.
       tolerance: width of the bounds of initial states at which refinement stops; default 1e-3.
       threshold: stop as soon as the lower bounds of all initial states reach it, or the upper bound of
         one of them is below; default None.
@@ -307,7 +308,8 @@ def certify_policy(
 
     Raises:
       ValueError: a policy or a step with a primitive that has no enclosure, actions of another shape,
-        a proposition that is no label, or a grid beyond `max_cells`.
+        a proposition that is no label, a grid beyond `max_cells`, or a first grid with more transition
+        probabilities than memory should hold (a finer one ends the refinement).
 
     Example:
       >>> from jaxltl.core.continuous import make_dynamics, triangular
@@ -333,6 +335,7 @@ def prove(
     if settings.get("threshold") is not None:
         settings["threshold"] = validation.finite_number("threshold", settings["threshold"])
     limits = Limits(**settings)
+    _require_initial_inside(dynamics)
     grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
     abstraction = Abstraction(dynamics, formula, step, actions, limits)
@@ -345,6 +348,18 @@ def prove(
     seconds, text = abstraction.seconds, str(formula)
     certificate = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
     return certificate, abstraction, bounds
+
+
+def _require_initial_inside(dynamics: Dynamics) -> None:
+    """Raises ValueError for initial states outside a domain that replaced the one they were checked with."""
+    (low, high), initial = dynamics.domain, dynamics.initial
+    inside = ((low <= initial.low) & (initial.high <= high)).all(axis=1)
+    if not inside.all():
+        i = int(np.argmin(inside))
+        raise ValueError(
+            f"initial: box {i}, {initial.low[i].tolist()} to {initial.high[i].tolist()}, has states outside "
+            "the domain, for which nothing is proven; give boxes inside of it."
+        )
 
 
 def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Array]:
@@ -376,7 +391,7 @@ def first_grid(
     """The first grid, whose edges include those of the labels and of the initial boxes."""
     n = dynamics.num_states
     if cells is None:
-        cells = (max(int(FIRST_CELLS ** (1 / n)), 2),) * n
+        cells = (min(max(int(FIRST_CELLS ** (1 / n)), 2), FIRST_LENGTH),) * n
     breakpoints = []
     for axis in range(n):
         edges = np.concatenate([[], *(r.breakpoints(axis) for r in dynamics.labels.values())])
@@ -411,8 +426,9 @@ def counterexample(
     """A simulated run that violates a formula, from the initial cell with the least upper bound.
 
     A run violates a formula as soon as no continuation satisfies it: every violated safety formula has
-    such a run, and a formula such as ``!unsafe U goal`` where a run enters ``unsafe``. No finite run
-    violates ``F goal``. Disturbances are uniform, so that a worst case may be missed.
+    such a run, and a formula such as ``!unsafe U goal`` where a run enters ``unsafe``. With
+    ``outside="violates"`` a run also violates it that leaves the domain before the formula is satisfied
+    for good; no other finite run violates ``F goal``. Disturbances are uniform, so that a worst case may be missed.
 
     Args:
       dynamics, policy, formula: as of :func:`certify_policy`.

@@ -177,8 +177,9 @@ class DynamicsOptions(TypedDict, total=False):
       noise: a :class:`~jaxltl.core.continuous.noise.Distribution`, or one for each random coordinate.
       disturbance: ``(low, high)`` of a bounded disturbance, chosen by an adversary.
       actions: ``(low, high)``, a tuple, for a box of actions; an array ``float[A, m]`` for a grid.
-      outside: ``"violates"`` (default): leaving the domain violates every task; ``"clip"``:
-        successors are clipped; or the name of a label that holds forever outside.
+      outside: ``"violates"`` (default): leaving the domain violates every task that the labels of the run
+        have not satisfied before, whatever their continuation; ``"clip"``: successors are clipped; or
+        the name of a label that holds forever outside, where no other label holds.
       initial: a :class:`~jaxltl.core.continuous.regions.Region` of boxes, or ``(low, high)``; default:
         the domain.
     """
@@ -266,7 +267,8 @@ def to_environment(dynamics: Dynamics) -> Environment:
 
     Its states and observations are ``float[n]``. Actions are those of the box, or indices of the grid;
     disturbances are uniform. An episode terminates when the state leaves the domain: with
-    ``outside="violates"`` the task is violated, with a label it repeats forever.
+    ``outside="violates"`` the task is violated, whatever its formula, unless the run has satisfied it
+    before; with a label it repeats forever.
 
     Args:
       dynamics: dynamics; learners call this themselves.
@@ -300,7 +302,7 @@ def to_environment(dynamics: Dynamics) -> Environment:
         labels=dynamics.label,
         propositions=dynamics.propositions,
         observations=make_box(low, high, dtype=dtype),
-        ending="violated" if dynamics.outside == "violates" else "repeat",
+        ending="rejected" if dynamics.outside == "violates" else "repeat",
     )
 
 

@@ -49,7 +49,8 @@ def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
 
     def gains(x: jax.Array, u: jax.Array, w: jax.Array) -> tuple[PyTree, jax.Array]:
         following, push = jax.linearize(lambda v: step(x, u, v), w)
-        return following, jnp.stack([push(unit) for unit in jnp.eye(len(w), dtype=w.dtype)])
+        units = np.eye(len(w), dtype=w.dtype)
+        return following, jnp.concatenate([push(unit)[None] for unit in units])
 
     try:
         return make_program(gains, *specs)

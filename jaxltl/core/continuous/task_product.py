@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import MAX_FREE_PROPOSITIONS, Automaton
+from jaxltl.core.automata.runs import Verdict, lasso_verdicts, live_states, universal_states
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.pretty_print import brief
@@ -33,7 +34,8 @@ class TaskProduct:
     start: Booleans  # bool[D, Q], memory states after the initial cell
     priority: Integers  # int[Q]
     decided: Integers  # int[Q], 1 or 0 where every continuation is accepted or rejected, else -1
-    outside: Integers  # int[Q], 1 if the task is satisfied after leaving the domain, else 0
+    # int[Q], 1 if the task is satisfied by a run that leaves the domain in this state, else 0
+    outside: Integers
     automaton: Automaton  # of the formula
     # its states and the priorities of the transitions into them, one pair a memory state
     states: tuple[tuple[int, int], ...]
@@ -46,7 +48,8 @@ class TaskProduct:
     def same_memory(self, other: TaskProduct) -> bool:
         """True if memory states mean the same in both products."""
         one, two = self.automaton.delta, other.automaton.delta
-        return self.states == other.states and np.array_equal(one, two)
+        decided = np.array_equal(self.decided, other.decided)
+        return self.states == other.states and np.array_equal(one, two) and decided
 
     def complement(self) -> TaskProduct:
         """The product of the negated formula."""
@@ -80,9 +83,11 @@ def task_product(
 ) -> TaskProduct:
     """The product of a grid with the automaton of a formula.
 
-    Labels ``bool[C, P]`` are certain in all, and possible in some states of a cell. `outside` is the
-    proposition that holds forever outside the domain; None: leaving violates. Raises ValueError for a
-    proposition that is no label.
+    Labels ``bool[C, P]`` are certain in all, and possible in some states of a cell. `outside` is that of
+    the dynamics: the proposition that holds forever outside the domain; ``"clip"``, the domain is never
+    left; ``"violates"`` or None, a run that leaves the domain is rejected, unless the labels that it has
+    read satisfy the formula with every continuation, whichever labels the domain has. Raises ValueError
+    for a proposition that is no label, and where too many letters decide that.
     """
     formula = parse_ltl(formula) if isinstance(formula, str) else formula
     missing = sorted(set(formula.propositions) - set(propositions))
@@ -94,26 +99,53 @@ def task_product(
     pattern = certain.astype(np.int8) + 2 * unknown
     classes, label_class = np.unique(pattern, axis=0, return_inverse=True)
     letters = [_letters(row, propositions) for row in classes]
-    everywhere = {letter for class_letters in letters for letter in class_letters}
-    if outside is not None:
-        everywhere.add(frozenset([outside]))
-    automaton = to_automaton(formula, letters=sorted(everywhere, key=sorted))
+    inside = {letter for class_letters in letters for letter in class_letters}
+    automaton, verdict, satisfied_outside = _translated(formula, inside, outside)
     index = _letter_index(automaton)
     names = set(automaton.propositions)
     of_class = [
         sorted({index[letter & names] for letter in class_letters}) for class_letters in letters
     ]
-    states, moves, start = _memory(automaton, of_class)
-    decided = np.array([_decided(automaton, q) for q, _ in states])
-    lasso = np.zeros(len(states), int)
-    if outside is not None:
-        letter = index[frozenset([outside]) & names]
-        lasso = np.array([_accepts_forever(automaton, q, letter) for q, _ in states])
-    lasso = np.where(decided == 1, 1, lasso)
+    states, moves, start = _memory(automaton, of_class, verdict)
+    at = np.array([q for q, _ in states])
     priority = np.array([p for _, p in states])
-    return TaskProduct(
-        label_class.reshape(-1), moves, start, priority, decided, lasso, automaton, tuple(states)
-    )
+    arrays = label_class.reshape(-1), moves, start, priority, verdict[at], satisfied_outside[at]
+    return TaskProduct(*arrays, automaton, tuple(states))
+
+
+def _translated(
+    formula: Formula, inside: set[frozenset[str]], outside: str | None
+) -> tuple[Automaton, Integers, Integers]:
+    """The automaton; ``int[Q']`` twice, of its states: 1 or 0 where every continuation is accepted or
+    rejected, else -1; and 1 if a run that leaves the domain there is accepted, else 0.
+
+    The automaton reads the letters of the domain alone where that suffices, since it is smaller.
+    """
+    violates, beyond = outside in (None, "violates"), frozenset([str(outside)])
+    label = not violates and outside != "clip"
+    letters = inside | ({beyond} if label else set())
+    automaton = to_automaton(formula, letters=sorted(letters, key=sorted))
+    sure, live = universal_states(automaton), live_states(automaton)
+    if violates and sure.any():
+        # Of all letters, since those of the domain may satisfy a formula only while a run stays inside.
+        if len(formula.propositions) > MAX_FREE_PROPOSITIONS:
+            raise ValueError(
+                f"{formula}: {len(formula.propositions)} propositions where leaving the domain "
+                f"violates; give a formula of at most {MAX_FREE_PROPOSITIONS}, or dynamics with "
+                'outside="clip" or the name of a label.'
+            )
+        automaton = to_automaton(formula)
+        index, names = _letter_index(automaton), set(automaton.propositions)
+        columns = sorted({index[letter & names] for letter in inside})
+        tables = {x: getattr(automaton, x)[:, columns] for x in ("delta", "priority")}
+        part = replace(automaton, letters=automaton.letters[columns], **tables)
+        sure, live = universal_states(automaton), live_states(part)
+    verdict = np.where(sure, 1, np.where(live, -1, 0))
+    accepted: Booleans = sure
+    if label:
+        letter = _letter_index(automaton)[beyond & set(automaton.propositions)]
+        accepted = lasso_verdicts(automaton)[:, letter] == Verdict.SATISFIED
+    return automaton, verdict, accepted.astype(int)
 
 
 def _letters(row: Integers, propositions: Sequence[str]) -> list[frozenset[str]]:
@@ -130,7 +162,7 @@ def _letter_index(automaton: Automaton) -> dict[frozenset[str], int]:
 
 
 def _memory(
-    automaton: Automaton, of_class: list[list[int]]
+    automaton: Automaton, of_class: list[list[int]], verdict: Integers
 ) -> tuple[list[tuple[int, int]], Booleans, Booleans]:
     """Reachable pairs of state and priority of the last transition, and their moves."""
     delta, priority = automaton.delta, automaton.priority
@@ -139,7 +171,7 @@ def _memory(
     def visit(q: int, letter: int) -> int:
         to = int(delta[q, letter])
         # A decided state keeps one priority: the letters read before do not matter.
-        decided = _decided(automaton, to)
+        decided = int(verdict[to])
         pair = (to, int(priority[q, letter]) if decided < 0 else 1 - decided)
         return number.setdefault(pair, len(number))
 
@@ -153,22 +185,3 @@ def _memory(
         for marks, entered in zip(row, targets, strict=True):
             marks[list(entered)] = True
     return list(number), rows[1:], rows[0]
-
-
-def _decided(automaton: Automaton, q: int) -> int:
-    """1 or 0 for a sink that accepts or rejects every continuation, else -1."""
-    parity = automaton.priority[q] % 2
-    if (automaton.delta[q] != q).any() or (parity != parity[0]).any():
-        return -1
-    return 1 - int(parity[0])
-
-
-def _accepts_forever(automaton: Automaton, q: int, letter: int) -> bool:
-    """True if the word of one letter is accepted from a state."""
-    seen: dict[int, int] = {}
-    priorities: list[int] = []
-    while q not in seen:
-        seen[q] = len(priorities)
-        priorities.append(int(automaton.priority[q, letter]))
-        q = int(automaton.delta[q, letter])
-    return min(priorities[seen[q] :]) % 2 == 0

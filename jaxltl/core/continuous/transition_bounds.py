@@ -23,7 +23,12 @@ from jaxltl.core.continuous.noise import Distribution
 from jaxltl.core.pretty_print import brief
 
 _CHUNK = 2**14  # probabilities handled at once by a thread
+MAX_PROBABILITIES = 2**26  # of one coordinate, of which arrays have half a GiB
 _UNIT = float(np.finfo(np.float64).eps)
+
+
+class TooManyProbabilitiesError(ValueError):
+    """Images times the intervals that each may meet exceed `MAX_PROBABILITIES`."""
 
 
 @brief
@@ -154,8 +159,13 @@ def _factors(
     start = np.clip(np.searchsorted(edges, ends[0], "right") - 1, 0, count - 1)
     stop = np.clip(np.searchsorted(edges, ends[1], "right"), start + 1, count)
     width = int((stop - start).max())
+    if len(rows) * width > MAX_PROBABILITIES:
+        raise TooManyProbabilitiesError(
+            f"{len(rows):,} images that may each meet {width:,} intervals of one coordinate have "
+            f"{len(rows) * width:,} transition probabilities, of at most {MAX_PROBABILITIES:,}; give "
+            "fewer cells."
+        )
     start = np.minimum(start, count - width)
-    index = start[:, None] + np.arange(width)
     bottom, top = edges[0], np.nextafter(edges[-1], np.inf)  # the last cell includes its upper edge
     if clipped:
         bottom, top = -np.inf, np.inf
@@ -163,17 +173,19 @@ def _factors(
     def side(at: Integers) -> Floats:
         return np.where(at == 0, bottom, np.where(at == count, top, edges[at]))
 
-    def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-        many = max(_CHUNK // a.shape[1], 1)
-        parts = [slice(i, i + many) for i in range(0, len(rows), many)]
-        chunks = [_bounds(noise, (a[part], b[part]), rows[part]) for part in parts]
-        return np.concatenate([x for x, _ in chunks]), np.concatenate([x for _, x in chunks])
+    def bounds(first: Integers, last: Integers, width: int = 1) -> tuple[Floats, Floats]:
+        """``[U, width]``, of the intervals between the edges ``first + i`` and ``last + i``."""
+        many, table = max(_CHUNK // width, 1), np.empty((2, len(rows), width))
+        for i in range(0, len(rows), many):
+            part = slice(i, i + many)
+            a, b = (side(x[part, None] + np.arange(width)) for x in (first, last))
+            table[:, part] = _bounds(noise, (a, b), rows[part])
+        return table[0], table[1]
 
-    lower, upper = bounds(side(index), side(index + 1))
-    first, last = side(start)[:, None], side(start + width)[:, None]
-    bottoms, tops = np.full_like(first, bottom), np.full_like(first, top)
-    below, above = bounds(bottoms, first)[1], bounds(last, tops)[1]
-    rest = np.where(first > bottom, below, 0) + np.where(last < top, above, 0)
+    lower, upper = bounds(start, start + 1, width)
+    bottoms, tops = np.zeros_like(start), np.full_like(start, count)
+    below, above = bounds(bottoms, start)[1], bounds(start + width, tops)[1]
+    rest = np.where(start > 0, below[:, 0], 0) + np.where(start + width < count, above[:, 0], 0)
     outside = np.zeros((len(rows), 2))
     if not clipped:
         total_low, total_high = bounds(bottoms, tops)
@@ -181,8 +193,9 @@ def _factors(
         outside = np.where(
             np.concatenate([total_high, total_low], -1) == 1, 0, np.maximum(outside, 0)
         )
-    gap = np.where(upper > lower, upper - lower + _UNIT, 0)
-    return Factors(start, lower, gap, outside, rest[:, 0])
+    gap = np.subtract(upper, lower, out=upper)
+    np.add(gap, _UNIT, out=gap, where=gap > 0)
+    return Factors(start, lower, np.maximum(gap, 0, out=gap), outside, rest)
 
 
 def _bounds(

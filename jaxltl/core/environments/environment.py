@@ -34,7 +34,7 @@ from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
 from jaxltl.core.pretty_print import brief, count, nested_repr, propositions_text, value_range
 from jaxltl.core.types import require_shape
 
-ENDINGS = ("repeat", "violated", "undecided")
+ENDINGS = ("repeat", "violated", "undecided", "rejected")
 
 
 @struct.dataclass
@@ -237,8 +237,8 @@ class EnvironmentOptions(TypedDict, total=False):
       propositions: the P names.
       observations: a tree of :class:`Box`; default: unbounded.
       horizon: an upper bound on the length of episodes.
-      ending: ``"repeat"`` (default), ``"violated"`` or ``"undecided"``, the default of the option of
-        tasks (:class:`~jaxltl.core.environments.task_environment.TaskOptions`).
+      ending: ``"repeat"`` (default), ``"violated"``, ``"undecided"`` or ``"rejected"``, the default of
+        the option of tasks (:class:`~jaxltl.core.environments.task_environment.TaskOptions`).
     """
 
     labels: Callable[..., jax.Array] | None

@@ -137,7 +137,8 @@ class TaskOptions(RewardOptions, total=False):
     Attributes:
       ending: the verdict of a terminal state of the environment while the task is undecided:
         ``"repeat"`` (default): that of the last label repeated for ever, as in an absorbing state;
-        ``"violated"``; or ``"undecided"``. An environment with another `ending` sets the default.
+        ``"violated"``; ``"undecided"``; or ``"rejected"``: violated, even where the label of the
+        terminal state satisfies the formula. An environment with another `ending` sets the default.
       embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
     """
 
@@ -172,17 +173,13 @@ def make_task_tables(
             f"[{len(decisions)}, ...], a row for each state of the automaton."
         )
     number = jnp.result_type(float)
-    last = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
-    repeated = np.full(np.shape(automaton.delta), last, np.int32)
-    if ending == "repeat":
-        repeated = lasso_verdicts(automaton)
     return TaskTables(
         weight=weight,
         letter=np.asarray(reading.letter),
         delta=np.asarray(automaton.delta, np.int32),
         initial=np.int32(automaton.initial),
         verdict=decisions,
-        repeated=repeated,
+        repeated=_terminal_verdicts(automaton, decisions, ending),
         accepting=pay.accepting,
         reward=pay.reward.astype(number),
         discount=pay.discount.astype(number),
@@ -192,6 +189,19 @@ def make_task_tables(
         embedding=None if features is None else features.astype(number),
         state_names=automaton.state_names,
     )
+
+
+def _terminal_verdicts(automaton: Automaton, decisions: Array, ending: str) -> Array:
+    """``int32[Q, L]``: the verdict of a terminal state, by its automaton state and letter."""
+    if ending == "repeat":
+        return lasso_verdicts(automaton)
+    table = np.full(np.shape(automaton.delta), Verdict.VIOLATED, np.int32)
+    if ending == "rejected":
+        return table
+    last = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
+    decided = decisions != Verdict.UNDECIDED
+    table[:] = np.where(decided, decisions, last)[:, None]
+    return table
 
 
 def _require_open(formula: str, verdict: int) -> None:
@@ -456,9 +466,8 @@ def _read_on(
     tables = jax.tree.map(jnp.asarray, tables)
     reading = before.memory, _read(tables, labels(step.world))
     memory, accepted = tables.delta[reading], tables.accepting[reading]
-    over, verdict = jnp.asarray(step.terminated, bool), tables.verdict[memory]
-    at_end = tables.repeated[memory, reading[1]]
-    verdict = jnp.where(over & (verdict == Verdict.UNDECIDED), at_end, verdict)
+    over = jnp.asarray(step.terminated, bool)
+    verdict = jnp.where(over, tables.repeated[memory, reading[1]], tables.verdict[memory])
     decided = verdict != Verdict.UNDECIDED
     terminated = over | decided
     discount = step.discount * tables.discount[reading]

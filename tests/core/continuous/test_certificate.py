@@ -15,6 +15,7 @@ from jaxltl.core.continuous import (
     gaussian,
     make_dynamics,
     synthesize_policy,
+    transition_bounds,
     triangular,
     uniform,
 )
@@ -236,6 +237,25 @@ def test_a_step_that_is_unbounded_on_a_cell_is_refused(step):
 def test_more_pairs_of_cells_and_actions_than_fit_are_refused():
     with pytest.raises(ValueError, match=r"37.3 GiB with 1,000 actions; give at most 16,777"):
         synthesize_policy(scalar(), "F goal", np.ones((1000, 1)), cells=[100_000])
+
+
+def test_more_probabilities_than_fit_end_the_refinement(monkeypatch):
+    monkeypatch.setattr(transition_bounds, "MAX_PROBABILITIES", 2000)
+    lines = []
+    options = {"tolerance": 0.0, "report": lines.append}
+    policy = lambda x: jnp.full(1, 0.2)  # noqa: E731
+    found = certify_policy(scalar(), policy, "F goal", cells=[30], **options)
+    whole = certify_policy(scalar(), policy, "F goal", cells=[30], max_cells=30, tolerance=0.0)
+    assert found.status.name == "MAX_STEPS" and "transition probabilities" in lines[-1]
+    assert found.initial_bounds[0] >= whole.initial_bounds[0] > 0
+    with pytest.raises(ValueError, match="transition probabilities, of at most 2,000; give fewer"):
+        certify_policy(scalar(), policy, "F goal", cells=[80])
+
+
+def test_initial_states_outside_of_a_smaller_domain_are_refused():
+    part = replace(scalar(), domain=(np.array([-0.4]), np.array([1.6])))
+    with pytest.raises(ValueError, match=r"initial: box 0.*outside the domain.*give boxes inside"):
+        certify_policy(part, lambda x: jnp.full(1, 0.2), "F goal", cells=[20])
 
 
 def test_an_interrupt_keeps_the_bounds_of_the_grid_before():

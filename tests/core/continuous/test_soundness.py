@@ -10,19 +10,27 @@ import pytest
 import scipy.stats
 from scipy.special import ndtr, ndtri
 
+from jaxltl.core.automata import to_automaton
+from jaxltl.core.automata.runs import Verdict, lasso_verdicts
+from jaxltl.core.automata.runs import verdicts as verdicts_of
 from jaxltl.core.continuous import (
     Dynamics,
     box,
     certify_policy,
+    counterexample,
     gaussian,
     half_space,
     make_dynamics,
+    shield_dynamics,
+    synthesize_policy,
     triangular,
     truncated_gaussian,
     uniform,
 )
 from jaxltl.core.continuous.abstraction import Successors, winning_cells
 from jaxltl.core.continuous.task_product import task_product
+from jaxltl.core.environments.episodes import make_agent, run_episode
+from jaxltl.core.environments.task_environment import stack_tasks, task_environment
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from tests.reference_logic import random_formula
 
@@ -63,29 +71,27 @@ def labels_of_runs(world, policy, starts, num_steps, seed=0, disturbance=None):
 
 
 def verdicts(formula, world, labels, alive):
-    """Runs that surely satisfy and surely violate a formula, after their finite number of steps."""
-    names = list(world.propositions)
-    formula = parse_ltl(formula) if isinstance(formula, str) else formula
-    used = sorted(formula.propositions)
-    columns = [names.index(p) for p in used]
-    every = np.array([[i >> j & 1 for j in range(len(used))] for i in range(2 ** len(used))], bool)
-    task = task_product(formula, used, every, every, None)
-    automaton = task.automaton
-    sink = {q: int(d) for (q, _), d in zip(task.states, task.decided, strict=True) if d >= 0}
-    decided = np.array([sink.get(q, -1) for q in range(len(automaton.delta))])
-    order = [used.index(p) for p in automaton.propositions]
-    weights = 2 ** np.arange(len(order))
-    number = {int(row @ weights): i for i, row in enumerate(np.asarray(automaton.letters, int))}
-    table = np.array([number.get(i, -1) for i in range(2 ** len(order))])
+    """Runs that surely satisfy and surely violate a formula, after their finite number of steps.
+
+    The reference reads all letters of the formula: leaving violates unless every continuation of the
+    labels inside satisfies it, whatever the labels of the domain are.
+    """
+    automaton = to_automaton(formula)
+    told, forever = verdicts_of(automaton), lasso_verdicts(automaton)
+    columns = [list(world.propositions).index(p) for p in automaton.propositions]
+    weights = 2 ** np.arange(len(columns))
+    letter_of = np.argsort(np.asarray(automaton.letters, int) @ weights)
     q = np.full(labels.shape[1], int(automaton.initial))
     lost = np.zeros(labels.shape[1], bool)
     for label, inside in zip(labels, alive, strict=True):
-        letter = table[label[:, columns][:, order].astype(int) @ weights]
-        assert (letter >= 0).all()
+        letter = letter_of[label[:, columns].astype(int) @ weights]
         if world.outside == "violates":
-            lost |= ~inside & (decided[q] != 1)
+            lost |= ~inside & (told[q] != Verdict.SATISFIED)
         q = np.where(lost, q, automaton.delta[q, letter])
-    return (decided[q] == 1) & ~lost, (decided[q] == 0) | lost
+    found = told[q]
+    if world.outside == "out":  # its letter repeats for ever
+        found = np.where(alive[-1], found, forever[q, letter])
+    return (found == Verdict.SATISFIED) & ~lost, (found == Verdict.VIOLATED) | lost
 
 
 def check(proof, formula, world, policy, start, runs, num_steps, **options):
@@ -315,6 +321,146 @@ def test_simulated_runs_of_random_worlds_lie_inside():
 @pytest.mark.parametrize("block", range(20))
 def test_many_simulated_runs_of_random_worlds_lie_inside(block):
     check_triples(range(10 * block, 10 * (block + 1)), 100_000)
+
+
+# --- leaving the domain ---------------------------------------------------------------------------
+
+# Of each class; the labels of some worlds satisfy or violate some of them whatever the run does.
+TASKS = (
+    "G !u", "G (u -> m)", "G (m | !u)", "X !u", "X X !m",  # safety
+    "F m", "!u U m", "F (m & X !m)", "F (u & !m)", "X (m | !m & X !u)",  # co-safety
+    "G F m", "G F !u", "G F (u & !m)", "F G m", "F G !u",  # recurrence, persistence
+    "G !u | F m", "G (u -> m) & F m", "G (u -> m) | F u", "G F m -> G F u", "F G !u | F m",
+    "G F m & G !u", "(G F m | F G !m) & F u", "G F (u & !m) | F m", "!(G F m & F u) | X !u",
+)  # fmt: skip
+REGIONS = {  # of u and m: one inside the other, apart, across, all of the domain
+    "nested": ((-0.4, -0.1), (-0.5, 0.3)),
+    "apart": ((-0.6, -0.2), (0.1, 0.5)),
+    "across": ((-0.3, 0.3), (0.1, 0.6)),
+    "everywhere": ((-0.5, -0.2), (-1.0, 1.0)),
+}
+# A contraction that noise of the first kinds may not leave, and one that it soon does.
+MOTIONS = {"stays": (0.5, 0.05), "leaves": (0.9, 0.1)}
+
+
+def leaving_triple(n, motion, regions, noise, outside):
+    """A world in n dimensions, without control, whose runs stay or leave."""
+    gain, drift = MOTIONS[motion]
+    distribution, draw_noise = NOISES[noise]
+    ends = [np.array([[end, *(-0.7, 0.8)[i : i + n - 1]] for i, end in enumerate(x)])
+            for x in REGIONS[regions]]  # fmt: skip
+    if regions == "everywhere":
+        ends[1] = np.array([[-1.0] * n, [1.0] * n])
+    world = make_dynamics(
+        lambda x, u, w: gain * x + drift + w,
+        domain=(np.full(n, -1.0), np.full(n, 1.0)),
+        noise=[distribution] * n,
+        labels={"u": box(*ends[0]), "m": box(*ends[1])},
+        outside=outside,
+    )
+    step = lambda x, u, w: gain * x + drift + w  # noqa: E731
+    return Triple(world, lambda x: np.zeros(len(x)), parse_ltl("F m"), [draw_noise] * n, step)
+
+
+def check_leaving(case, formulas, runs=1500, num_steps=25):
+    """Bounds from random states against simulated runs; the number of bounds that are not trivial."""
+    draw, informative = np.random.default_rng(7), 0  # starts are in all of the domain
+    triple = leaving_triple(*case)
+    starts = draw.uniform(-1, 1, (6, case[0]))
+    found = triple.simulate(draw, np.repeat(starts, runs, 0), num_steps)
+    cells = {1: [40], 2: [12, 12]}[case[0]]
+    options = {"cells": cells, "max_cells": 400, "tolerance": 0.02, "max_sweeps": 200}
+    for formula in formulas:
+        proof = certify_policy(triple.world, no_action, formula, **options)
+        good, bad = (x.reshape(len(starts), -1) for x in verdicts(formula, triple.world, *found))
+        lower, upper = proof.at(starts)
+        for i in range(len(starts)):
+            least, most = (interval(x[i].sum(), runs)[0] for x in (good, bad))
+            says = case, str(formula), starts[i], (lower[i], upper[i]), (least, 1 - most)
+            assert least <= upper[i] and lower[i] <= 1 - most, says
+        informative += (upper - lower < 0.3).sum()
+    return informative / len(starts) / len(formulas)
+
+
+def leaving_cases():
+    """All worlds; by default some that have each value of each part."""
+    for i, motion in enumerate(MOTIONS):
+        for j, regions in enumerate(REGIONS):
+            for k, outside in enumerate(OUTSIDE):
+                yield 1 + (i + j + k) % 2, motion, regions, (i + 2 * j + k) % 4, outside
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=[] if i in (7, 12, 14) else pytest.mark.slow)
+        for i, case in enumerate(leaving_cases())
+    ],
+    ids=str,
+)
+def test_leaving_the_domain_means_what_outside_says(case):
+    assert check_leaving(case, TASKS) > 0.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(24))
+def test_random_formulas_where_runs_leave_the_domain(seed):
+    chooser = random.Random(seed)
+    case = list(leaving_cases())[seed]
+    names = ["u", "m", *(["out"] if case[-1] == "out" else [])]
+    formulas = [random_formula(chooser, chooser.randint(3, 7), names) for _ in range(20)]
+    check_leaving(case, [f for f in formulas if f.propositions])
+
+
+def test_episodes_that_leave_the_domain_have_the_verdicts_of_the_proofs():
+    """The label outside satisfies no formula, such as `X !u`, that was not satisfied before."""
+    world = leaving_triple(1, "leaves", "nested", 2, "violates").world
+    open_tasks = [f for f in TASKS if set(verdicts_of(to_automaton(f))[:1]) == {0}]
+    tasks = stack_tasks([task_environment(world, f) for f in open_tasks])
+    agent = make_agent(lambda seen, key: jnp.int32(0))
+    keys = jax.random.split(jax.random.key(0), 200)
+    run = jax.vmap(lambda e: jax.vmap(lambda k: run_episode(k, e, agent, num_steps=30))(keys))
+    found = jax.device_get(jax.jit(run)(tasks))
+    seen = set()
+    for formula, states, told, valid in zip(
+        open_tasks, found.world.world, found.world.verdict, found.valid, strict=True
+    ):
+        steps, row = valid.sum(-1), np.arange(len(valid))
+        at = np.minimum(np.arange(states.shape[1])[:, None], steps)  # the last state is kept
+        x, last = states[row, at], told[row, steps]
+        inside = (np.abs(x) <= 1).all(-1)
+        label = np.stack([world.labels[p].contains(x) & inside for p in world.labels], -1)
+        good, bad = verdicts(formula, world, label, inside)
+        assert (good == (last == 1)).all() and (bad == (last == 2)).all(), formula
+        seen |= {(formula, *pair) for pair in zip(inside[-1].tolist(), last.tolist(), strict=True)}
+    assert len(seen) > len(open_tasks)
+
+
+def test_a_shield_keeps_learners_inside_where_labels_satisfy_the_formula():
+    world = make_dynamics(
+        lambda x, u, w: x + u + w,
+        domain=([-1.0], [1.0]),
+        noise=uniform(-0.1, 0.1),
+        actions=([-0.4], [0.4]),
+        labels={"u": ([-0.3], [0.1]), "m": ([-0.5], [0.2])},
+        initial=([-0.5], [0.5]),
+    )
+    formula = "G (u -> m)"
+    found = synthesize_policy(world, formula, np.array([[-0.4], [0.4]]), cells=[40])
+    assert found.certificate.initial_bounds == (1, 1)
+    low, high = found.certificate.grid.boxes()
+    reach = [
+        x[:, None, 0] + u for x, u in zip((low, high), ([-0.5, 0.3], [-0.3, 0.5]), strict=True)
+    ]
+    leaves = (reach[0] < -1) | (reach[1] > 1)
+    assert leaves.any() and not (found.allowed & leaves).any()
+    shielded = task_environment(shield_dynamics(found), formula)
+    agent = make_agent(lambda seen, key: jnp.full(1, 0.4))
+    run = run_episode(jax.random.key(0), shielded, agent, num_steps=30)
+    assert int(np.asarray(run.world.verdict)[-1]) != Verdict.VIOLATED
+    proof = certify_policy(world, lambda x: x * 0 + 0.4, formula, cells=[40])
+    violating = counterexample(world, lambda x: x * 0 + 0.4, formula, jax.random.key(0), proof)
+    assert proof.initial_bounds == (0, 0) and violating[-1, 0] > 1 > violating[-2, 0]
 
 
 # --- winning strategies ---------------------------------------------------------------------------
