@@ -55,7 +55,10 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):
 cache_all_programs()
 
 import jax  # noqa: E402
+import jax.experimental  # noqa: E402
 
+if not hasattr(jax, "enable_x64"):  # JAX 0.7
+    jax.enable_x64 = jax.experimental.enable_x64
 jax.config.update("jax_enable_x64", True)
 # Meshes of one, two and four devices; all else stays on the first.
 jax.config.update("jax_num_cpu_devices", 4)

@@ -9,6 +9,7 @@ coordinate of the state; the rest of the noise is treated as chosen by an advers
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.enclosures.interval import Interval
 from jaxltl.core.enclosures.linear_bounds import AffineForm, Enclosed, propagate
 from jaxltl.core.enclosures.program import Elementwise, Program, make_program
+from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
@@ -36,6 +38,10 @@ Step = Callable[[PyTree, PyTree, PyTree], PyTree]
 _UNDERFLOW = 1e-200  # of products with 0 that are rounded outward
 # Functions that may jump: their derivatives do not bound their variation.
 _JUMPS = {"sign", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne", "atan2", "pow"}
+_ADVERSARY = (
+    "all noise is treated as chosen by an adversary, so that the bounds may be wide; write the step as a "
+    "smooth function of the noise."
+)
 
 
 def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
@@ -44,7 +50,10 @@ def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
     One program for both, since the derivatives need what the step computes: of a policy, say.
     """
     program = make_program(lambda x, u, w: step(x, u, w), *specs)
-    if specs[2].shape[0] == 0 or jumps(program):
+    if specs[2].shape[0] == 0:
+        return program
+    if jumps(program):
+        warnings.warn(f"the step may jump in the noise: {_ADVERSARY}", stacklevel=2)
         return program
 
     def gains(x: jax.Array, u: jax.Array, w: jax.Array) -> tuple[PyTree, jax.Array]:
@@ -54,7 +63,11 @@ def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
 
     try:
         return make_program(gains, *specs)
-    except ValueError:  # a derivative without an enclosure
+    except ValueError as error:
+        warnings.warn(
+            f"the derivative of the step in the noise has no enclosure ({error}) {_ADVERSARY}",
+            stacklevel=2,
+        )
         return program
 
 
@@ -174,7 +187,7 @@ def image_boxes(
     """
     cells = np.asarray(cells)
     sizes = grid.num_axes, actions.shape[1], len(noise.low)
-    with jax.enable_x64(True):
+    with enable_x64(True):
         program = gain_program(step, [jax.ShapeDtypeStruct((k,), np.float64) for k in sizes])
     num_actions, n = len(actions), grid.num_axes
     arrays = [np.empty((len(cells), num_actions, n)) for _ in range(4)]

@@ -19,6 +19,7 @@ from scipy.special import ndtr
 
 from jaxltl.core import validation
 from jaxltl.core.enclosures.linear_bounds import enclose
+from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.pretty_print import brief
 
 Floats = NDArray[np.float64]
@@ -201,7 +202,7 @@ class Distribution:
         inside = (x > low) & (x < high)
         some = low if np.isfinite(low) else high - 1.0 if np.isfinite(high) else 0.0
         safe = np.where(inside, x, np.nextafter(some, np.inf)).reshape(-1)
-        with jax.enable_x64(True):  # constants of the function in double precision
+        with enable_x64(True):  # constants of the function in double precision
             sides = enclose(self.function, "interval")(safe, safe)
         lower, upper = (np.clip(np.asarray(y, np.float64).reshape(x.shape), 0, 1) for y in sides)
         outside = np.where(x >= high, 1.0, 0.0)

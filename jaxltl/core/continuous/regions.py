@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array
 from jaxltl.core.enclosures.linear_bounds import over_boxes
+from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.pretty_print import brief, count
 
 Floats = NDArray[np.float64]
@@ -112,7 +113,7 @@ class Region:
         for function in self.functions:
             for start in range(0, len(low), _CHUNK):
                 part = slice(start, start + _CHUNK)
-                with jax.enable_x64(True):  # constants of the function in double precision
+                with enable_x64(True):  # constants of the function in double precision
                     (bounds,) = over_boxes(function, low[part], high[part]).outputs(True)
                 certain[part] |= np.asarray(bounds.low)[:, 0] > 0
                 possible[part] |= ~(np.asarray(bounds.high)[:, 0] <= 0)

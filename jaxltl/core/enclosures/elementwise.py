@@ -42,7 +42,7 @@ def _named(name: str) -> Function:
 
 INCREASING: dict[str, Function] = {
     **{name: _named(name) for name in (
-        "exp", "exp2", "expm1", "log", "log1p", "tanh", "sqrt", "cbrt", "asinh", "sinh", "floor",
+        "exp", "exp2", "expm1", "log", "log2", "log1p", "tanh", "sqrt", "cbrt", "asinh", "sinh", "floor",
         "ceil", "round", "sign")},
     "atan": _named("arctan"), "asin": _named("arcsin"), "asinh": _named("arcsinh"),
     "logistic": _logistic, "erf": _erf,
@@ -97,10 +97,23 @@ def _compare(operation: Elementwise, x: Interval, y: Interval) -> Interval:
 
 def _select(_: Elementwise, inputs: list[Interval]) -> Interval:
     """Hull of the cases that are possible."""
+    if inputs[0].low.dtype != bool:
+        return _select_case(*inputs)
     test, no, yes = inputs
     xp = module_of(no.low)
     hull = Interval(xp.minimum(no.low, yes.low), xp.maximum(no.high, yes.high))
     return arithmetic.where(test.low, yes, arithmetic.where(test.high, hull, no))
+
+
+def _select_case(which: Interval, *cases: Interval) -> Interval:
+    """Hull of the cases from a lower to an upper index."""
+    xp, hull = module_of(which.low), cases[-1]
+    for i, case in reversed(list(enumerate(cases[:-1]))):
+        joined = Interval(xp.minimum(case.low, hull.low), xp.maximum(case.high, hull.high))
+        # `hull` has the cases behind, from the lower index on, if that is larger.
+        joined = arithmetic.where(which.high <= i, case, joined)
+        hull = arithmetic.where(which.low > i, hull, joined)
+    return hull
 
 
 def _convert(operation: Elementwise, inputs: list[Interval]) -> Interval:
@@ -167,6 +180,7 @@ _RULES: dict[str, Rule] = {
     "sin": lambda _, x: arithmetic.sine(x[0]),
     "cos": lambda _, x: arithmetic.sine(x[0], np.pi / 2),
     "tan": lambda _, x: arithmetic.tangent(x[0]),
+    "one_minus_square": lambda _, x: _one_minus_square(x[0]),
     "atan2": lambda _, x: arithmetic.angle(*x),
     "acos": _decreasing(_named("arccos")),
     "rsqrt": _decreasing(lambda x: 1 / module_of(x).sqrt(x)),
@@ -358,6 +372,9 @@ def _mean_value(
 def _relax_select(inputs: list[Interval], output: Interval) -> Relaxation:
     """The case itself where the test is certain, and constants elsewhere."""
     xp, dtype = module_of(output.low), output.low.dtype
+    if len(inputs) > 3 or inputs[0].low.dtype != bool:
+        zeros = (output.low * 0,) * len(inputs)
+        return Relaxation(zeros, output.low, zeros, output.high)
     yes, no = inputs[0].low, ~inputs[0].high
     slopes = tuple(
         xp.broadcast_to(case, output.low.shape).astype(dtype) for case in (yes & no, no, yes)
@@ -396,12 +413,16 @@ def _twice(x: Interval) -> Interval:
 
 _DERIVATIVES: dict[str, Callable[[Interval], Interval]] = {
     "square": _twice,
+    "one_minus_square": lambda x: arithmetic.negate(_twice(x)),
     "tanh": lambda x: _one_minus_square(_increasing("tanh", x)),
     "logistic": _derivative_logistic,
     "erf": _derivative_erf,
     "exp": lambda x: _increasing("exp", x),
     "expm1": lambda x: _increasing("exp", x),
     "log": lambda x: _for_positive(arithmetic.reciprocal(x), x),
+    "log2": lambda x: _for_positive(
+        arithmetic.multiply(arithmetic.reciprocal(x), point(x.low * 0 + 1 / np.log(2))), x
+    ),
     "log1p": lambda x: arithmetic.reciprocal(outward(x.low + 1, x.high + 1)),
     "sqrt": lambda x: _for_positive(arithmetic.reciprocal(_twice(_increasing("sqrt", x))), x),
     "sin": lambda x: arithmetic.sine(x, np.pi / 2),

@@ -30,15 +30,17 @@ _OWN = (str(Path(jax.__file__).parent), str(Path(__file__).parent))
 
 ELEMENTWISE = {
     "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sign", "floor", "ceil", "round",
-    "exp", "exp2", "expm1", "log", "log1p", "logistic", "tanh", "sqrt", "rsqrt", "cbrt",
+    "exp", "exp2", "expm1", "log", "log2", "log1p", "logistic", "tanh", "sqrt", "rsqrt", "cbrt",
     "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "asinh", "erf",
-    "square", "integer_pow", "pow", "convert_element_type", "select_n",
+    "square", "one_minus_square", "integer_pow", "pow", "convert_element_type", "select_n",
     "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not",
 }  # fmt: skip
 _RENAMED = {"add_any": "add", "copy": "reshape", "copy_p": "reshape", "stop_gradient": "reshape",
-            "squeeze": "reshape", "expand_dims": "reshape", "optimization_barrier": "reshape"}  # fmt: skip
+            "squeeze": "reshape", "expand_dims": "reshape", "optimization_barrier": "reshape",
+            "device_put": "reshape"}  # fmt: skip
 _SELECTIONS = {"reshape", "broadcast_in_dim", "transpose", "slice", "rev", "concatenate", "stack",
-               "split", "gather", "dynamic_slice", "tile", "dynamic_update_slice"}  # fmt: skip
+               "unstack", "split", "gather", "dynamic_slice", "tile", "dynamic_update_slice", "pad",
+               "scatter"}  # fmt: skip
 _REDUCTIONS = {"reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul",
                "reduce_and": "and", "reduce_or": "or"}  # fmt: skip
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
@@ -181,8 +183,9 @@ class _Builder:
             )
             self.place = outside
             return outputs
-        if name == "scan":
-            return self._unroll(equation, inputs)
+        if name in ("scan", "while", "cond"):
+            unrolled = {"scan": self._unroll, "while": self._repeat, "cond": self._branches}[name]
+            return unrolled(equation, inputs)
         if len(self.operations) >= MAX_OPERATIONS:
             raise ValueError(
                 f"{self._place(equation)}: the function has more than {MAX_OPERATIONS} operations after its "
@@ -199,6 +202,15 @@ class _Builder:
             return [self._linear(equation, inputs, 0)]
         if name == "dot_general":
             return [self._dot(equation, inputs)]
+        if name == "pow" and (exponent := self._integer(inputs[1])) is not None:
+            power = equation.replace(params={"y": exponent})
+            return [self._elementwise("integer_pow", power, inputs[:1], output)]
+        if name == "polynomial":  # by Horner's rule
+            argument, *others, result = inputs
+            for coefficient in reversed(others):
+                product = self._elementwise("mul", equation, [result, argument], output)
+                result = self._elementwise("add", equation, [product, coefficient], output)
+            return [result]
         if name == "clamp":
             low = self._elementwise("max", equation, [inputs[1], inputs[0]], output)
             return [self._elementwise("min", equation, [low, inputs[2]], output)]
@@ -211,8 +223,25 @@ class _Builder:
         if not all(x in self.known for x in inputs):
             return False
         exact = not any(jnp.issubdtype(_spec(v).dtype, jnp.floating) for v in equation.outvars)
+        # A comparison with what is not a number is unknown, and so is its integer.
+        exact = exact and not any(self._may_be_nan(x) for x in inputs)
         widens = name == "convert_element_type" and self._converts(equation, inputs[0])
         return exact or widens or name in _SELECTIONS or name in ("max", "min", "iota", "select_n")
+
+    def _may_be_nan(self, x: int) -> bool:
+        """True unless a known array is seen to have numbers alone."""
+        value = self.known[x]
+        if not jnp.issubdtype(value.dtype, jnp.floating):
+            return False
+        return not isinstance(value, np.ndarray) or bool(np.isnan(value).any())
+
+    def _integer(self, x: int) -> int | None:
+        """The integer, of moderate size, that all entries of a known array are; else None."""
+        value = self.known.get(x)
+        if not isinstance(value, np.ndarray) or not value.size or (value != value[0]).any():
+            return None
+        exponent = float(value[0])
+        return int(exponent) if exponent.is_integer() and abs(exponent) <= 64 else None
 
     def _converts(self, equation: core.JaxprEqn, x: int) -> bool:
         """True if the conversion of a known array loses nothing."""
@@ -233,7 +262,9 @@ class _Builder:
         """Selection of entries: the primitive's own result on the entries' numbers."""
         count = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2}.get(name, len(inputs))
         data, indices = inputs[:count], inputs[count:]
-        if any(x not in self.known for x in indices):
+        if name == "scatter":
+            data, indices = inputs[::2], inputs[1:2]
+        if any(isinstance(self.known.get(x), jax.core.Tracer | None) for x in indices):
             raise ValueError(
                 f"{self._place(equation)}: an index depends on the argument; index by constants, or use "
                 "jnp.where."
@@ -243,8 +274,15 @@ class _Builder:
             numbers.append(self._numbers(x) + start)
             start += numbers[-1].size
         known = [self.known[x].reshape(self.shapes[x].shape) for x in indices]
-        selected = zip(_selection(name, equation, numbers, known), equation.outvars, strict=True)
-        return [self._selected(data, index, _spec(variable)) for index, variable in selected]
+        entries = _selection(name, equation, numbers, known)
+        selected = list(zip(map(np.asarray, entries), map(_spec, equation.outvars), strict=True))
+        if name == "gather" and any((index < 0).any() for index, _ in selected):
+            # Entries out of range have a value of their own, by default NaN.
+            fill = equation.params["fill_value"]
+            value = np.array([np.nan if fill is None else fill], selected[0][1].dtype)
+            data = [*data, self.constant(value)]
+            selected = [(np.where(index < 0, start, index), spec) for index, spec in selected]
+        return [self._selected(data, index, spec) for index, spec in selected]
 
     def _numbers(self, x: int) -> np.ndarray:
         """The numbers of the entries of a variable, in its shape."""
@@ -332,7 +370,10 @@ class _Builder:
     def _unroll(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """The operations of each step of a scan, with slices of its arrays."""
         p = equation.params
-        constants, carries = p["num_consts"], p["num_carry"]
+        # Carries have equal shapes outside and inside, and arrays have an axis more outside: counts
+        # that do not depend on the names of parameters, which differ between versions of JAX.
+        carries = _equal_ranks(equation.outvars, p["jaxpr"].jaxpr.outvars)
+        constants = _equal_ranks(equation.invars, p["jaxpr"].jaxpr.invars) - carries
         fixed, carry = inputs[:constants], list(inputs[constants : constants + carries])
         arrays, body = inputs[constants + carries :], p["jaxpr"]
         stacked: list[list[int]] = []
@@ -349,10 +390,49 @@ class _Builder:
         ]
         return [*carry, *columns]
 
+    def _repeat(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        """The operations of a loop while its condition is known."""
+        p = equation.params
+        test, body = p["cond_jaxpr"], p["body_jaxpr"]
+        first = p["cond_nconsts"]
+        last = first + p["body_nconsts"]
+        carry = inputs[last:]
+        for _ in range(MAX_OPERATIONS):
+            (condition,) = self.inline(test.jaxpr, test.consts, [*inputs[:first], *carry])
+            value = self.known.get(condition)
+            if not isinstance(value, np.ndarray):
+                raise ValueError(f"{self._place(equation)}: {_refusal('while')}")
+            if not value.all():
+                return carry
+            carry = self.inline(body.jaxpr, body.consts, [*inputs[first:last], *carry])
+        raise ValueError(f"{self._place(equation)}: the loop has more than {MAX_OPERATIONS} steps.")
+
+    def _branches(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        """The branch of a known index, or all branches and a choice between their results."""
+        (index, *operands), branches = inputs, equation.params["branches"]
+        value = self.known.get(index)
+        if isinstance(value, np.ndarray):
+            branches = [branches[int(np.clip(value[0], 0, len(branches) - 1))]]
+        results = [self.inline(branch.jaxpr, branch.consts, operands) for branch in branches]
+        outputs = []
+        for variable, cases in zip(equation.outvars, zip(*results, strict=True), strict=True):
+            equal, spec = len(set(cases)) == 1, _spec(variable)
+            choice = [index, *cases]
+            outputs.append(
+                cases[0] if equal else self._elementwise("select_n", equation, choice, spec)
+            )
+        return outputs
+
     def _apply(self, function: Callable[..., jax.Array], inputs: list[int]) -> int:
         """Appends the operations of a function of variables."""
         closed = jax.make_jaxpr(function)(*(self.shapes[i] for i in inputs))
         return self.inline(closed.jaxpr, closed.consts, inputs)[0]
+
+
+def _equal_ranks(outside: Sequence[core.Var], inside: Sequence[core.Var]) -> int:
+    """The number of variables with as many axes inside a loop as outside."""
+    pairs = zip(outside, inside, strict=True)
+    return sum(len(_spec(x).shape) == len(_spec(y).shape) for x, y in pairs)
 
 
 def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
@@ -395,12 +475,20 @@ def _selection(
         return [np.concatenate(numbers, p["dimension"])]
     if name == "stack":
         return [np.stack(numbers, p["axis"])]
+    if name == "unstack":
+        return list(np.moveaxis(x, p["axis"], 0))
     if name == "broadcast_in_dim":
         place = [1] * len(p["shape"])
         for axis, size in zip(p["broadcast_dimensions"], x.shape, strict=True):
             place[axis] = size
         return [np.broadcast_to(x.reshape(place), p["shape"])]
     with jax.ensure_compile_time_eval():
+        if name == "scatter":
+            options = {x: p[x] for x in ("indices_are_sorted", "unique_indices", "mode")}
+            place, arrays = p["dimension_numbers"], [x, *indices, numbers[1]]
+            return [jax.lax.scatter(*map(jnp.asarray, arrays), place, **options)]
+        if name == "gather":
+            p = p | {"fill_value": -1}  # marks entries out of range
         entries = equation.primitive.bind(*map(jnp.asarray, [*numbers, *indices]), **p)
     return list(entries) if equation.primitive.multiple_results else [entries]
 
@@ -453,7 +541,7 @@ def _letters(equation: core.JaxprEqn) -> tuple[str, str, str, str]:
 
 def _refusal(name: str) -> str:
     """Remedy for an unsupported primitive."""
-    if name in ("while", "cond"):
+    if name == "while":
         return (
             f"`{name}` depends on values that are not known. Use a loop of fixed length (lax.scan, or "
             "lax.fori_loop with constant bounds) and jnp.where."

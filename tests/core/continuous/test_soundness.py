@@ -160,6 +160,7 @@ GAINS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:the step may jump")
 @pytest.mark.parametrize("noise", [uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)])
 @pytest.mark.parametrize("name", GAINS)
 def test_noise_that_is_not_additive(name, noise):

@@ -24,6 +24,7 @@ from jax.interpreters import mlir
 from jax.sharding import SingleDeviceSharding
 
 from jaxltl.core.array_types import PyTree
+from jaxltl.core.models.ops.array_namespace import enable_x64
 
 Result = TypeVar("Result")
 
@@ -162,7 +163,7 @@ class _Parts:
     @cached_property
     def compiled(self) -> list[PyTree]:
         """The program of a part, for each thread."""
-        with jax.enable_x64(self.x64):
+        with enable_x64(self.x64):
             program = self.traced.lower().compile()
         # While the first call of a handle runs, other threads wait at that handle.
         return [copy.copy(program) for _ in range(0, self.size, self.width)]
@@ -178,11 +179,11 @@ class _Parts:
             if skip:  # the last part repeats its last lane
                 rows = np.minimum(np.arange(start, start + self.width), self.size - 1)
             inputs = [x[rows] if has else x for x, has in zip(shared, self.lanes, strict=True)]
-            with jax.enable_x64(self.x64):  # local to a thread
+            with enable_x64(self.x64):  # local to a thread
                 for x, y in zip(results, self.compiled[start // self.width](*inputs), strict=True):
                     x[start:stop] = np.asarray(y)[: stop - start] if skip else np.asarray(y)
 
-        with jax.enable_x64(self.x64):  # one copy of large arrays for all parts
+        with enable_x64(self.x64):  # one copy of large arrays for all parts
             shared = [
                 x if has or x.nbytes < _SMALL else jax.device_put(x, _device())
                 for x, has in zip(data, self.lanes, strict=True)

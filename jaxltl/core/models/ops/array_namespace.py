@@ -6,9 +6,11 @@ Operations of ``jax.numpy`` outside of ``jit`` compile a program for each shape;
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TypeVar, cast
 
 import jax
+import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -44,6 +46,13 @@ def jax_array(array: ArrayLike) -> jax.Array:
     """A JAX array, without compilation."""
     # device_put may share memory with its argument, hence the copy.
     return array if isinstance(array, jax.Array) else jax.device_put(np.array(array))
+
+
+def enable_x64(enabled: bool) -> AbstractContextManager[None]:
+    """Context in which JAX of this thread has double precision, or not, in every version of JAX."""
+    module = jax if hasattr(jax, "enable_x64") else jax.experimental  # up to JAX 0.7
+    context: AbstractContextManager[None] = vars(module)["enable_x64"](enabled)
+    return context
 
 
 def jit(*static: str) -> Callable[[FunctionT], FunctionT]:
