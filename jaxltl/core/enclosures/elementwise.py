@@ -421,7 +421,7 @@ _DERIVATIVES: dict[str, Callable[[Interval], Interval]] = {
     "expm1": lambda x: _increasing("exp", x),
     "log": lambda x: _for_positive(arithmetic.reciprocal(x), x),
     "log2": lambda x: _for_positive(
-        arithmetic.multiply(arithmetic.reciprocal(x), point(x.low * 0 + 1 / np.log(2))), x
+        arithmetic.multiply(arithmetic.reciprocal(x), point(x.low * 0 + 1.4426950408889634)), x
     ),
     "log1p": lambda x: arithmetic.reciprocal(outward(x.low + 1, x.high + 1)),
     "sqrt": lambda x: _for_positive(arithmetic.reciprocal(_twice(_increasing("sqrt", x))), x),
