@@ -15,6 +15,7 @@ import hashlib
 import importlib
 import os
 import platform
+import sys
 import tempfile
 import threading
 from pathlib import Path
@@ -46,19 +47,45 @@ def _cache() -> Path | None:
     return place / f"jaxlib-{jaxlib.__version__}-{key}"
 
 
+def _limit_memory(most: int = 8 * 2**30, least: int = 4 * 2**30) -> None:
+    """Bounds the data of this process and of those that it starts, on Linux.
+
+    A test that fills the memory then fails with its name. Otherwise the kernel ends workers, also
+    those of other tests, and the run waits for them.
+    """
+    if sys.platform != "linux" or os.environ["JAX_PLATFORMS"] != "cpu":
+        return  # drivers of accelerators map more than they use
+    resource = importlib.import_module("resource")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):  # of a container
+        file = Path("/sys/fs/cgroup", name)
+        text = file.read_text().strip() if file.is_file() else ""
+        memory = min(memory, int(text)) if text.isdigit() else memory
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = max(least, min(most, memory // 2))
+    limits = [limit, *(x for x in (soft, hard) if x != resource.RLIM_INFINITY)]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), hard))
+
+
 # Before JAX reads them; workers and subprocesses inherit them.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # also where there is an accelerator
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = xla_flags(_HASTE)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
+_limit_memory()
 cache_all_programs()
 
 import jax  # noqa: E402
 import jax.experimental  # noqa: E402
 
-if not hasattr(jax, "enable_x64"):  # JAX 0.7
+# In JAX 0.7 tests find two functions where later versions have them.
+if not hasattr(jax, "enable_x64"):
     jax.enable_x64 = jax.experimental.enable_x64
+if not hasattr(jax.monitoring, "unregister_event_duration_listener"):
+    of_private = importlib.import_module("jax._src.monitoring")
+    remove = of_private._unregister_event_duration_listener_by_callback
+    jax.monitoring.unregister_event_duration_listener = remove
 jax.config.update("jax_enable_x64", True)
 # Meshes of one, two and four devices; all else stays on the first.
 jax.config.update("jax_num_cpu_devices", 4)
