@@ -5,8 +5,8 @@ product of the world and the task's automaton; every answer comes with certified
 or a confidence interval. Public names are listed in ``__init__.pyi`` and imported on first use.
 """
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
 __version__ = "0.2.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

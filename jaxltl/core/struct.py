@@ -10,8 +10,8 @@ by type.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial, wraps
 from types import MappingProxyType
 from typing import Any, TypeVar, dataclass_transform
 
@@ -20,6 +20,7 @@ from flax.struct import field
 
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.status import Status
+from jaxltl.core.suggestions import unknown_keyword
 
 __all__ = ["Static", "dataclass", "field", "metrics", "register"]
 
@@ -87,6 +88,7 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
     """
     result: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
     result.replace = _replace
+    result.__init__ = _suggesting(result.__init__, result)
     static = [f.name for f in dataclasses.fields(result) if not f.metadata.get("pytree_node", True)]
     arrays = [f.name for f in dataclasses.fields(result) if f.name not in static]
     return register(result, arrays, static)
@@ -96,6 +98,22 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
 def metrics(cls: type[ClassT]) -> type[ClassT]:
     """Decorator: a :func:`dataclass` of a learner's metrics, whose ``repr`` shows the last row."""
     return brief(facts=partial(history, codes=_CODES))(dataclass(cls))
+
+
+def _suggesting(init: Callable[..., None], cls: type) -> Callable[..., None]:
+    """The constructor of a dataclass, with a suggestion in place of an unknown keyword."""
+
+    @wraps(init)
+    def wrapper(self: object, *args: object, **fields: object) -> None:
+        try:
+            init(self, *args, **fields)
+        except TypeError:
+            known = [f.name for f in dataclasses.fields(cls) if f.init]
+            for name in fields.keys() - set(known):
+                raise unknown_keyword(cls.__qualname__, name, known) from None
+            raise
+
+    return wrapper
 
 
 def _replace(self: Any, **updates: Any) -> Any:

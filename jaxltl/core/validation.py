@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxltl.core.suggestions import unknown_keyword
 from jaxltl.core.array_types import Booleans, Floats
 
 ROW_SUM_TOLERANCE = 1e-6  # largest error of the sum of a distribution that is given
@@ -269,11 +270,11 @@ def unsupported_model(model: object) -> str:
 def options(function: str, values: Mapping[str, object], **defaults: Any) -> tuple[Any, ...]:
     """The values of optional keywords with these defaults; TypeError for another, as Python raises."""
     if unknown := sorted(values.keys() - defaults.keys()):
-        raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")
+        raise unknown_keyword(function, unknown[0], defaults)
     return tuple({**defaults, **values}.values())
 
 
 def keywords(function: str, names: Iterable[str], options: type) -> None:
     """Raises TypeError, as Python does, for a keyword that a TypedDict of options lacks."""
     if unknown := sorted(set(names) - set(options.__annotations__)):
-        raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")
+        raise unknown_keyword(function, unknown[0], options.__annotations__)

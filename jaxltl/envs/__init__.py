@@ -5,6 +5,6 @@ environments: ``letter_world``, ``flat_world``, ``zone_world``, ``navigation``, 
 ``networks``.
 """
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -4,6 +4,6 @@
 have format-specific options. Only ``read_parametric`` is differentiable, in its parameters.
 """
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -5,6 +5,6 @@ without a display and in any thread. ``figure.savefig("name.svg")`` writes it. T
 return the text of an SVG for pages that move, and ``playback`` that of one that moves by itself.
 """
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,5 +1,5 @@
 """Shared parts of learners: loops, checkpoints, schedules, networks and distributions of actions."""
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

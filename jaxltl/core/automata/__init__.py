@@ -1,5 +1,5 @@
 """Deterministic automata of formulas, and questions about their languages. No JAX here."""
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

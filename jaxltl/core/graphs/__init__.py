@@ -1,5 +1,5 @@
 """Exact questions about supports, on the host or traced: attractors, components, acceptance."""
 
-import lazy_loader
+from jaxltl.core.lazy import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
