@@ -18,6 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, condition_of, make_alphabet
 from jaxltl.core.automata.emerson_lei import (
@@ -333,10 +334,8 @@ def to_automaton(
       >>> often.acceptance, often.accepting.astype(int).tolist()
       ('buchi', [[0, 1, 0, 1], [0, 0, 1, 1]])
     """
-    if acceptance not in ("auto", "dfa", "buchi", "parity"):
-        raise ValueError(
-            f"to_automaton: acceptance = {acceptance!r}. Pass one of auto, dfa, buchi, parity."
-        )
+    validation.choice("acceptance", acceptance, ("auto", "dfa", "buchi", "parity"))
+    max_states = validation.integer("max_states", max_states, least=1)
     formula = as_formula(formula)
     alphabet = make_alphabet(formula.propositions, letters, "to_automaton")
     normal = negation_normal_form(formula)

@@ -119,7 +119,7 @@ def permissive_strategy(
       >>> permissive_strategy(world, "G !crash").allowed[0].any(0).tolist()
       [True, False]
     """
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")

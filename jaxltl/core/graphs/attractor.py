@@ -13,6 +13,7 @@ from typing import NamedTuple, Any
 import jax
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, on_graph
 from jaxltl.core.models.game import Game
@@ -83,14 +84,13 @@ def attractor(
       [True, False]
     """
     if isinstance(rule, str):
-        if rule not in ("exists", "forall"):
-            raise ValueError(f"rule={rule!r}; choose exists or forall, or give bool[S].")
-        exists: Array | bool = rule == "exists"
+        word = validation.choice("rule", rule, ("exists", "forall"))
+        exists: Array | bool | None = word == "exists"
     else:
         exists = state_mask(model, "rule", rule)
-    if chance not in ("some", "all"):
-        raise ValueError(f"chance={chance!r}; choose some or all.")
-    goal, among = state_mask(model, "goal", goal), state_mask(model, "among", among)
+    validation.choice("chance", chance, ("some", "all"))
+    goal = state_mask(model, "goal", goal)
+    among = None if among is None else state_mask(model, "among", among)
     allowed = choice_mask(model, "allowed", allowed)
     return on_graph(partial(attract, chance=chance), model, goal, allowed, exists, among)
 

@@ -209,8 +209,7 @@ def product(
       >>> product(world, "F goal").state_shape
       (2, 2)
     """
-    if label_on not in ("entry", "exit"):
-        raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    validation.choice("label_on", label_on, ("entry", "exit"))
     if isinstance(world, Game):
         model = product(world.mdp, task, label_on=label_on)
         xp, system = namespace(world.system)

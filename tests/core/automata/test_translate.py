@@ -251,8 +251,8 @@ def test_deep_formula():
             ],
         ),
         ("F G a | G F b", "buchi", ["F G a | G F b has no deterministic Buchi"]),
-        ("F a", "finite", ["acceptance = 'finite'", "auto, dfa, buchi, parity"]),
-        ("F a", None, ["acceptance = None"]),
+        ("F a", "finite", ["acceptance='finite'", "auto, dfa, buchi, parity"]),
+        ("F a", None, ["acceptance=None"]),
     ],
 )
 def test_acceptance_that_the_language_has_not(text, acceptance, parts):

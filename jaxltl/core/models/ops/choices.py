@@ -344,7 +344,7 @@ def _(model: SparseMDP) -> tuple[int, ...]:
     return (model.num_rows,)
 
 
-def state_mask(model: Model, name: str, value: Array | None) -> Array | None:
+def state_mask(model: Model, name: str, value: Array) -> Array:
     """A set of states ``bool[S]`` as an argument; ValueError for another shape or other values."""
     if not hasattr(model, "state_shape"):
         raise ValueError(validation.unsupported_model(model))
@@ -353,12 +353,10 @@ def state_mask(model: Model, name: str, value: Array | None) -> Array | None:
 
 def choice_mask(model: Model, name: str, value: Array | None) -> Array | None:
     """A set of choices ``bool[S, A]``, or ``bool[R]`` of a sparse model, as an argument."""
-    return _mask(name, value, choice_shape(model), "a choice")
+    return None if value is None else _mask(name, value, choice_shape(model), "a choice")
 
 
-def _mask(name: str, value: Array | None, shape: tuple[int, ...], of: str) -> Array | None:
-    if value is None:
-        return None
+def _mask(name: str, value: Array, shape: tuple[int, ...], of: str) -> Array:
     traced = is_traced(value)
     # The operators of sets negate bitwise, so that integers 0 and 1 would be other sets.
     mask = value if traced else validation.boolean_array(name, value)

@@ -460,9 +460,12 @@ def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndar
             )
         wrong = ((policy < host.row_start[:-1]) | (policy >= host.row_start[1:])) & where
         for s in first_true(wrong):
+            first, count = int(host.row_start[s]), int(host.row_start[s + 1] - host.row_start[s])
+            ranks = 0 <= policy[s] < count
+            hint = "; for choice k of a state give row_start[s] + k" if ranks else ""
             raise ValueError(
-                f"the policy takes row {policy[s]} in state {s}, whose rows are "
-                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}."
+                f"policy[{s}]={policy[s]} is not a choice of state {s}: a policy of a sparse model "
+                f"gives rows, and those of the state are {first} to {first + count - 1}{hint}."
             )
         weight = np.zeros(host.num_rows)
         weight[policy[np.broadcast_to(where, policy.shape)]] = 1

@@ -29,6 +29,7 @@ from jaxltl.core.values.engine.state_quantities import (
     solution_from_error,
     finite_reward,
     reduction_for,
+    row_reward,
 )
 from jaxltl.core.values.engine.validated import validated
 
@@ -79,7 +80,8 @@ def average_reward(
             "total_reward until a target, or give model.nominal, which is one "
             "choice of nature."
         )
-    model = to_sparse(model)
+    sparse = to_sparse(model)
+    model, reward = sparse, row_reward(model, sparse, reward)
     sign = 1 if reduction_for(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)
     enclosure = average(

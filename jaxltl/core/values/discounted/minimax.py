@@ -127,7 +127,7 @@ def minimax_value(
     )
 
 
-@validated(games=True, per=_PER, method=_METHODS, environment=("adversarial",))
+@validated(games=True, per=_PER, method=_METHODS)
 def strategy_value(
     game: Model,
     strategy: chex.Array,
@@ -175,6 +175,7 @@ def strategy_value(
     game_model = as_game(game)
     form, reward = compiled_form(game_model, reward)
     if isinstance(environment, str):
+        validation.choice("environment", environment, ("adversarial",))
         environment = None
     strategy, environment = (flatten_policy(game_model.mdp, x) for x in (strategy, environment))
     policies = [("strategy", strategy, form.system)]

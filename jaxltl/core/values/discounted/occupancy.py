@@ -17,7 +17,7 @@ from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.types import Solution, status_code
+from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
@@ -59,6 +59,8 @@ def occupancy_measure(
     """
     (form, _), policy = compiled_form(model), flatten_policy(model, policy)
     require_policy(form, policy)
+    if initial is not None:
+        require_shape("initial", initial, model.state_shape)
     start = model.initial if initial is None else initial
     return _occupancy(form, policy, discount, start, tolerance)
 

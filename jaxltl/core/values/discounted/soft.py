@@ -22,7 +22,7 @@ from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
 from jaxltl.core.models.protocols import Array, Model, PyTree
-from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
     expected_reward,
@@ -99,7 +99,7 @@ def _soft_value(
     tolerance, max_steps = limits
     problem = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
-    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    start = first_iterate(model, initial)
     value, image, n, _ = newton.solve(
         sweep_operator(model),
         newton.Method(soft_maximum, judge, newton=method == "newton"),
@@ -238,6 +238,15 @@ def boltzmann_expansion(num_actions: ArrayLike) -> Array:
     return expansion if xp is jnp else float(expansion)
 
 
+def first_iterate(model: Model, initial: jax.Array | None) -> jax.Array:
+    """The first iterate of a value, ``float[N]``, from one in the model's shape; zero for None."""
+    if initial is None:
+        return jnp.zeros(model.num_states, model.dtype)
+    if np.shape(initial) != (model.num_states,):
+        require_shape("initial", initial, model.state_shape)
+    return jnp.asarray(initial, model.dtype).ravel()
+
+
 @validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
 def boltzmann_value(
     model: Model,
@@ -305,7 +314,7 @@ def _boltzmann_value(
     discount = jnp.asarray(discount, model.dtype)
     criterion = _criterion(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
-    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    start = first_iterate(model, initial)
     damping = jnp.where(criterion.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n, _ = newton.solve(
         sweep_operator(model),

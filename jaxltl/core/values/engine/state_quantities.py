@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.protocols import Array, Model, SuccessorModel, base_model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
-from jaxltl.core.types import Solution, Status, require_states
+from jaxltl.core.types import Solution, Status, require_shape, require_states
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
 
@@ -35,6 +36,25 @@ def state_mask(model: SparseMDP, states: Array | str, name: str) -> np.ndarray:
     if mask.dtype != bool:
         raise ValueError(f"{name} is {mask.dtype}[{mask.size}]; give booleans, or a label.")
     return mask
+
+
+def row_reward(model: Model, sparse: SparseMDP, reward: Reward) -> Reward:
+    """A reward ``[S]``, ``[S, A]`` or ``[S, A, K]`` of a padded model, expected on rows of its sparse form."""
+    if isinstance(base_model(model), SparseMDP) or isinstance(reward, str | Rewards | None):
+        return reward
+    reward = validation.float_array("reward", reward)
+    if reward.shape == model.state_shape:
+        return Rewards(state=reward.ravel())
+    padded = cast(SuccessorModel, model)
+    actions = (*model.state_shape, padded.num_actions)
+    if reward.shape == (*actions, padded.num_successors):
+        weight = np.asarray(padded.successor_probability, np.float64)
+        reward = (weight * np.where(weight > 0, reward, 0)).sum(-1)
+    if reward.shape in ((sparse.num_rows,), (sparse.num_transitions,)):
+        return reward
+    require_shape("reward", reward, actions)
+    pairs = reward.reshape(sparse.num_states, -1)
+    return Rewards(choice=pairs[sparse.host.state, np.asarray(sparse.action)])
 
 
 def state_reward(model: SparseMDP, reward: Reward) -> np.ndarray:

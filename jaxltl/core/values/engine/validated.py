@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -10,11 +11,13 @@ from typing import ParamSpec, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.models.one_player import refuse_game
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import PyTree, base_model
+from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
 
@@ -32,12 +35,18 @@ class SolverOptions(TypedDict, total=False):
     start: tuple[jax.Array, jax.Array] | None
 
 
+WORDS = {"objective": ("max", "min"), "over": ("mean", "worst"), "label_on": ("entry", "exit")}
+BOOLEANS = ("relative", "by_step", "by_level")
+NUMBERS = ("reward", "initial")  # arrays, which may be lists
+
+
 def validated(
     *, games: bool = False, **words: tuple[str, ...]
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`.
+    """Decorator of solvers that checks arguments by their names.
 
-    A game is refused unless `games` says that the solver knows who moves.
+    Numbers in :data:`validation.RANGES`, words, Booleans, and arrays of numbers; `words` are those of
+    more arguments. A game is refused unless `games` says that the solver knows who moves.
     """
     # Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
     # argument out of range is replaced by the least valid number, so that the solver ends, and the
@@ -58,9 +67,16 @@ def validated(
             arguments.update(options)
             if "options" in bound.arguments:
                 bound.arguments["options"] = options
-            for name, known in words.items():
-                if isinstance(arguments.get(name), str):
+            for name, known in (WORDS | words).items():
+                if name in arguments and (arguments[name] is not None or name not in optional):
                     choice(name, arguments[name], known)
+            for name in BOOLEANS:
+                if name in arguments:
+                    validation.boolean(name, arguments[name])
+            for name in NUMBERS:
+                if arguments.get(name) is not None:
+                    place = options if name in options else bound.arguments
+                    place[name] = arguments[name] = _numbers(name, arguments)
             traced = traced_arguments(
                 {name: x for name, x in arguments.items() if x is not None or name not in optional}
             )
@@ -78,6 +94,26 @@ def validated(
     return decorate
 
 
+def _numbers(name: str, arguments: Mapping[str, PyTree]) -> PyTree:
+    """An array of numbers, or a name or structure of rewards, which sparse models have."""
+    value = arguments[name]
+    if isinstance(value, str | Rewards) and name == "reward":
+        model = base_model(arguments.get("model", arguments.get("game")))
+        if model is not None and not hasattr(getattr(model, "nominal", model), "rewards"):
+            raise ValueError(
+                f"reward={validation.shorten(value)}; a {type(model).__name__} has no named rewards: "
+                "give an array."
+            )
+        return value
+    if isinstance(value, jax.Array | Rewards):
+        return value
+    with contextlib.suppress(TypeError, ValueError):
+        array = np.asarray(value)
+        if array.dtype.kind in "biuf":
+            return value if hasattr(value, "dtype") or not array.ndim else array
+    raise ValueError(f"{name} is {validation.shorten(value)}; give an array of numbers.")
+
+
 def traced_arguments(arguments: Mapping[str, PyTree]) -> dict[str, jax.Array]:
     """Checks concrete arguments by their names; returns the scalar ones that are traced."""
     traced = {}
@@ -86,8 +122,6 @@ def traced_arguments(arguments: Mapping[str, PyTree]) -> dict[str, jax.Array]:
             require_in_range(name, value)
             if not is_concrete(value):
                 traced[name] = value
-        elif name == "relative":
-            validation.boolean(name, value)
         else:
             require_real(name, value)
     return traced

@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxltl.core import validation
 from jaxltl.core import struct
 
 from jaxltl.core.models.construct.convert import to_sparse
@@ -172,8 +173,7 @@ def prepare(
             'policy is for models with intervals; prepare with objective="policy" and give the '
             "policy to solve_prepared."
         )
-    if objective not in ("max", "min", "policy"):
-        raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
+    validation.choice("objective", objective, ("max", "min", "policy"))
     sparse = to_sparse(model)
     host = sparse.host
     require_states("target", target, model.state_shape)

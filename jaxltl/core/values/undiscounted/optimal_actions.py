@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import DTypeLike, NDArray
 
 from jaxltl.core.graphs.end_components import components_within
@@ -123,6 +123,8 @@ def optimal_actions(
       [[True, False], [True, True]]
     """
     refuse_sharded(model)
+    if solution is not None:
+        validation.instance("solution", solution, Solution, "that of optimal_satisfaction")
     if is_traced((model, solution, tolerance)):
         raise ValueError(
             "optimal_actions(model) reads values, so it works on the host only: "

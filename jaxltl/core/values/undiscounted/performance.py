@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
@@ -116,8 +116,7 @@ def task_performance(
       >>> round(found.mean.item(), 3), found.worst_state.item()
       (0.5, 0)
     """
-    if method not in ("auto", "blocks", "general"):
-        raise ValueError(f"method={method!r}; choose auto, blocks or general.")
+    validation.choice("method", method, ("auto", "blocks", "general"))
     require_policy(model, policy)
     return _task_performance(model, policy, tolerance, method=method)
 

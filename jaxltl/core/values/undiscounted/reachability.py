@@ -30,7 +30,6 @@ from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layer
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance, as_width
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_states
-from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     induced_chain,
     default_tolerance,
@@ -47,7 +46,7 @@ QUICK_LIMIT = 100_000  # states up to which ties are broken by the expected time
 _TIE_ROUNDINGS = 4  # that a bound gives up for each step, for ties to attain it
 
 
-@validated()
+@validated(method=("auto", "direct", "iterative"))
 def reachability_probability(
     model: Model,
     target: jax.Array,
@@ -107,9 +106,6 @@ def reachability_probability(
     max_steps, start, relative = validation.options(
         "reachability_probability", options, max_steps=None, start=None, relative=False
     )
-    if method not in ("auto", "direct", "iterative"):
-        raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
-    reduction_for(objective)
     if isinstance(model, IntervalMDP) or is_sparse(model) or stay is not None:
         refuse_iteration(max_steps, start)
     if relative:

@@ -56,7 +56,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
 )
 
 
-@validated()
+@validated(method=("auto", "direct", "iterative"))
 def satisfaction_probability(
     model: Product,
     policy: jax.Array,

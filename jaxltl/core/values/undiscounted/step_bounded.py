@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.one_player import of_one_player
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.sparse.solvers import step_bounded as host
@@ -23,11 +22,13 @@ from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.engine.state_quantities import (
     reduction_for,
     state_mask,
+    row_reward,
     state_reward,
     transition_reward,
     finite_reward,
     solution_from_error,
 )
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core import validation
 
 
@@ -45,7 +46,7 @@ def _has_intervals(
     return True
 
 
-@of_one_player
+@validated()
 def next_probability(
     model: Model, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
@@ -86,7 +87,7 @@ def next_probability(
     return solution_from_error(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
 
 
-@of_one_player
+@validated()
 def bounded_reachability(
     model: Model,
     target: Array | str,
@@ -149,7 +150,7 @@ def bounded_avoidance(
     return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
 
 
-@of_one_player
+@validated()
 def cumulative_reward(
     model: Model,
     reward: Array | str,
@@ -184,13 +185,14 @@ def cumulative_reward(
         return robust.robust_cumulative_reward(
             model, reward, num_steps, objective=objective, nature=nature
         )
-    model, operation = _problem(model, objective, num_steps)
-    rewards = *finite_reward(model, reward), np.zeros(model.num_states)
-    values = host.total(model.host, rewards, num_steps, operation, by_step)
+    sparse, operation = _problem(model, objective, num_steps)
+    rewards = finite_reward(sparse, row_reward(model, sparse, reward))
+    final = np.zeros(sparse.num_states)
+    values = host.total(sparse.host, (*rewards, final), num_steps, operation, by_step)
     return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
-@of_one_player
+@validated()
 def instantaneous_reward(
     model: Model,
     reward: Array | str,
@@ -227,14 +229,14 @@ def instantaneous_reward(
         return robust.robust_instantaneous_reward(
             model, reward, num_step, objective=objective, nature=nature
         )
-    model, operation = _problem(model, objective, num_step)
-    zero = np.zeros(model.num_rows)
-    rewards = zero, zero, state_reward(model, reward)
-    values = host.total(model.host, rewards, num_step, operation, by_step)
+    sparse, operation = _problem(model, objective, num_step)
+    zero = np.zeros(sparse.num_rows)
+    rewards = zero, zero, state_reward(sparse, row_reward(model, sparse, reward))
+    values = host.total(sparse.host, rewards, num_step, operation, by_step)
     return solution_from_error(values.value, values.error, values.row, values.num_steps)
 
 
-@of_one_player
+@validated()
 def reward_bounded_reachability(
     model: Model,
     target: Array | str,
@@ -273,11 +275,12 @@ def reward_bounded_reachability(
       >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
       [0.875, 1.0]
     """
+    if np.ndim(reward) < 3:  # rewards of transitions are not their expectation here
+        reward = row_reward(model, to_sparse(model), reward)
     model, operation = _problem(model, objective)
     mdp, target = model.host, state_mask(model, target, "target")
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
-    if not 0 <= bound < math.inf:
-        raise ValueError(f"bound={bound}; it must be finite and not negative.")
+    validation.require_in_range("bound", bound, validation.Range(0, math.inf, open_above=True))
     cost = transition_reward(model, reward_structure(model, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])

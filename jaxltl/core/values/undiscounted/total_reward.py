@@ -31,7 +31,7 @@ from jaxltl.core.values.engine.host_solution import (
     is_sparse,
     solution_from_enclosure,
 )
-from jaxltl.core.values.engine.state_quantities import reduction_for
+from jaxltl.core.values.engine.state_quantities import row_reward
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_total_reward
 from jaxltl.core.values.undiscounted.reachability import on_rows, rows_of_model
@@ -89,7 +89,6 @@ def total_reward(
       >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
       [2.0, 0.0]
     """
-    reduction_for(objective)
     if isinstance(model, IntervalMDP):
         if target is None:
             raise ValueError("total rewards of interval models need a target; give one.")
@@ -177,18 +176,9 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
 
 
 def _earned(model: Model, sparse: SparseMDP, reward: Reward) -> Floats:
-    if is_sparse(model):
-        return choice_reward(sparse, reward)
-    if reward is None or isinstance(reward, str | Rewards):
+    if not is_sparse(model) and (reward is None or isinstance(reward, str | Rewards)):
         raise ValueError(f"reward={reward!r}; only a SparseMDP has named rewards: give an array.")
-    reward = np.asarray(reward, np.float64)
-    states = model.state_shape
-    if reward.shape == states:
-        return reward.ravel()[sparse.host.state]
-    require_shape("reward", reward, (*states, cast(ActionModel, model).num_actions))
-    flat = reward.reshape(sparse.num_states, -1)
-    result: Floats = flat[sparse.host.state, np.asarray(sparse.action)]
-    return result
+    return choice_reward(sparse, row_reward(model, sparse, reward))
 
 
 # --- inside jit and over a mesh -------------------------------------------------------------------

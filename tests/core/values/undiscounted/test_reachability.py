@@ -348,7 +348,7 @@ def test_errors_name_the_argument(cases):
         jl.reachability_probability(mdp, np.zeros(5, bool))
     with pytest.raises(ValueError, match=r"of state numbers, np.isin\(np.arange\(6\), \[3\]\)"):
         jl.reachability_probability(mdp, [3])
-    with pytest.raises(ValueError, match="objective='best'; it must be"):
+    with pytest.raises(ValueError, match="objective='best'; choose"):
         jl.reachability_probability(mdp, np.zeros(6, bool), objective="best")
     with pytest.raises(ValueError, match=r"policy has shape \(2,\)"):
         jl.reachability_probability(mdp, np.zeros(6, bool), policy=jnp.zeros(2, int))
