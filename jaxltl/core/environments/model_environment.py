@@ -58,8 +58,9 @@ def model_environment(
         sparse, model = model, to_padded(model)
         if isinstance(reward, str | Rewards):
             reward = choice_reward(sparse, reward)
-        if np.shape(reward) == (sparse.num_rows,) != (sparse.num_states,):
-            reward = pad_rows(sparse, validation.float_array("reward", reward))
+        rows = None if reward is None else np.asarray(reward)
+        if rows is not None and rows.shape == (sparse.num_rows,) != (sparse.num_states,):
+            reward = pad_rows(sparse, validation.float_array("reward", rows))
     if not isinstance(model, MDP | DenseMDP):
         raise ValueError(
             f"model_environment: {type(model).__name__} is no world; simulate the MDP under it, and "

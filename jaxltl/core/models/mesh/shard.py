@@ -16,6 +16,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP, StateLayout, state_layout
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model, PyTree
@@ -128,7 +129,7 @@ def shard(
         )
 
     # An action that is available nowhere has no rows, but a column in rewards and policies.
-    num_actions = 1 if isinstance(model, SparseMDP) else model.num_actions
+    num_actions = model.num_actions if isinstance(model, MDP | DenseMDP) else 1
     layout = state_layout(host.num_states, mesh, axis)._replace(order=ordered)
     return _assembled(part, layout, sparse.propositions, num_actions)
 

@@ -42,18 +42,18 @@ def row_reward(model: Model, sparse: SparseMDP, reward: Reward) -> Reward:
     """A reward ``[S]``, ``[S, A]`` or ``[S, A, K]`` of a padded model, expected on rows of its sparse form."""
     if isinstance(base_model(model), SparseMDP) or isinstance(reward, str | Rewards | None):
         return reward
-    reward = validation.float_array("reward", reward)
-    if reward.shape == model.state_shape:
-        return Rewards(state=reward.ravel())
+    earned = validation.float_array("reward", reward)
+    if earned.shape == model.state_shape:
+        return Rewards(state=earned.ravel())
     padded = cast(SuccessorModel, model)
     actions = (*model.state_shape, padded.num_actions)
-    if reward.shape == (*actions, padded.num_successors):
+    if earned.shape == (*actions, padded.num_successors):
         weight = np.asarray(padded.successor_probability, np.float64)
-        reward = (weight * np.where(weight > 0, reward, 0)).sum(-1)
-    if reward.shape in ((sparse.num_rows,), (sparse.num_transitions,)):
-        return reward
-    require_shape("reward", reward, actions)
-    pairs = reward.reshape(sparse.num_states, -1)
+        earned = (weight * np.where(weight > 0, earned, 0)).sum(-1)
+    if earned.shape in ((sparse.num_rows,), (sparse.num_transitions,)):
+        return earned
+    require_shape("reward", earned, actions)
+    pairs = earned.reshape(sparse.num_states, -1)
     return Rewards(choice=pairs[sparse.host.state, np.asarray(sparse.action)])
 
 

@@ -124,9 +124,6 @@ def with_definitions(
     return replace(model, nominal=more) if isinstance(model, IntervalMDP) else more
 
 
-_NUMBERS = ("value", "lower", "upper")
-
-
 def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
     """The aggregate of an answer over its states; ``states`` are -1 if it is of no single one."""
     kind, count = prop.aggregate, answer.states.size
@@ -149,11 +146,12 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
             _number(prop, whole, (end(lower), end(value), end(upper)), tolerance)
             for end in (np.min, np.max)
         ]
-        parts = (np.concatenate([getattr(x, key) for x in ends]) for key in _NUMBERS)
         return whole._replace(
             states=np.array([-1, -1]),
+            value=np.concatenate([x.value for x in ends]),
+            lower=np.concatenate([x.lower for x in ends]),
+            upper=np.concatenate([x.upper for x in ends]),
             status=max(x.status for x in ends),
-            **dict(zip(_NUMBERS, parts, strict=True)),
         )
     divisor = count if kind == "avg" else 1
     # The sum of fsum is the nearest double.
