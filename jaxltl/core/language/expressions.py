@@ -6,6 +6,7 @@ import math
 import operator as op
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cache, reduce
 from typing import Any, Literal
 
@@ -13,11 +14,12 @@ import numpy as np
 
 
 Type = Literal["bool", "int", "double"]
-Value = bool | int | float
+Value = bool | int | float | Fraction  # fractions in exact arithmetic alone
 
 MAX_DEPTH = 150  # of a tree, also after formulas are substituted: traversals are recursive
 MAX_SIZE = 200_000  # nodes, counted as if nothing were shared
 MAX_INTEGER = 2**53  # integers up to which every operation on arrays is exact
+_MAX_BITS = 20_000  # of powers of fractions
 FUNCTIONS = {  # the least and the most numbers of arguments
     **dict.fromkeys(("min", "max"), (1, MAX_SIZE)),
     **dict.fromkeys(("floor", "ceil", "round"), (1, 1)),
@@ -297,6 +299,11 @@ def _power(a: Any, b: Any) -> Any:
         if abs(a) > 1 and b * math.log2(abs(a)) > 54:
             raise ValueError("it is larger than 2^53")
         return a**b
+    if isinstance(a, Fraction) and not isinstance(b, float) and b == math.floor(b):
+        exponent = int(b)
+        size = max(a.numerator.bit_length(), a.denominator.bit_length())
+        if abs(exponent) * size <= _MAX_BITS:
+            return a**exponent
     return math.pow(a, b)
 
 

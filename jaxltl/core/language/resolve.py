@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
+from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeVar, cast
 
@@ -60,9 +61,17 @@ def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Pr
     """The program of a syntax tree; arguments, result and errors as of :func:`read_program`."""
     values = {key: constant_value(key, value) for key, value in (constants or {}).items()}
     try:
-        return _Resolver(syntax, values).program()
+        program = resolved(syntax, values)
     except LanguageError as error:
         raise syntax.source.located(error) from None
+    return replace(program, syntax=syntax, given=dict(constants or {}))
+
+
+def resolved(
+    syntax: Syntax, values: Mapping[str, Value], real: Callable[[int], float | Fraction] = float
+) -> Program:
+    """The program of a syntax tree, whose integers become `real` in constants of type double."""
+    return _Resolver(syntax, values, real).program()
 
 
 def constant_value(name: str, value: object) -> Value:
@@ -84,17 +93,17 @@ def constant_value(name: str, value: object) -> Value:
     return value
 
 
-def _changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None) -> Tree:
+def changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None) -> Tree:
     """Applies a function to the expressions of a tree, and renames its actions and variables."""
     result: object = tree
     if isinstance(tree, Expression):
         result = change(tree)
     elif isinstance(tree, tuple):
-        result = tuple([_changed(x, change, names) for x in tree])
+        result = tuple([changed(x, change, names) for x in tree])
     elif isinstance(tree, str):
         result = (names or {}).get(tree, tree)
     elif is_dataclass(tree) and not isinstance(tree, type):
-        parts = {f.name: _changed(getattr(tree, f.name), change, names) for f in fields(tree)}
+        parts = {f.name: changed(getattr(tree, f.name), change, names) for f in fields(tree)}
         result = type(tree)(**parts)
     return cast(Tree, result)
 
@@ -102,8 +111,13 @@ def _changed(tree: Tree, change: Change, names: Mapping[str, str] | None = None)
 class _Resolver:
     """Stages of the resolution; each method is one stage."""
 
-    def __init__(self, syntax: Syntax, values: Mapping[str, Value]) -> None:
-        self.syntax, self.given = syntax, values
+    def __init__(
+        self,
+        syntax: Syntax,
+        values: Mapping[str, Value],
+        real: Callable[[int], float | Fraction],
+    ) -> None:
+        self.syntax, self.given, self.real = syntax, values, real
         self.table = {c.name: c for c in syntax.constants}
 
     def program(self) -> Program:
@@ -111,7 +125,7 @@ class _Resolver:
         formulas = _expanded(syntax.formulas, "formula", {})
         expand = _substitution(formulas)
         modules = self.renamed(
-            [_changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules], formulas
+            [changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules], formulas
         )
         self.check_names(modules)
         constants, known = self.constant_values(expand)
@@ -119,10 +133,10 @@ class _Resolver:
         labels = _expanded(quoted, "label", known)
         fold = _substitution(known | labels)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
-        modules = [_changed(m, fold) for m in modules]
-        variables = [self.variable(_changed(d, both), None) for d in syntax.variables]
+        modules = [changed(m, fold) for m in modules]
+        variables = [self.variable(changed(d, both), None) for d in syntax.variables]
         variables += [self.variable(d, i) for i, m in enumerate(modules) for d in m.declarations]
-        rewards = _changed(_numbered(syntax.rewards), both)
+        rewards = changed(_numbered(syntax.rewards), both)
         used: set[str] = set()
         for e in (
             *(e for m in modules for c in m.commands for e in c.expressions),
@@ -193,7 +207,7 @@ class _Resolver:
             else:
                 e = literal(self.given[name])
             if e.is_literal:
-                values[name] = _typed(table[name], e.value)
+                values[name] = _typed(table[name], e.value, self.real)
                 e = literal(values[name])
             for missing in sorted(names_in(e) & table.keys()):
                 if types[name] != "double" or types[missing] != "double":
@@ -259,14 +273,14 @@ def _no_value(name: str) -> str:
     )
 
 
-def _typed(constant: Constant, value: object) -> Value:
+def _typed(constant: Constant, value: object, real: Callable[[int], float | Fraction]) -> Value:
     """A value of a constant's type."""
-    assert isinstance(value, int | float)
+    assert isinstance(value, int | float | Fraction)
     actual = value_type(value)
-    if constant.type == "double" and actual == "int":
-        return float(value)
+    if isinstance(value, int) and constant.type == "double" and actual == "int":
+        return real(value)
     is_argument = constant.expression is None
-    if is_argument and constant.type == "int" and isinstance(value, float) and value.is_integer():
+    if is_argument and constant.type == "int" and _is_whole(value):
         return int(value)
     if actual != constant.type:
         raise LanguageError(
@@ -274,6 +288,10 @@ def _typed(constant: Constant, value: object) -> Value:
             f"the constant {constant.name} is {value}, and its type {constant.type}.",
         )
     return value
+
+
+def _is_whole(value: Value) -> bool:
+    return isinstance(value, float | Fraction) and value == math.floor(value)
 
 
 def _substitution(names: Mapping[str, Expression]) -> Change:
@@ -320,7 +338,7 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
                 renaming.place,
                 f"the copy {renaming.name} does not rename {d.name}, a variable of {base.name}.",
             )
-    copy = _changed(base, rename, names)
+    copy = changed(base, rename, names)
     placed = tuple(replace(d, place=renaming.place) for d in copy.declarations)
     return replace(copy, name=renaming.name, declarations=placed, place=renaming.place)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -180,6 +181,7 @@ class Program:
       rewards: the reward structures.
       initial: the condition of the ``init`` block, or None.
       players: the players of an smg.
+      syntax, given: the syntax tree, and the values that were given for its constants.
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
@@ -200,6 +202,8 @@ class Program:
     rewards: tuple[RewardStructure, ...]
     initial: Expression | None
     players: tuple[Player, ...]
+    syntax: Syntax | None = field(default=None, compare=False, repr=False)
+    given: Mapping[str, object] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def types(self) -> dict[str, Type]:

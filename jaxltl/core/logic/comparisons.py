@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,6 +20,8 @@ from jaxltl.core.language.expressions import (
     names_in,
     type_of,
 )
+from jaxltl.core.language.exact import exact_constant, exact_program
+from jaxltl.core.language.resolve import constant_value
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
 
@@ -89,6 +91,7 @@ def _undefined(expression: Expression) -> list[Expression]:
     return [*conditions, expression] if expression.operator in ("/", "log", "pow") else conditions
 
 
+RationalNames = tuple[dict[str, Expression], dict[str, Value]]
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
 
 
@@ -102,6 +105,7 @@ class Definitions:
       variables: the variables of the model.
       rewards: the names of the reward structures in their order, for ``R{2}``.
       constant_values: values of constants that a property file declares without one.
+      rational: the rational values of the names, and those of the constants of a property file.
 
     Example:
       >>> sorted(Definitions(variables=("x", "y")).known)
@@ -112,6 +116,12 @@ class Definitions:
     variables: tuple[str, ...] = ()
     rewards: tuple[str, ...] = ()
     constant_values: Mapping[str, Value] = field(default_factory=dict)
+    rational: Callable[[], RationalNames] = field(default=lambda: ({}, {}), repr=False)
+
+    @cached_property
+    def rational_names(self) -> RationalNames:
+        """The result of `rational`."""
+        return self.rational()
 
     @cached_property
     def known(self) -> frozenset[str]:
@@ -120,13 +130,14 @@ class Definitions:
 
 
 def program_definitions(
-    program: Program, constant_values: Mapping[str, Value] | None = None
+    program: Program, constant_values: Mapping[str, object] | None = None
 ) -> Definitions:
     """The constants, formulas, variables and rewards of a program, for ``parse_properties``.
 
     Args:
       program: of ``jaxltl.io.read_program``.
-      constant_values: values of constants that the text of properties declares without one.
+      constant_values: values of constants that the text of properties declares without one:
+        numbers, Booleans or texts such as ``"1/3"``.
 
     Returns:
       :class:`Definitions`.
@@ -138,9 +149,20 @@ def program_definitions(
       ['N', 'x']
     """
     names = {name: literal(value) for name, value in program.constants.items()}
+    values = {name: constant_value(name, x) for name, x in (constant_values or {}).items()}
+
+    def rational() -> RationalNames:
+        numbers = exact_program(program)
+        exact: dict[str, Expression] = {}
+        if numbers is not None:
+            exact |= {name: literal(value) for name, value in numbers.constants.items()}
+            exact |= numbers.formulas
+        return exact, {name: exact_constant(x) for name, x in (constant_values or {}).items()}
+
     return Definitions(
         names | program.formulas,
         tuple(v.name for v in program.variables),
         tuple(r.name for r in program.rewards),
-        constant_values or {},
+        values,
+        rational,
     )

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import bisect
+import math
 import re
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
-from jaxltl.core.language.expressions import Expression, LanguageError, literal, substitute
+from jaxltl.core.language.exact import exact_tree, exact_value
+from jaxltl.core.language.expressions import (
+    TRUE,
+    Expression,
+    LanguageError,
+    literal,
+    names_in,
+    substitute,
+)
 from jaxltl.core.language.parser import ADDITIVE, ExpressionParser
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.ltl import pointed
 
 
+_OPERATORS = ("+", "-", "*", "/", "^")  # that continue a number as an expression
 _MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
 
 
@@ -64,6 +74,8 @@ class TokenStream:
         self.starts = [token.start for token in self.tokens]
         self.names = dict(known.names)
         self.labels: dict[str, Comparison] = {}  # that the text defines
+        self.rational: dict[str, Expression] = {}  # constants of the text, in exact arithmetic
+        self.tree = TRUE  # the last expression, before substitution
 
     @property
     def token(self) -> Token:
@@ -109,30 +121,48 @@ class TokenStream:
         return re.sub(r'\\(["\\])', r"\1", self.take().text[1:-1])
 
     def number(self, signed: bool = False) -> Fraction:
+        """A number, a fraction of two, or an expression of constants, in exact arithmetic."""
+        start, before = self.token, self.place
         sign = -1 if signed and self.accept("-") else 1
-        value = self.plain_number()
-        if self.accept("/"):
-            start = self.token
-            divisor = self.plain_number()
-            self.require(divisor != 0, "a divisor other than 0", start)
-            value /= divisor
-        return sign * value
+        is_plain = self.token.kind == "number"
+        if is_plain:
+            value = self.plain_number()
+            if self.token.text == "/" and self.tokens[self.place + 1].kind == "number":
+                self.take()
+                place = self.token
+                divisor = self.plain_number()
+                self.require(divisor != 0, "a divisor other than 0", place)
+                value /= divisor
+            if self.token.text not in _OPERATORS:
+                return sign * value
+        self.place = before
+        begins = is_plain or sign < 0 or start.kind == "word" or start.text == "("
+        self.require(begins, "a number")
+        tree = self.expression(ADDITIVE)
+        is_number = tree.is_literal and not isinstance(tree.value, bool)
+        self.require(is_number, "a number", start)
+        exact = exact_value(*self.rational_tree())
+        if exact is None:
+            self.require(math.isfinite(cast(float, tree.value)), "a finite number", start)
+            exact = Fraction(str(tree.value))
+        return exact
 
     def plain_number(self) -> Fraction:
-        """A number, or an expression of constants."""
-        start, before = self.token, self.place
-        follows = self.tokens[min(self.place + 1, len(self.tokens) - 1)].text
-        is_plain = start.kind == "number" and follows not in ("+", "-", "*", "^")
-        if not is_plain and (start.kind in ("number", "word") or start.text == "("):
-            value = self.expression(ADDITIVE)
-            if value.is_literal and not isinstance(value.value, bool):
-                return Fraction(str(value.value))
-            self.place = before
+        """A decimal."""
+        start = self.token
         self.require(start.kind == "number", "a number")
         exponent = re.split("[eE]", start.text)[1:] or ["0"]
         short = len(start.text) <= _MAX_DIGITS and abs(int(exponent[0])) <= _MAX_DIGITS
         self.require(short, f"a number of at most {_MAX_DIGITS} digits")
         return Fraction(self.take().text)
+
+    def rational_tree(self) -> tuple[Expression, dict[str, Expression]]:
+        """The last expression and the names in it, both in exact arithmetic."""
+        used = names_in(self.tree)
+        names = {name: exact_tree(e) for name, e in self.names.items() if name in used}
+        if not used <= self.rational.keys():
+            names |= self.known.rational_names[0]
+        return exact_tree(self.tree, self.text), names | self.rational
 
     def steps(self) -> int:
         start = self.token
@@ -148,21 +178,27 @@ class TokenStream:
         type_ = (self.accept("int", "double", "bool") or "int") if kind == "const" else None
         start = self.token
         name = self.quoted() if kind == "label" else self.take().text
+        exact: Fraction | None
         fresh = start.kind in ("quoted", "word") and name not in self.names
         self.require(fresh, "a name that is not declared yet", start)
         if kind == "const" and not self.accept("="):
             wanted = f"a value of {name}, here or as --const {name}=..."
             self.require(name in self.known.constant_values, wanted, start)
             value = literal(self.known.constant_values[name])
+            number = self.known.rational_names[1].get(name)
+            exact = None if number is None or isinstance(number, bool) else Fraction(number)
         else:
             if kind != "const":
                 self.expect("=")
             value = self.expression(0)
             constant = kind != "const" or value.is_literal
             self.require(constant, "an expression of constants", start)
+            exact = exact_value(*self.rational_tree()) if kind == "const" else None
         if kind == "label":
             self.labels[name] = Comparison(f'"{name}"', value)
         else:
+            if exact is not None:
+                self.rational[name] = literal(exact if type_ == "double" else int(exact))
             if type_ == "double" and value.is_literal and isinstance(value.value, int):
                 value = literal(float(value.value))
             self.names[name] = value
@@ -172,7 +208,7 @@ class TokenStream:
         """An expression with constants and formulas substituted."""
         try:
             parser = ExpressionParser(self.text, self.token.start)
-            tree = parser.expression(level)
+            self.tree = tree = parser.expression(level)
             meanings = {f'"{name}"': label.expression for name, label in self.labels.items()}
             tree = substitute(tree, {**self.names, **meanings})
         except LanguageError as error:

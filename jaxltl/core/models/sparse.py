@@ -18,6 +18,7 @@ from numpy.typing import DTypeLike
 from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.models import facts
+from jaxltl.core.models.exact_numbers import NumberSource
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce
@@ -94,6 +95,8 @@ class SparseMDP:
       valuation: values of named variables in each state, ``[S]`` each.
       propositions: the P names; static.
       action_names: names of the actions by number, or empty; static.
+      numbers: the rational numbers that the probabilities and rewards stand for, which decide
+        thresholds of small models; static.
 
     Example:
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2], [1, 0.5, 0.5, 1, 1],
@@ -113,6 +116,7 @@ class SparseMDP:
     valuation: dict[str, Array] = struct.field(default_factory=dict)
     propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
     action_names: tuple[str, ...] = struct.field(pytree_node=False, default=())
+    numbers: NumberSource = struct.field(pytree_node=False, default=NumberSource())
 
     @property
     def num_states(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.language.expressions import Expression, LanguageError, compile_expressions, literal
 from jaxltl.core.language.syntax import Program, RewardItem
+from jaxltl.core.models.exact_numbers import NumberSource
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
@@ -92,20 +94,28 @@ def build_model(
     make: Any = interval_rows if len(ends) == 2 else make_sparse
     with validation.errors_in(f"{program.source.name!r}: "):
         model: SparseMDP | IntervalMDP = make(*starts, *ends, rewards=rewards, **rows.annotations)
+        if isinstance(model, SparseMDP) and rows.owner is None:
+            from jaxltl.core.programs.exact import rational_numbers  # which builds programs
+
+            return replace(model, numbers=NumberSource(partial(rational_numbers, program)))
         if rows.owner is None:
             return model
         return make_game(model, np.isin(rows.owner, _players(program, coalition)))
 
 
 def build_rows(
-    program: Program, *, max_states: int = MAX_STATES, progress: Progress | None = None
+    program: Program,
+    *,
+    max_states: int = MAX_STATES,
+    progress: Progress | None = None,
+    weights: Numbers | None = None,
 ) -> Rows:
     """Rows of the model of a program, also of one with parameters; see :func:`build_model`."""
     max_states = validation.integer("max_states", max_states, least=1, limit=2**31 - 2)
     layout = make_layout(program.variables)
-    weights: Numbers = (
-        Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()
-    )
+    if weights is None:
+        intervals = Intervals() if program.has_intervals else Numbers()
+        weights = Functions() if program.parameters else intervals
     try:
         initial = layout.packed(*initial_columns(program, max_states))
         explored = Search(program, layout, weights, max_states).run(initial, progress)

@@ -136,7 +136,11 @@ class Functions(Numbers):
         return np.array(numbers, np.int64)[inverse.ravel()]
 
     def divided(self, weight: Weight, numbers: Integers) -> Weight:
-        shares = [self._number(literal(1 / n)) for n in range(1, int(numbers.max()) + 1)]
+        one = literal(1)
+        shares = [
+            self._number(Expression("/", (one, literal(n))) if n > 1 else one)
+            for n in range(1, int(numbers.max()) + 1)
+        ]
         return self.product(weight, np.array(shares)[numbers - 1])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -21,6 +20,7 @@ from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward, SparseMDP
+from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.average.average_reward import average_reward
@@ -39,7 +39,7 @@ from jaxltl.core.values.properties.answers import (
     with_definitions,
 )
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
-from jaxltl.core.values.properties.exact_reachability import Bounds, exact_reachability, exact_steps
+from jaxltl.core.values.properties.exact_thresholds import exact_values, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.undiscounted.reachability import (
     avoidance_probability,
@@ -56,7 +56,10 @@ TOLERANCE_SHARES = (
     1e-3,
     1e-6,
 )  # shares of the tolerance with which an open threshold is tried
-_EXACT = 1e-10  # tolerances up to which small chains are solved in rational arithmetic
+_EXACT = 1e-10  # tolerances up to which tiny models are solved in rational arithmetic
+_FEW = 32  # rows of a tiny model that leave their state
+_MARGIN = 1e-6  # relative difference of values of doubles and of the rationals behind them
+_RATIONAL = "rational arithmetic"
 TINY = 1e-12  # absolute width of bounds on rewards that is always accepted
 _AVERAGE = "averages of end components"
 _OTHER = {"max": "min", "min": "max"}
@@ -173,9 +176,13 @@ def solve_property(
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
     tolerance = requested_width(tolerance)
-    solve = partial(_solved, _Query(model, states, prop.text), prop, _aim(model, prop))
+    aim = _aim(model, prop)
+    solve = partial(_solved, _Query(model, states, prop.text), prop, aim)
+    exact = partial(exact_values, model, prop, states, maximize=aim.policy == "max")
     result = solve(width(tolerance))
     if prop.relation is None:
+        if tolerance <= _EXACT and not _is_exact(result) and _is_tiny(model):
+            result = _with_values(result, exact())
         return _answer(prop, states, result, None, width(tolerance))
     verdicts = _verdicts(prop, result)
     for share in TOLERANCE_SHARES[1:]:
@@ -183,6 +190,12 @@ def solve_property(
             break
         result = solve(width(tolerance * share))
         verdicts = _verdicts(prop, result)
+    if None in verdicts or _is_close(model, prop, result):
+        values = exact()
+        if values is not None:
+            assert prop.threshold is not None
+            verdicts = [meets(prop.relation, prop.threshold, x, x) for x in values]
+            result = _with_values(result, values)
     return _answer(prop, states, result, verdicts, tolerance)
 
 
@@ -261,6 +274,41 @@ def _is_exact(result: _Result) -> bool:
     return bool((result.solution.lower == result.solution.upper).all())
 
 
+def _is_tiny(model: SparseMDP | IntervalMDP) -> bool:
+    """True if few choices leave their state."""
+    return int(np.count_nonzero(~_graph(model).host.is_self_loop)) <= _FEW
+
+
+def _with_values(result: _Result, exact: list[Fraction | float] | None) -> _Result:
+    """The result with bounds by rational arithmetic; unchanged for None."""
+    if exact is None:
+        return result
+    lower, upper = np.array([double_bounds(x) for x in exact]).T
+    zero: Array = np.float64(0)
+    converged: Array = np.int32(Status.CONVERGED)
+    solution = replace(
+        result.solution,
+        value=lower,
+        lower=lower,
+        upper=upper,
+        residual=zero,
+        status=converged,
+        method=_RATIONAL,
+    )
+    return result._replace(solution=solution)
+
+
+def _is_close(model: SparseMDP | IntervalMDP, prop: Property, result: _Result) -> bool:
+    """True if the doubles of a model and the numbers of its source may differ in the verdict."""
+    if isinstance(model, IntervalMDP) or model.numbers.read is None:
+        return False
+    assert prop.threshold is not None
+    threshold = float(prop.threshold)
+    margin = _MARGIN * max(abs(threshold), _MARGIN)
+    ends = np.asarray(result.solution.lower), np.asarray(result.solution.upper)
+    return bool(any((np.abs(x - threshold) <= margin).any() for x in ends))
+
+
 def _verdicts(prop: Property, result: _Result) -> list[bool | None]:
     assert prop.relation is not None and prop.threshold is not None
     lower, upper = np.asarray(result.solution.lower), np.asarray(result.solution.upper)
@@ -270,7 +318,9 @@ def _verdicts(prop: Property, result: _Result) -> list[bool | None]:
     ]
 
 
-def meets(relation: str, threshold: Fraction, lower: float, upper: float) -> bool | None:
+def meets(
+    relation: str, threshold: Fraction, lower: float | Fraction, upper: float | Fraction
+) -> bool | None:
     """Truth of a threshold for all numbers between two bounds; None if it differs."""
     if lower != lower or upper != upper:
         return None
@@ -392,21 +442,6 @@ class _Query(NamedTuple):
         solution = replace(solution, method=solution.method or method)
         return _Result(at_states(solution, self.states), strategy)
 
-    def exact(
-        self, result: _Result, tolerance: float, solve: Callable[..., Bounds | None]
-    ) -> _Result:
-        """The solution with bounds by rational arithmetic, if these are asked for and possible."""
-        if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
-            return result
-        bounds = solve(self.model.host)
-        if bounds is None:
-            return result
-        lower, upper = (x[self.states] for x in bounds)
-        solution = replace(
-            result.solution, value=lower, lower=lower, upper=upper, method="rational arithmetic"
-        )
-        return result._replace(solution=solution)
-
     def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
         """The probability of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
@@ -422,8 +457,7 @@ class _Query(NamedTuple):
             case "X":
                 target = self.where(right)
                 solution = bounded.next_probability(self.model, target, **aim.directions)
-                exact = partial(exact_steps, target=target, objective=aim.policy)
-                return self.exact(self.result(solution), tolerance, exact)
+                return self.result(solution)
             case "F":
                 return self.until(TRUE, right, aim, tolerance)
             case "U":
@@ -490,16 +524,7 @@ class _Query(NamedTuple):
             solution = reachability_probability(
                 self.model, target, stay=stay, tolerance=tolerance, **aim.directions
             )
-        policy = None if self.model.is_chain else np.asarray(solution.policy)
-        exact = partial(
-            exact_reachability,
-            target=target,
-            stay=stay,
-            policy=policy,
-            objective=(aim.opposite if complement else aim).policy,
-            complement=complement,
-        )
-        return self.exact(self.result(solution), tolerance, exact)
+        return self.result(solution)
 
     def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
         result = optimal_satisfaction(
@@ -517,9 +542,7 @@ class _Query(NamedTuple):
             path, aim = replace(path, operator="U", left=negated, right=~path.right), aim.opposite
         target, stay = self.where(path.right), self.where(path.left)
         if path.reward is not None:
-            assert path.limit is not None
-            # Rewards are counted in units of more than 1e-9, so this is just below the limit.
-            limit = float(path.limit - Fraction(1, 10**9) * path.strict)
+            limit = reward_limit(path)
             model = _without_intervals(self.model, self.text, "bounds on rewards")
             solution = bounded.reward_bounded_reachability(
                 model, target, path.reward or None, limit, stay=stay, objective=aim.policy
@@ -535,20 +558,16 @@ class _Query(NamedTuple):
             return self.probability(
                 ~unfolded(path) if complement else unfolded(path), asked, tolerance
             )
-        exact = partial(
-            exact_steps, target=target, stay=stay, num_steps=path.upper, objective=aim.policy
-        )
         if complement and isinstance(tolerance, RelativeTolerance):
             avoided = bounded.bounded_avoidance(
                 self.model, target, path.upper, stay=stay, objective=asked.policy
             )
             if avoided is not None:
-                exact = partial(exact, complement=True)
-                return self.exact(self.result(avoided, by="steps"), tolerance, exact)
+                return self.result(avoided, by="steps")
         solution = bounded.bounded_reachability(
             self.model, target, path.upper, stay=stay, **aim.directions
         )
-        result = self.exact(self.result(solution, by="steps"), tolerance, exact)
+        result = self.result(solution, by="steps")
         return _opposite(result) if complement else result
 
 

@@ -20,7 +20,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief, count, nested_repr
-from jaxltl.core.sparse.graph.accepting import accepting_region
+from jaxltl.core.sparse.graph.accepting import AcceptingRegion, accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
@@ -145,39 +145,56 @@ def _best(
     depth: int = 0,
 ) -> tuple[Solution, np.ndarray]:
     """The optimal probability from all states of a product, and the rows that attain it."""
-    automaton = reader.automaton
-    opposite = automaton.is_safety or (not automaton.has_final_states and objective == "min")
-    goal: np.ndarray = (reader.rejecting if opposite else reader.accepting)[product.memory]
-    visiting = None
-    if not automaton.has_final_states:
-        entry_letter = product.entry_letter(reader.letter, reader.on_entry)
-        source = product.host.state[product.host.row]
-        priority = automaton.priority[product.memory[source], entry_letter] + opposite
-        # Absorbing states have their verdict, and no other end component.
-        priority[product.still[source]] = 1
-        visiting = accepting_region(product.host, priority)
-        goal = goal | visiting.region
-        aim = "max"
-    else:
-        aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
+    problem = _problem(product, reader, objective)
     whole = sparse_mdp_of_product(product)
     requested = default_tolerance(whole) if tolerance is None else as_width(tolerance)
     relative = isinstance(requested, RelativeTolerance)
     # One minus a probability near one has no relative accuracy.
+    avoids = problem.complement and relative
     solve, maximize = (
-        (avoidance, aim == "min") if opposite and relative else (reachability, aim == "max")
+        (avoidance, not problem.maximize) if avoids else (reachability, problem.maximize)
     )
     solution = solution_from_enclosure(
         whole,
         whole,
-        solve(product.host, goal, maximize=maximize, tolerance=requested, depth=depth),
+        solve(product.host, problem.goal, maximize=maximize, tolerance=requested, depth=depth),
         float(requested),
         relative=relative,
     )
     row = np.asarray(solution.policy)
-    if visiting is not None:
-        row = np.where(visiting.region, visiting.row, row)
-    return (complement_event(solution) if opposite and not relative else solution), row
+    if problem.visiting is not None:
+        row = np.where(problem.visiting.region, problem.visiting.row, row)
+    return (complement_event(solution) if problem.complement and not relative else solution), row
+
+
+class ReachabilityProblem(NamedTuple):
+    """Satisfaction as the probability of reaching states of a product, or of its complement."""
+
+    goal: np.ndarray  # bool[N]
+    maximize: bool
+    complement: bool
+    visiting: AcceptingRegion | None  # of a formula that is not decided by a prefix
+
+
+def reachability_problem(result: Satisfaction, objective: str) -> ReachabilityProblem:
+    """The reachability problem that a satisfaction probability was solved by."""
+    reader = _Reader(result.automaton, result.letter, result.label_on == "entry")
+    return _problem(result.product, reader, objective)
+
+
+def _problem(product: SparseProduct, reader: _Reader, objective: str) -> ReachabilityProblem:
+    automaton = reader.automaton
+    opposite = automaton.is_safety or (not automaton.has_final_states and objective == "min")
+    goal: np.ndarray = (reader.rejecting if opposite else reader.accepting)[product.memory]
+    if automaton.has_final_states:
+        return ReachabilityProblem(goal, (objective == "max") != opposite, opposite, None)
+    entry_letter = product.entry_letter(reader.letter, reader.on_entry)
+    source = product.host.state[product.host.row]
+    priority = automaton.priority[product.memory[source], entry_letter] + opposite
+    # Absorbing states have their verdict, and no other end component.
+    priority[product.still[source]] = 1
+    visiting = accepting_region(product.host, priority)
+    return ReachabilityProblem(goal | visiting.region, True, opposite, visiting)
 
 
 def product_satisfaction(

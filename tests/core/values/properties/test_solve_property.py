@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.models.exact_numbers import exact_numbers
 from jaxltl.core.models.sparse import Rewards, make_sparse
+from jaxltl.core.sparse.exact import total
+from jaxltl.core.sparse.exact.bounded import until_within
+from jaxltl.core.sparse.exact.model import Work, double_bounds
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties import solve_property as module
-from jaxltl.core.values.properties.exact_reachability import (
-    exact_reachability,
-    exact_steps,
-)
 from jaxltl.core.values.properties.solve_property import meets, solve_property
 from tests.core.values.undiscounted.test_sparse_satisfaction import random_sparse
 from tests.storm_oracle import storm_model, storm_values
@@ -333,7 +333,7 @@ def test_thresholds_that_are_met_with_equality_are_decided_in_small_chains():
         for path in ('F "a"', 'G !"a"', '(!"a") U "a"'):
             found = jl.solve_property(coin, f"P{relation}0.5 [ {path} ]")
             assert found.holds == [holds] and found.status == jl.Status.CONVERGED, path
-    # 1/3 is not a double: bounds stay apart, and nothing is guessed.
+    # 1/3 is not a double: bounds stay apart, and the model is solved in fractions.
     retry = jl.make_sparse(
         None,
         [0, 3, 4, 5],
@@ -343,7 +343,8 @@ def test_thresholds_that_are_met_with_equality_are_decided_in_small_chains():
         label={"a": [1]},
     )
     third = jl.solve_property(retry, 'P>=1/3 [ F "a" ]')
-    assert third.holds == [None] and third.lower < 1 / 3 + 1e-15 and third.status != 0
+    assert third.holds == [True] and third.status == 0
+    assert third.lower < Fraction(1, 3) < third.upper == np.nextafter(third.lower, 1)
 
 
 @pytest.mark.parametrize(
@@ -374,15 +375,16 @@ def test_thresholds_of_small_mdps_are_decided(path, least, most):
         assert found.lower == found.upper == threshold
 
 
-def test_a_policy_that_is_not_optimal_decides_nothing():
+def exact_bounds(values):
+    return np.array([double_bounds(x) for x in values]).T
+
+
+def test_a_minimum_is_that_of_a_policy_that_may_wait_for_ever():
     """State 0 may wait for ever, so that 1 solves the equation of the minimum, which is 0."""
     wait = jl.make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1.0] * 3)
-    target, (stay, go) = np.array([False, True]), (np.array([0, 2]), np.array([1, 2]))
-    assert exact_reachability(wait.host, target, None, stay, "max") is None
-    assert exact_reachability(wait.host, target, None, go, "min") is None
-    for policy, objective, value in ((go, "max", 1), (stay, "min", 0)):
-        lower, upper = exact_reachability(wait.host, target, None, policy, objective)
-        assert lower[0] == upper[0] == value
+    target, mdp = np.array([False, True]), exact_numbers(wait).mdp
+    assert total.reachability(mdp, target, None, True, Work()) == [1, 1]
+    assert total.reachability(mdp, target, None, False, Work()) == [0, 1]
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -400,12 +402,14 @@ def test_exact_bounds_of_random_mdps_agree_with_the_solvers(seed):
         until = jl.reachability_probability(model, target, stay=stay, objective=objective)
         steps = jl.values.bounded_reachability(model, target, 4, stay=stay, objective=objective)
         once = jl.values.next_probability(model, target, objective=objective)
-        for solution, bounds in (
-            (until, exact_reachability(model.host, target, stay, until.policy, objective)),
-            (steps, exact_steps(model.host, target, objective, stay=stay, num_steps=4)),
-            (once, exact_steps(model.host, target, objective)),
+        mdp, largest = exact_numbers(model).mdp, objective == "max"
+        free, entered = [Fraction(0)] * len(mdp.rows), [Fraction(int(x)) for x in target]
+        for solution, values in (
+            (until, total.reachability(mdp, target, stay, largest, Work())),
+            (steps, until_within(mdp, target, stay, 4, largest, Work())),
+            (once, mdp.backup(free, entered, largest, Work())),
         ):
-            assert bounds is not None
+            bounds = exact_bounds(values)
             assert (solution.lower <= bounds[1]).all() and (bounds[0] <= solution.upper).all()
             assert (np.nextafter(bounds[0], 2) >= bounds[1]).all()
 
@@ -422,7 +426,8 @@ def test_rational_arithmetic_agrees_with_the_solver(seed):
     chain = jl.make_sparse(None, start, successor, chance)
     target, stay = rng.random(size) < 0.2, rng.random(size) < 0.9
     for within in (None, stay):
-        lower, upper = exact_reachability(chain.host, target, within)
+        mdp = exact_numbers(chain).mdp
+        lower, upper = exact_bounds(total.reachability(mdp, target, within, True, Work()))
         found = jl.reachability_probability(chain, target, stay=within)
         assert (np.nextafter(lower, 2) >= upper).all()
         assert (found.lower <= upper).all() and (lower <= found.upper).all()

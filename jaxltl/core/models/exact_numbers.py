@@ -1,0 +1,152 @@
+"""Rational probabilities and rewards of sparse models, as the source of a model writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
+
+if TYPE_CHECKING:
+    from jaxltl.core.models.sparse import Rewards, SparseMDP
+
+Part = Sequence[Fraction] | None  # of states or of choices
+_DENOMINATOR = 10**6  # of fractions as which doubles are read; chance agreement is below 1e-3
+_CLOSE = 1e-12  # relative difference of a number and its double, after products
+
+
+class Rationals(NamedTuple):
+    """Rational numbers of a model."""
+
+    mdp: ExactMDP
+    rewards: dict[str, tuple[Part, Part]]  # of states and of choices, by name
+
+
+@dataclass(frozen=True, eq=False)
+class NumberSource:
+    """The rational numbers behind the doubles of a model, found on demand.
+
+    All sources are equal, so that models share compiled programs.
+    """
+
+    read: Callable[[SparseMDP], Rationals | None] | None = None  # None: doubles mean themselves
+    # The last model's arrays of successors and probabilities, and their numbers.
+    known: list[tuple[object, object, Rationals]] = field(default_factory=list, repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, NumberSource)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+def exact_numbers(model: SparseMDP) -> Rationals:
+    """The rational numbers of a model: those of its source, where they round to its doubles.
+
+    Otherwise they are the doubles, as rows that are divided by their sums.
+    """
+    read = model.numbers.read
+    if read is None:
+        return _doubles_of(model)
+    for successor, probability, numbers in model.numbers.known:
+        if successor is model.successor and probability is model.probability:
+            return numbers
+    written = read(model)
+    if written is None or not _agrees(written.mdp, model):
+        written = _doubles_of(model)
+    model.numbers.known[:] = [(model.successor, model.probability, written)]
+    return written
+
+
+def _doubles_of(model: SparseMDP) -> Rationals:
+    return Rationals(_normalised(model, [Fraction(x) for x in model.host.probability.tolist()]), {})
+
+
+def decimal_numbers(model: SparseMDP) -> Rationals:
+    """Rows and rewards of a text file, read as fractions and decimals.
+
+    A double stands for the fraction with a denominator of at most 10^6 that rounds to it, else for
+    its shortest decimal; in rows of which these numbers do not sum to one, for itself.
+    """
+    probability = [Fraction(x) for x in model.host.probability.tolist()]
+    for entries in pairs(model.host.entry_start.tolist()):
+        written = [written_number(float(probability[e])) for e in entries]
+        if sum(written) == 1:
+            probability[entries.start : entries.stop] = written
+    rewards = {
+        name: (_written(reward.state), _written(reward.choice))
+        for name, reward in model.rewards.items()
+    }
+    return Rationals(_normalised(model, probability), rewards)
+
+
+def written_number(x: float) -> Fraction:
+    """The fraction or the decimal that a double stands for in a text."""
+    simple = Fraction(x).limit_denominator(_DENOMINATOR)
+    return simple if float(simple) == x else Fraction(repr(x))
+
+
+def exact_reward(
+    model: SparseMDP, numbers: Rationals, reward: Rewards, name: str | None
+) -> list[Fraction]:
+    """Expected rewards of choices; ValueError if some are not finite."""
+    state, choice = numbers.rewards.get(name or "", (None, None))
+    state = _doubles(reward.state) if state is None else state
+    choice = _doubles(reward.choice) if choice is None else choice
+    total = [ZERO] * model.num_rows if choice is None else list(choice)
+    if state is not None:
+        total = [x + state[s] for x, s in zip(total, model.host.state.tolist(), strict=True)]
+    if (transition := _doubles(reward.transition)) is not None:
+        successor = model.host.successor.tolist()
+        for r, entries in enumerate(pairs(model.host.entry_start.tolist())):
+            row = numbers.mdp.rows[r]
+            total[r] += sum((row[successor[e]] * transition[e] for e in entries), ZERO)
+    return total
+
+
+def exact_state_reward(numbers: Rationals, reward: Rewards, name: str | None) -> list[Fraction]:
+    """Rewards of states."""
+    state = numbers.rewards.get(name or "", (None, None))[0]
+    doubles = _doubles(reward.state) if state is None else state
+    assert doubles is not None
+    return list(doubles)
+
+
+def _doubles(values: object) -> Part:
+    return None if values is None else [Fraction(x) for x in np.asarray(values, float).tolist()]
+
+
+def _written(values: object) -> Part:
+    if values is None:
+        return None
+    return [written_number(x) for x in np.asarray(values, float).tolist()]
+
+
+def _normalised(model: SparseMDP, probability: Sequence[Fraction]) -> ExactMDP:
+    """Rows that sum to one, of the probabilities of a model's entries."""
+    successor, rows = model.host.successor.tolist(), []
+    for entries in pairs(model.host.entry_start.tolist()):
+        total = sum((probability[e] for e in entries), ZERO)
+        rows.append({successor[e]: probability[e] / total for e in entries})
+    return ExactMDP(model.host.row_start.tolist(), rows)
+
+
+def _agrees(mdp: ExactMDP, model: SparseMDP) -> bool:
+    """True if the rows are distributions with the support of a model and round to its numbers."""
+    host = model.host
+    starts = host.row_start.tolist(), host.entry_start.tolist()
+    if list(mdp.row_start) != starts[0] or len(mdp.rows) != host.num_rows:
+        return False
+    successor, probability = host.successor.tolist(), host.probability.tolist()
+    for row, entries in zip(mdp.rows, pairs(starts[1]), strict=True):
+        if row.keys() != set(successor[entries.start : entries.stop]) or sum(row.values()) != 1:
+            return False
+        for e in entries:
+            p = row[successor[e]]
+            if not p > 0 or abs(float(p) - probability[e]) > _CLOSE * probability[e]:
+                return False
+    return True

@@ -1,0 +1,1 @@
+"""Values of small Markov chains and MDPs in rational arithmetic."""

@@ -1,0 +1,194 @@
+"""Values of properties of small models in rational arithmetic, which decide every threshold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.labels import is_boolean
+from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
+from jaxltl.core.logic.properties import Property
+from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward, exact_state_reward
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
+from jaxltl.core.sparse.exact import bounded
+from jaxltl.core.sparse.exact.average import average
+from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP, TooLarge, Values, Work, flags
+from jaxltl.core.sparse.exact.total import least_total, reachability, until_end
+from jaxltl.core.sparse.solvers.reward_bounded import in_units
+from jaxltl.core.values.engine.state_quantities import transition_reward
+from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    Satisfaction,
+    reachability_problem,
+    sparse_satisfaction,
+)
+
+MAX_STATES = 1000
+MAX_TRANSITIONS = 10_000
+_WIDTH = 0.01  # of the bounds of the product, of which only the graph is used
+
+
+def exact_values(
+    model: SparseMDP | IntervalMDP, prop: Property, states: np.ndarray, maximize: bool
+) -> list[Fraction | float] | None:
+    """Values at some states, fractions or infinite; None if the model is large or has intervals."""
+    if isinstance(model, IntervalMDP):
+        return None
+    if model.num_states > MAX_STATES or model.num_transitions > MAX_TRANSITIONS:
+        return None
+    try:
+        values = _values(_ExactQuery(model, states, prop.text), prop, maximize)
+    except (TooLarge, OverflowError):  # a reward may be infinite
+        return None
+    return list(values)
+
+
+def _values(query: _ExactQuery, prop: Property, maximize: bool) -> Values:
+    mdp, work, path = query.mdp, query.work, prop.path
+    if prop.operator == "P":
+        assert not isinstance(path, Earned)
+        return query.probability(path, maximize)
+    if isinstance(path, Earned) and path.kind == "instantaneous":
+        assert path.steps is not None
+        structure = reward_structure(query.model, prop.reward)
+        final = exact_state_reward(query.numbers, structure, query.reward_name(prop.reward))
+        free = [ZERO] * len(mdp.rows)
+        return query.at(bounded.earned_within(mdp, free, final, path.steps, maximize, work))
+    reward = query.reward(prop)
+    if prop.operator == "LRA" or path == Earned("average"):
+        return query.at(average(mdp, reward, maximize, work))
+    if isinstance(path, Formula):
+        final_states = dict.fromkeys(flags(query.where(path.operands[0])), ZERO)
+        return query.at(until_end(mdp, reward, final_states, maximize, work))
+    assert isinstance(path, Earned)
+    if path.steps is not None:
+        zero = [ZERO] * mdp.num_states
+        return query.at(bounded.earned_within(mdp, reward, zero, path.steps, maximize, work))
+    return query.at(least_total(mdp, reward, {}, maximize, work))
+
+
+class _ExactQuery:
+    """Values of path formulas at the requested states."""
+
+    def __init__(self, model: SparseMDP, states: np.ndarray, text: str) -> None:
+        self.model, self.states, self.text = model, states, text
+        self.numbers, self.work = exact_numbers(model), Work()
+
+    @property
+    def mdp(self) -> ExactMDP:
+        return self.numbers.mdp
+
+    def at(self, values: Values) -> Values:
+        """The values at the requested states."""
+        return [values[s] for s in self.states.tolist()]
+
+    def where(self, condition: Formula) -> np.ndarray:
+        return states_satisfying(self.model, condition, self.text)
+
+    def reward_name(self, name: str | None) -> str | None:
+        return default_reward(self.model.rewards) if name is None else name
+
+    def reward(self, prop: Property) -> list[Fraction]:
+        """The expected reward of each choice."""
+        if prop.operator == "T":
+            return [ONE] * self.model.num_rows
+        if prop.operator == "LRA":
+            assert isinstance(prop.path, Formula)
+            holds = self.where(prop.path)[self.model.host.state]
+            return [Fraction(int(x)) for x in holds]
+        structure = reward_structure(self.model, prop.reward)
+        return exact_reward(self.model, self.numbers, structure, self.reward_name(prop.reward))
+
+    def probability(self, path: Formula | Bounded, maximize: bool) -> Values:
+        """The probability of a path formula."""
+        if isinstance(path, Bounded):
+            return self.within(path, maximize)
+        if is_boolean(path):
+            return self.at([Fraction(int(x)) for x in self.where(path)])
+        if path.operator == "!":
+            return self.complement(path.operands[0], maximize)
+        if not all(is_boolean(f) for f in path.operands):
+            return self.automaton(path, maximize)
+        first, right = path.operands[0], path.operands[-1]
+        match path.operator:
+            case "X":
+                final = [Fraction(int(x)) for x in self.where(right)]
+                free = [ZERO] * len(self.mdp.rows)
+                return self.at(self.mdp.backup(free, final, maximize, self.work))
+            case "F" | "U":
+                stay = None if path.operator == "F" else self.where(first)
+                target = self.where(right)
+                return self.at(reachability(self.mdp, target, stay, maximize, self.work))
+            case "G":
+                return self.complement(Formula("F", (~right,)), maximize)
+            case "W":
+                return self.complement(Formula("U", (~right, ~first & ~right)), maximize)
+            case "R":
+                return self.complement(Formula("U", (~first, ~right)), maximize)
+        raise AssertionError(path.operator)
+
+    def complement(self, path: Formula | Bounded, maximize: bool) -> Values:
+        """One minus the probability of the complementary event."""
+        return [1 - x for x in self.probability(path, not maximize)]
+
+    def within(self, path: Bounded, maximize: bool) -> Values:
+        """The probability of a bounded formula."""
+        if path.operator == "R":
+            negated = TRUE if path.left == FALSE else ~path.left
+            until = replace(path, operator="U", left=negated, right=~path.right)
+            return self.complement(until, maximize)
+        if path.reward is not None:
+            return self.at(self.cost(path, maximize))
+        if path.lower or path.upper is None:
+            return self.probability(unfolded(path), maximize)
+        target, stay = self.where(path.right), self.where(path.left)
+        steps = bounded.until_within(self.mdp, target, stay, path.upper, maximize, self.work)
+        return self.at(steps)
+
+    def cost(self, path: Bounded, maximize: bool) -> Values:
+        """The probability of reaching a target before too much reward is earned."""
+        host, target, stay = self.model.host, self.where(path.right), self.where(path.left)
+        costs = transition_reward(self.model, reward_structure(self.model, path.reward or None))
+        counted = np.where((stay & ~target)[host.state[host.row]], costs, 0)
+        units, limit = in_units(counted, reward_limit(path))
+        rows: list[dict[int, int]] = [{} for _ in self.mdp.rows]
+        for r, t, c in zip(host.row.tolist(), host.successor.tolist(), units.tolist(), strict=True):
+            rows[r][t] = c
+        return bounded.until_at_cost(self.mdp, target, stay, (rows, limit), maximize, self.work)
+
+    def automaton(self, path: Formula, maximize: bool) -> Values:
+        """The probability of an LTL formula, on the product with an automaton."""
+        objective = "max" if maximize else "min"
+        result = sparse_satisfaction(
+            self.model, path, states=self.states, objective=objective, tolerance=_WIDTH
+        )
+        if result.product.host.num_transitions > MAX_TRANSITIONS:
+            raise TooLarge
+        problem = reachability_problem(result, objective)
+        mdp = _product(result, self.mdp)
+        value = reachability(mdp, problem.goal, None, problem.maximize, self.work)
+        at_start = [value[s] for s in result.product.start.tolist()]
+        return [1 - x for x in at_start] if problem.complement else at_start
+
+
+def reward_limit(path: Bounded) -> float:
+    """The largest reward that a bound allows; rewards are counted in units of more than 1e-9."""
+    assert path.limit is not None
+    return float(path.limit - Fraction(1, 10**9) * path.strict)
+
+
+def _product(result: Satisfaction, mdp: ExactMDP) -> ExactMDP:
+    """The product with the rational probabilities of the model."""
+    product = result.product
+    host, state = product.host, product.base_state.tolist()
+    rows: list[dict[int, Fraction]] = []
+    entry, successor = host.entry_start.tolist(), host.successor.tolist()
+    still = product.still.tolist()
+    for r, (base, s) in enumerate(zip(product.base_row.tolist(), host.state.tolist(), strict=True)):
+        after = successor[entry[r] : entry[r + 1]]
+        rows.append({s: ONE} if still[s] else {t: mdp.rows[base][state[t]] for t in after})
+    return ExactMDP(host.row_start.tolist(), rows)
