@@ -14,7 +14,7 @@ from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 if TYPE_CHECKING:
     from jaxltl.core.models.sparse import Rewards, SparseMDP
 
-Part = Sequence[Fraction] | None  # of states or of choices
+Part = Sequence[Fraction] | None  # of states, of choices or of transitions
 _DENOMINATOR = 10**6  # of fractions as which doubles are read; chance agreement is below 1e-3
 _CLOSE = 1e-12  # relative difference of a number and its double, after products
 
@@ -23,7 +23,7 @@ class Rationals(NamedTuple):
     """Rational numbers of a model."""
 
     mdp: ExactMDP
-    rewards: dict[str, tuple[Part, Part]]  # of states and of choices, by name
+    rewards: dict[str, tuple[Part, Part, Part]]  # of states, choices and transitions, by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def decimal_numbers(model: SparseMDP) -> Rationals:
         if sum(written) == 1:
             probability[entries.start : entries.stop] = written
     rewards = {
-        name: (_written(reward.state), _written(reward.choice))
+        name: (_written(reward.state), _written(reward.choice), _written(reward.transition))
         for name, reward in model.rewards.items()
     }
     return Rationals(_normalised(model, probability), rewards)
@@ -94,13 +94,14 @@ def exact_reward(
     model: SparseMDP, numbers: Rationals, reward: Rewards, name: str | None
 ) -> list[Fraction]:
     """Expected rewards of choices; ValueError if some are not finite."""
-    state, choice = numbers.rewards.get(name or "", (None, None))
+    state, choice, transition = numbers.rewards.get(name or "", (None, None, None))
     state = _doubles(reward.state) if state is None else state
     choice = _doubles(reward.choice) if choice is None else choice
+    transition = _doubles(reward.transition) if transition is None else transition
     total = [ZERO] * model.num_rows if choice is None else list(choice)
     if state is not None:
         total = [x + state[s] for x, s in zip(total, model.host.state.tolist(), strict=True)]
-    if (transition := _doubles(reward.transition)) is not None:
+    if transition is not None:
         successor = model.host.successor.tolist()
         for r, entries in enumerate(pairs(model.host.entry_start.tolist())):
             row = numbers.mdp.rows[r]
@@ -110,7 +111,7 @@ def exact_reward(
 
 def exact_state_reward(numbers: Rationals, reward: Rewards, name: str | None) -> list[Fraction]:
     """Rewards of states."""
-    state = numbers.rewards.get(name or "", (None, None))[0]
+    state = numbers.rewards.get(name or "", (None,))[0]
     doubles = _doubles(reward.state) if state is None else state
     assert doubles is not None
     return list(doubles)

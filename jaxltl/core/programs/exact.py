@@ -57,6 +57,7 @@ def rational_numbers(program: Program, model: SparseMDP) -> Rationals | None:
             name: (
                 None if state is None else [state[s] for s in states],
                 None if choice is None else [choice[r] for r in order],
+                None,
             )
             for name, (state, choice) in rewards.items()
         },

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP, interval_rows, make_sparse
+from jaxltl.core.models.exact_numbers import NumberSource, decimal_numbers
 from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,
@@ -106,7 +108,8 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     options, rewards = names_of(header, body), _rewards(header, body)
     if header.value_type in INTERVALS:
         return interval_rows(*rows, *probability.T, rewards=rewards, **options)
-    return make_sparse(*rows, probability, rewards=rewards, **options)
+    model = make_sparse(*rows, probability, rewards=rewards, **options)
+    return replace(model, numbers=NumberSource(decimal_numbers))
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:

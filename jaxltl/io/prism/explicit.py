@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.models.exact_numbers import NumberSource, decimal_numbers
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Annotations, SparseMDP, make_sparse
 from jaxltl.io.files import read_bytes, write_bytes
@@ -396,6 +397,7 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
         model = interval.nominal
     else:
         model = make_sparse(*starts, rows.target, probability, initial=initial, **annotations)
+        model = replace(model, numbers=NumberSource(decimal_numbers))
     del rows, new, start, total, probability, starts  # free memory for the rewards
     model = replace(model, rewards=read_rewards(sections, model, is_chain))
     return model if interval is None else replace(interval, nominal=model)

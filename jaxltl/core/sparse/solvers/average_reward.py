@@ -10,6 +10,7 @@ then a shortest path problem (Puterman 1994, chapter 9).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
+    almost_sure_reachability,
     backward_reachable,
     end_components,
     shortest_path_rows,
@@ -102,6 +104,40 @@ def average(
         residual=half,
         method=_METHOD,
     )
+
+
+class Range(NamedTuple):
+    """The least and the largest reward of a row, and whether sums of rewards equal them exactly."""
+
+    least: float
+    largest: float
+    is_exact: tuple[bool, bool]
+
+    @property
+    def negated(self) -> Range:
+        return Range(-self.largest, -self.least, (self.is_exact[1], self.is_exact[0]))
+
+
+def within_range(mdp: HostMDP, reward: Floats, enclosure: Enclosure, ends: Range) -> Enclosure:
+    """The enclosure of a largest average, clipped to the range of the rewards.
+
+    The graph decides where it is an end of the range: the least reward where no end component with
+    a larger one is reachable, and the largest reward where end components without a smaller one are
+    reached almost surely.
+    """
+    lower = np.clip(enclosure.lower, ends.least, ends.largest)
+    upper = np.clip(enclosure.upper, ends.least, ends.largest)
+    if ends.is_exact[0] and ((lower <= ends.least) & (upper > ends.least)).any():
+        components = end_components(mdp)
+        row = components.inside & (reward > ends.least)
+        larger = mask_of(components.component[mdp.state[row]], mdp.num_states)
+        larger = larger[components.component] & components.region(mdp)
+        upper[~backward_reachable(mdp, larger)] = ends.least
+    if ends.is_exact[1] and ((upper >= ends.largest) & (lower < ends.largest)).any():
+        best = end_components(mdp, rows=reward >= ends.largest).region(mdp)
+        lower[almost_sure_reachability(mdp, best)[0]] = ends.largest
+    value = np.clip(enclosure.value, lower, upper)
+    return replace(enclosure, value=value, lower=lower, upper=upper)
 
 
 @dataclass(frozen=True)

@@ -448,10 +448,26 @@ def total(
     # Without a reward ahead the value is exactly 0, also where the remaining steps are bounded.
     some = backward_reachable(mdp, some)
     value, off = np.where(some, value, 0), np.where(some & (num_steps > 0), off, 0)
+    if not signed and num_steps <= _LONG and (some & (value <= off) & (off > 0)).any():
+        zero = ~_earning(mdp, reward > 0, start > 0, num_steps, operation is np.maximum)
+        value[zero] = off[zero] = 0
     if every is not None:
         return Steps(value, off, _policies(mdp, backup, every, num_steps), iterate.num_steps)
     row = backup.greedy(cost, iterate.before)
     return Steps(value, off, _policy(mdp, backup, row), iterate.num_steps)
+
+
+def _earning(
+    mdp: HostMDP, rows: Booleans, start: Booleans, num_steps: int, maximize: bool
+) -> Booleans:
+    """States in which some (all) policies earn something in n steps or after them."""
+    region, choose = start, np.logical_or if maximize else np.logical_and
+    for _ in range(num_steps):
+        new = mdp.over_choices(choose, rows | mdp.support.some_successor_in(region))
+        if (new == region).all():
+            break
+        region = new
+    return region
 
 
 def _largest_sum(mdp: HostMDP, magnitude: Floats, start: Floats, num_steps: int) -> Floats:

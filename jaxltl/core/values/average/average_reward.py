@@ -21,8 +21,8 @@ from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.operators import induced_chain
 from jaxltl.core.models.protocols import Array, Model, base_model
-from jaxltl.core.models.sparse import SparseMDP, choice_reward
-from jaxltl.core.sparse.solvers.average_reward import average
+from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.sparse.solvers.average_reward import Range, average, within_range
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.discounted import expected_reward
 from jaxltl.core.values.engine.state_quantities import (
@@ -30,6 +30,7 @@ from jaxltl.core.values.engine.state_quantities import (
     finite_reward,
     reduction_for,
     row_reward,
+    reward_span,
 )
 from jaxltl.core.values.engine.validated import validated
 
@@ -87,6 +88,10 @@ def average_reward(
     enclosure = average(
         model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
     )
+    ends = _range(reward_structure(model, reward))
+    enclosure = within_range(
+        model.host, sign * earned, enclosure, ends if sign > 0 else ends.negated
+    )
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(enclosure.upper - enclosure.value, enclosure.value - enclosure.lower)
     least = small * float(magnitude.max())
@@ -96,9 +101,20 @@ def average_reward(
         enclosure.row.astype(np.int32),
         enclosure.rounds,
         enough=tolerance * np.maximum(np.abs(enclosure.value), least),
+        span=(ends.least, ends.largest),
     )
     residual: Array = np.float64(enclosure.residual)
     return replace(solution, residual=residual)
+
+
+def _range(rewards: Rewards) -> Range:
+    """The range of a step's reward; ends are exact if nothing is added, or nothing but zeros."""
+    least, largest = reward_span(rewards)
+    parts = [x for x in (rewards.state, rewards.choice, rewards.transition) if x is not None]
+    alone = rewards.transition is None and len(parts) <= 1
+    least_zero = not any(np.min(x) for x in parts)
+    largest_zero = not any(np.max(x) for x in parts)
+    return Range(least, largest, (alone or least_zero, alone or largest_zero))
 
 
 @validated(games=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from typing import cast
 
 import jax
@@ -12,9 +13,12 @@ from jax.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model, SuccessorModel, base_model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status, require_shape, require_states
 
+Span = tuple[float, float]  # the least and the largest number of a quantity
+PROBABILITY: Span = (0.0, 1.0)
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
 
 
@@ -82,6 +86,16 @@ def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndar
     return earned, choice_reward(model, jax.tree.map(np.abs, rewards))
 
 
+def reward_span(rewards: Rewards, num_steps: int = 1) -> Span:
+    """Bounds of the sum of rewards of some steps."""
+    low = high = Fraction(0)
+    for part in (rewards.state, rewards.choice, rewards.transition):
+        if part is not None:
+            numbers = np.asarray(part, np.float64)
+            low, high = low + Fraction(float(numbers.min())), high + Fraction(float(numbers.max()))
+    return double_bounds(num_steps * low)[0], double_bounds(num_steps * high)[1]
+
+
 def nonnegative_reward(
     model: SparseMDP, reward: Reward, use: str, name: str = "the reward"
 ) -> np.ndarray:
@@ -122,17 +136,20 @@ def solution_from_error(
     policy: Array,
     num_steps: int,
     *,
-    highest: float = math.inf,
+    span: Span = (-math.inf, math.inf),
     enough: ArrayLike | None = None,
 ) -> Solution:
-    """A :class:`Solution` from a value and its error, CONVERGED if that is at most `enough`."""
+    """A :class:`Solution` from a value and its error, CONVERGED if that is at most `enough`.
+
+    Value and bounds are clipped to the `span` of the quantity.
+    """
     enough = TOLERANCE * np.maximum(np.abs(value), 1) if enough is None else enough
     error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
     out = error > 0
     lower = np.where(out, np.nextafter(value - error, -np.inf), value)
     upper = np.where(out, np.nextafter(value + error, np.inf), value)
-    if highest == 1:
-        lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
+    if span != (-math.inf, math.inf):
+        lower, upper, value = (np.clip(x, *span) for x in (lower, upper, value))
     finite = bool(np.isfinite(value).all())
     narrow = bool((error <= enough).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE

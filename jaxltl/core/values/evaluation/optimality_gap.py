@@ -34,7 +34,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     at_states,
     product_satisfaction,
 )
-from jaxltl.core.values.engine.state_quantities import safe_mean, solution_from_error
+from jaxltl.core.values.engine.state_quantities import PROBABILITY, safe_mean, solution_from_error
 
 _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at once
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
@@ -287,13 +287,13 @@ def _bounded(
     error = np.where(own.error > 0, wide, 0)
     at = reachable.start
     return (
-        solution_from_error(own.value[at], error[at], None, own.num_steps, highest=1),
+        solution_from_error(own.value[at], error[at], None, own.num_steps, span=PROBABILITY),
         solution_from_error(
             best.value[at],
             best.error[at],
             reachable.base_row[best.row[at]],
             best.num_steps,
-            highest=1,
+            span=PROBABILITY,
         ),
     )
 
@@ -372,4 +372,4 @@ def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[in
 
 def _mean(weight: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
     """Bounds on a mean of numbers between zero and one, rounding included."""
-    return safe_mean(weight, lower, up=False), safe_mean(weight, upper, up=True, highest=1)
+    return safe_mean(weight, lower, up=False), safe_mean(weight, upper, up=True, span=PROBABILITY)

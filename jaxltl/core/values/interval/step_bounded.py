@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward, reward_structure
 from jaxltl.core.values.interval.robust import nature_direction
 from jaxltl.core.values.engine.state_quantities import (
+    PROBABILITY,
+    Span,
+    reward_span,
     solution_from_error,
     state_mask,
     state_reward,
@@ -141,8 +144,11 @@ def robust_cumulative_reward(
       [1.5, 0.0]
     """
     world = require_interval(model).nominal
-    earned = transition_reward(world, reward_structure(world, reward))
-    return _earned(model, earned, np.zeros(world.num_states), num_steps, objective, nature)
+    rewards = reward_structure(world, reward)
+    count = validation.integer("num_steps", num_steps)
+    steps = _Steps(count, reward_span(rewards, count))
+    earned = transition_reward(world, rewards)
+    return _earned(model, earned, np.zeros(world.num_states), steps, objective, nature)
 
 
 @of_one_player
@@ -178,33 +184,35 @@ def robust_instantaneous_reward(
     """
     start = state_reward(require_interval(model).nominal, reward)
     zero = np.zeros(model.num_transitions)
-    return _earned(model, zero, start, num_step, objective, nature)
+    span = float(start.min()), float(start.max())
+    steps = _Steps(validation.integer("num_steps", num_step), span)
+    return _earned(model, zero, start, steps, objective, nature)
+
+
+class _Steps(NamedTuple):
+    """A number of steps, and the span of what they earn."""
+
+    count: int
+    span: Span
 
 
 def _earned(
     model: IntervalMDP,
     earned: Floats,
     start: Floats,
-    num_steps: int,
+    steps: _Steps,
     objective: str,
     nature: str | None,
 ) -> Solution:
-    direction, steps = (
-        nature_direction(nature, objective),
-        validation.integer("num_steps", num_steps),
-    )
-    return _solution(
-        interval_bounded.total(
-            model.host, earned, start, steps, Query(objective == "max", direction == "max")
-        ),
-        highest=math.inf,
-    )
+    query = Query(objective == "max", nature_direction(nature, objective) == "max")
+    values = interval_bounded.total(model.host, earned, start, steps.count, query)
+    return _solution(values, steps.span)
 
 
-def _solution(values: Steps, highest: float = 1) -> Solution:
+def _solution(values: Steps, span: Span = PROBABILITY) -> Solution:
     """The :class:`Solution` of step-bounded values."""
     nature: Array | None = values.probability
     solution = solution_from_error(
-        values.value, values.error, values.row.astype(np.int32), values.num_steps, highest=highest
+        values.value, values.error, values.row.astype(np.int32), values.num_steps, span=span
     )
     return replace(solution, nature=nature, method="step by step")

@@ -20,7 +20,9 @@ from jaxltl.core.types import Solution
 from jaxltl.core.values.interval import step_bounded as robust
 from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.engine.state_quantities import (
+    PROBABILITY,
     reduction_for,
+    reward_span,
     state_mask,
     row_reward,
     state_reward,
@@ -84,7 +86,9 @@ def next_probability(
     _, row = mdp.first_choice(
         image == np.repeat(mdp.over_choices(operation, image), np.diff(mdp.row_start))
     )
-    return solution_from_error(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
+    return solution_from_error(
+        value, np.where(sure | ~positive, 0, error), row, 1, span=PROBABILITY
+    )
 
 
 @validated()
@@ -136,7 +140,9 @@ def bounded_reachability(
     target = state_mask(model, target, "target")
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
     values = host.until(model.host, target, stay, num_steps, operation, by_step)
-    return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
+    return solution_from_error(
+        values.value, values.error, values.row, values.num_steps, span=PROBABILITY
+    )
 
 
 def bounded_avoidance(
@@ -186,10 +192,11 @@ def cumulative_reward(
             model, reward, num_steps, objective=objective, nature=nature
         )
     sparse, operation = _problem(model, objective, num_steps)
-    rewards = finite_reward(sparse, row_reward(model, sparse, reward))
-    final = np.zeros(sparse.num_states)
-    values = host.total(sparse.host, (*rewards, final), num_steps, operation, by_step)
-    return solution_from_error(values.value, values.error, values.row, values.num_steps)
+    structure = reward_structure(sparse, row_reward(model, sparse, reward))
+    rewards = *finite_reward(sparse, structure), np.zeros(sparse.num_states)
+    values = host.total(sparse.host, rewards, num_steps, operation, by_step)
+    span = reward_span(structure, num_steps)
+    return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
 
 
 @validated()
@@ -231,9 +238,10 @@ def instantaneous_reward(
         )
     sparse, operation = _problem(model, objective, num_step)
     zero = np.zeros(sparse.num_rows)
-    rewards = zero, zero, state_reward(sparse, row_reward(model, sparse, reward))
-    values = host.total(sparse.host, rewards, num_step, operation, by_step)
-    return solution_from_error(values.value, values.error, values.row, values.num_steps)
+    final = state_reward(sparse, row_reward(model, sparse, reward))
+    values = host.total(sparse.host, (zero, zero, final), num_step, operation, by_step)
+    span = float(final.min()), float(final.max())
+    return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
 
 
 @validated()
@@ -291,7 +299,7 @@ def reward_bounded_reachability(
     budget = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
     values = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
     error = np.where(values.undecided, values.error, 0)
-    return solution_from_error(values.value, error, values.row, budget[1] + 1, highest=1)
+    return solution_from_error(values.value, error, values.row, budget[1] + 1, span=PROBABILITY)
 
 
 # --- what these and other host solvers share -----------------------------------------------------

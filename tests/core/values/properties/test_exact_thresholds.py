@@ -1,6 +1,7 @@
 """Thresholds of small models are decided where they are the value, by an oracle in fractions."""
 
 import math
+import re
 import warnings
 from fractions import Fraction
 
@@ -28,14 +29,11 @@ CONSTANTS = {"p": Fraction(2, 9), "q": Fraction(1, 6)}
 
 
 def value_of(text):
-    names = {name: x for name, x in CONSTANTS.items()}
     number = "".join(f"Fraction('{x}')" if x[:1].isdigit() else x for x in _tokens(text))
-    return eval(number, {"Fraction": Fraction, **names})
+    return eval(number, {"Fraction": Fraction, **CONSTANTS})
 
 
 def _tokens(text):
-    import re
-
     return re.findall(r"[0-9.]+(?:e[+-]?[0-9]+)?|[a-z]+|[-+*/]", text)
 
 
@@ -100,9 +98,10 @@ def questions(model, rows, cost):
         return {d: reference.steps(rows, f, first, count, fixed=fixed) for d, f in BEST.items()}
 
     def at_cost(limit):
-        units = [int(30 * x) for x in cost]
-        width = 30 * limit + 2
-        grid = reference.with_budget(rows, units, 30 * limit)
+        scale = math.lcm(*(x.denominator for x in cost))
+        units = [int(scale * x) for x in cost]
+        width = scale * limit + 2
+        grid = reference.with_budget(rows, units, scale * limit)
         goal = {s * width + x for s in a for x in range(width - 1)}
         inner = {s * width + x for s in every for x in range(width - 1)} - goal
         # By value iteration over what is spent: only steps without cost are solved together.
@@ -184,14 +183,17 @@ def thresholds(operator, value):
     return [t for t in some if t >= 0 and (low or t <= 1)]
 
 
-def require_verdicts(model, rows, cost, parse, *, every=False):
+RELATIONS = (">=", "<"), ("<=", ">")
+
+
+def require_verdicts(model, rows, cost, parse, relations):
     """All comparisons at, below and above the value are right, in the initial state."""
     start = int(np.flatnonzero(np.asarray(model.initial))[0])
     for operator, path, values in questions(model, rows, cost):
         for direction, value in values.items():
             exact = value[start]
             for threshold in thresholds(operator, exact):
-                for relation in HOLDS if every else (">=", "<="):
+                for relation in relations:
                     text = f"{operator}{direction}{relation}{threshold} [ {path} ]"
                     answer = solve_property(model, parse(text))
                     assert answer.holds == [HOLDS[relation](exact, threshold)], (text, exact)
@@ -199,7 +201,10 @@ def require_verdicts(model, rows, cost, parse, *, every=False):
                     assert 0 <= answer.lower[0] <= answer.value[0] <= answer.upper[0]
 
 
-@pytest.mark.parametrize("seed", range(3))
+SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 40))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", ["dtmc", "mdp"])
 def test_thresholds_of_programs_are_those_of_their_rationals(kind, seed):
     text, rows, cost = random_program(seed, kind)
@@ -208,4 +213,68 @@ def test_thresholds_of_programs_are_those_of_their_rationals(kind, seed):
         warnings.simplefilter("ignore")
         model = build_model(program)
     names = program_definitions(program)
-    require_verdicts(model, *reordered(model, rows, cost), lambda x: parse_property(x, names))
+    some = RELATIONS[seed % 2]
+    require_verdicts(model, *reordered(model, rows, cost), lambda x: parse_property(x, names), some)
+
+
+def random_rows(rng, dyadic):
+    size = int(rng.integers(3, 6))
+    rows = []
+    for s in range(size):
+        rows.append([])
+        for _ in range(int(rng.integers(1, 3))):
+            parts = rng.integers(1, 8, int(rng.integers(1, 4))).tolist()
+            if dyadic:
+                parts[0] += 32 - sum(parts)
+            row = {
+                int(t): Fraction(x, sum(parts))
+                for t, x in zip(rng.choice(size, len(parts), replace=False), parts, strict=True)
+            }
+            rows[-1].append({s: Fraction(1)} if s == size - 1 else row)
+    return rows
+
+
+def sparse(rows, cost):
+    entries = [row for choices in rows for row in choices]
+    return jl.make_sparse(
+        np.cumsum([0, *map(len, rows)]),
+        np.cumsum([0, *map(len, entries)]),
+        np.concatenate([list(row) for row in entries]),
+        np.array([float(p) for row in entries for p in row.values()]),
+        initial=[1] + [0] * (len(rows) - 1),
+        label={"a": [len(rows) - 1], "b": [1, 2], "c": [0, *range(2, len(rows))]},
+        rewards={"r": jl.models.Rewards(state=np.array([float(x) for x in cost]))},
+    )
+
+
+def drn(rows, cost):
+    lines = ["@type: MDP", "@parameters", "", "@reward_models", "r", f"@nr_states\n{len(rows)}"]
+    lines += [f"@nr_choices\n{sum(map(len, rows))}", "@model"]
+    for s, choices in enumerate(rows):
+        labels = [
+            x
+            for x, holds in zip("abc", (s == len(rows) - 1, 0 < s < 3, s != 1), strict=True)
+            if holds
+        ]
+        lines.append(f"state {s} [{cost[s]}] {'init ' * (s == 0)}{' '.join(labels)}")
+        for i, row in enumerate(choices):
+            lines.append(f"\taction {i} [0]")
+            lines += [f"\t\t{t} : {p}" for t, p in row.items()]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_thresholds_of_models_are_those_of_their_doubles(seed):
+    rows = random_rows(np.random.default_rng(seed), True)
+    cost = [Fraction(x) for x in ("1/2", "1/10", "0", "2", "0")[: len(rows)]]
+    cost[1] = Fraction(1, 4)
+    require_verdicts(sparse(rows, cost), rows, cost, parse_property, RELATIONS[seed % 2])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_thresholds_of_text_files_are_those_of_their_fractions(seed, tmp_path):
+    rows = random_rows(np.random.default_rng(seed), False)
+    cost = [Fraction(x) for x in ("1/3", "1/10", "0", "2", "0")[: len(rows)]]
+    (tmp_path / "model.drn").write_text(drn(rows, cost))
+    model = jl.read_model(tmp_path / "model.drn")
+    require_verdicts(model, rows, cost, parse_property, RELATIONS[seed % 2])
