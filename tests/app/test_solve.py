@@ -152,10 +152,10 @@ def test_undecided_thresholds_are_not_guessed(tmp_path):
         path,
         make_sparse(
             None,
-            [0, 3, 4, 5],
-            [0, 1, 2, 1, 2],
-            [0.1, 0.3, 0.6, 1, 1],
-            initial=[1, 0, 0],
+            [0, 3, *range(4, 1004)],  # more states than are solved in fractions
+            [0, 1, 2, *range(1, 1001)],
+            [0.1, 0.3, 0.6, *[1.0] * 1000],
+            initial=[1, *[0] * 1000],
             label={"a": [1]},
         ),
     )

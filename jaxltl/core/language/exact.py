@@ -96,7 +96,7 @@ def exact_program(program: Program) -> Program | None:
     if program.syntax is None:
         return None
     try:
-        values = {name: exact_constant(x) for name, x in program.given.items()}
+        values = {name: exact_constant(x) for name, x in program.arguments.items()}
         exact = resolved(_exact_syntax(program.syntax), values, real=Fraction)
         modules = []
         for m, other in zip(program.modules, exact.modules, strict=True):

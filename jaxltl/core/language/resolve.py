@@ -64,7 +64,7 @@ def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Pr
         program = resolved(syntax, values)
     except LanguageError as error:
         raise syntax.source.located(error) from None
-    return replace(program, syntax=syntax, given=dict(constants or {}))
+    return replace(program, syntax=syntax, arguments=dict(constants or {}))
 
 
 def resolved(

@@ -181,7 +181,7 @@ class Program:
       rewards: the reward structures.
       initial: the condition of the ``init`` block, or None.
       players: the players of an smg.
-      syntax, given: the syntax tree, and the values that were given for its constants.
+      syntax, arguments: the syntax tree, and the values that were given for its constants.
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
@@ -203,7 +203,7 @@ class Program:
     initial: Expression | None
     players: tuple[Player, ...]
     syntax: Syntax | None = field(default=None, compare=False, repr=False)
-    given: Mapping[str, object] = field(default_factory=dict, compare=False, repr=False)
+    arguments: Mapping[str, object] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def types(self) -> dict[str, Type]:

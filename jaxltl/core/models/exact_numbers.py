@@ -2,46 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.models.number_source import Part, Rationals
+from jaxltl.core.models.sparse import Rewards, SparseMDP
 from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 
-if TYPE_CHECKING:
-    from jaxltl.core.models.sparse import Rewards, SparseMDP
-
-Part = Sequence[Fraction] | None  # of states, of choices or of transitions
 _DENOMINATOR = 10**6  # of fractions as which doubles are read; chance agreement is below 1e-3
 _CLOSE = 1e-12  # relative difference of a number and its double, after products
-
-
-class Rationals(NamedTuple):
-    """Rational numbers of a model."""
-
-    mdp: ExactMDP
-    rewards: dict[str, tuple[Part, Part, Part]]  # of states, choices and transitions, by name
-
-
-@dataclass(frozen=True, eq=False)
-class NumberSource:
-    """The rational numbers behind the doubles of a model, found on demand.
-
-    All sources are equal, so that models share compiled programs.
-    """
-
-    read: Callable[[SparseMDP], Rationals | None] | None = None  # None: doubles mean themselves
-    # The last model's arrays of successors and probabilities, and their numbers.
-    known: list[tuple[object, object, Rationals]] = field(default_factory=list, repr=False)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, NumberSource)
-
-    def __hash__(self) -> int:
-        return 0
 
 
 def exact_numbers(model: SparseMDP) -> Rationals:

@@ -18,7 +18,7 @@ from numpy.typing import DTypeLike
 from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.models import facts
-from jaxltl.core.models.exact_numbers import NumberSource
+from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,34 +15,19 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.language.expressions import Expression, LanguageError, compile_expressions, literal
 from jaxltl.core.language.syntax import Program, RewardItem
-from jaxltl.core.models.exact_numbers import NumberSource
+from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.programs.exact import rational_numbers
 from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
 from jaxltl.core.programs.packed_states import Layout, Reader, Words, initial_columns, make_layout
-from jaxltl.core.programs.local_choices import Functions, Intervals, Numbers, Weight, state_text
+from jaxltl.core.programs.local_choices import Functions, Intervals, Numbers, state_text
+from jaxltl.core.programs.rows import Rows as Rows
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 MAX_STATES = 10_000_000
 _PART = 2**17  # states on which labels and rewards are evaluated together
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Arrays of a model before its probabilities are numbers."""
-
-    # as of `~jaxltl.core.models.sparse.make_sparse`; `weight` has probabilities, their
-    # intervals [T, 2], or numbers of functions
-    row_start: Integers
-    entry_start: Integers
-    successor: Integers
-    weight: Weight
-    annotations: dict[str, Any]  # keyword arguments of make_sparse other than rewards
-    # by name the parts on states and choices, None where they are zero
-    rewards: dict[str, RewardParts]
-    functions: tuple[Expression, ...]  # of a program with parameters, expressions by number
-    owner: Integers | None  # int32[S], the number of the player of each state of a game
 
 
 def build_model(
@@ -95,9 +80,8 @@ def build_model(
     with validation.errors_in(f"{program.source.name!r}: "):
         model: SparseMDP | IntervalMDP = make(*starts, *ends, rewards=rewards, **rows.annotations)
         if isinstance(model, SparseMDP) and rows.owner is None:
-            from jaxltl.core.programs.exact import rational_numbers  # which builds programs
-
-            return replace(model, numbers=NumberSource(partial(rational_numbers, program)))
+            source = NumberSource(partial(rational_numbers, program, build_rows))
+            return replace(model, numbers=source)
         if rows.owner is None:
             return model
         return make_game(model, np.isin(rows.owner, _players(program, coalition)))

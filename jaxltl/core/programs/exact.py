@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -10,14 +11,16 @@ import numpy as np
 from jaxltl.core.language.exact import exact_program, exact_tree, exact_value
 from jaxltl.core.language.expressions import Expression
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.models.exact_numbers import Part, Rationals
+from jaxltl.core.models.number_source import Part, Rationals
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.programs.build import Rows, build_rows
 from jaxltl.core.programs.local_choices import Functions, Weight
+from jaxltl.core.programs.rows import Rows
 from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 
 
-def rational_numbers(program: Program, model: SparseMDP) -> Rationals | None:
+def rational_numbers(
+    program: Program, build_rows: Callable[..., Rows], model: SparseMDP
+) -> Rationals | None:
     """The numbers of the model of a program in rational arithmetic; None if some are irrational."""
     exact = exact_program(program)
     if exact is None:
@@ -93,7 +96,7 @@ def _order(
             def distance(i: int, r: int = r, row: dict[int, float] = row) -> float:
                 other = distributions[i]
                 away = max(abs(float(other.get(t, ZERO)) - row.get(t, 0)) for t in {*other, *row})
-                return away + (action[i] != names[r])
+                return float(away + (action[i] != names[r]))
 
             best = min(unused, key=distance, default=0)
             order.append(best)

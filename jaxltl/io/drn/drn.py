@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP, interval_rows, make_sparse
-from jaxltl.core.models.exact_numbers import NumberSource, decimal_numbers
+from jaxltl.core.models.exact_numbers import decimal_numbers
+from jaxltl.core.models.number_source import NumberSource
 from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,

@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.models.exact_numbers import NumberSource, decimal_numbers
+from jaxltl.core.models.exact_numbers import decimal_numbers
+from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Annotations, SparseMDP, make_sparse
 from jaxltl.io.files import read_bytes, write_bytes

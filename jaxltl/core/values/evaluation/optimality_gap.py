@@ -372,4 +372,4 @@ def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[in
 
 def _mean(weight: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
     """Bounds on a mean of numbers between zero and one, rounding included."""
-    return safe_mean(weight, lower, up=False), safe_mean(weight, upper, up=True, span=PROBABILITY)
+    return safe_mean(weight, lower, up=False), safe_mean(weight, upper, up=True, highest=1)

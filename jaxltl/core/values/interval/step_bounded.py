@@ -192,7 +192,7 @@ def robust_instantaneous_reward(
 class _Steps(NamedTuple):
     """A number of steps, and the span of what they earn."""
 
-    count: int
+    number: int
     span: Span
 
 
@@ -205,7 +205,7 @@ def _earned(
     nature: str | None,
 ) -> Solution:
     query = Query(objective == "max", nature_direction(nature, objective) == "max")
-    values = interval_bounded.total(model.host, earned, start, steps.count, query)
+    values = interval_bounded.total(model.host, earned, start, steps.number, query)
     return _solution(values, steps.span)
 
 

@@ -153,7 +153,9 @@ def bounded_avoidance(
     values = host.avoidance(model.host, target, stay, num_steps, operation)
     if values is None:
         return None
-    return solution_from_error(values.value, values.error, values.row, values.num_steps, highest=1)
+    return solution_from_error(
+        values.value, values.error, values.row, values.num_steps, span=PROBABILITY
+    )
 
 
 @validated()
