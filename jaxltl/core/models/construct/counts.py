@@ -22,6 +22,7 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
 MAX_SAMPLES = 2**53  # the largest range of exact integers in double precision
 _MAX_ENTRIES = 10**8
+_SMALL_TABLE = 10**6  # choices times states up to which all transitions are kept
 _ANY = "any"  # the only action of an unvisited state
 
 Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
@@ -362,8 +363,9 @@ def model_from_counts(
       terminal: absorbing states.
       graph: the assumption on transitions that were not observed: ``"seen"``, they are impossible
         (except those with a count of 0); ``"complete"``, each choice may lead to every state; or
-        :class:`~jaxltl.core.statistics.confidence_sets.LeastProbability`, they are impossible for
-        choices with sufficiently many samples.
+        :class:`~jaxltl.core.statistics.confidence_sets.LeastProbability`, each choice may lead to
+        every state, and confidence sets exclude those below the least probability; in a table of more
+        than 10^6 entries they are impossible for choices with sufficiently many samples.
 
     Returns:
       The model, which keeps the names of states as its variable `state`, and ``int64[T]``.
@@ -400,7 +402,7 @@ def model_from_counts(
     choice = np.unique(np.concatenate([tried, lone]))
     state, action = np.divmod(choice, len(names))
     samples = np.bincount(np.searchsorted(choice, tried), counts.count, choice.size)
-    is_open = ~stays[state] & (_may_miss(graph, samples) | np.isin(choice, lone))
+    is_open = ~stays[state] & (_may_miss(graph, samples, len(number)) | np.isin(choice, lone))
     start, successor, count = _entries(counts, np.searchsorted(choice, tried), state, is_open)
     labels = {
         name: _numbers(some, number, f"label {name!r}") for name, some in (labels or {}).items()
@@ -419,10 +421,14 @@ def model_from_counts(
     return model, count
 
 
-def _may_miss(graph: str | LeastProbability, samples: np.ndarray) -> NDArray[np.bool_]:
+def _may_miss(graph: str | LeastProbability, samples: np.ndarray, size: int) -> NDArray[np.bool_]:
     """Choices with possible transitions that may not have been observed."""
-    if isinstance(graph, LeastProbability):
+    if isinstance(graph, LeastProbability) and samples.size * size > _SMALL_TABLE:
         return samples < graph.sufficient_samples(samples.size)
+    if isinstance(
+        graph, LeastProbability
+    ):  # confidence sets exclude transitions, see learn_guarantee
+        return np.ones(samples.shape, bool)
     return np.full(samples.shape, graph == "complete")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from jaxltl.core.pretty_print import brief, count, nested_repr, readable
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
 from jaxltl.core.types import require_shape
 from jaxltl.core import validation
+from jaxltl.core.validation import first_true
 from jaxltl.core.models.protocols import RowModel
 from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
@@ -150,6 +151,8 @@ def learn_guarantee(
             method="anytime" if method is None else method,
             entry_start=sparse.entry_start,
         )
+    if isinstance(graph, LeastProbability) and needed == confidence:
+        sets = _without_unlikely(sparse, sets, graph.value)
     interval, aligned = _with_sets(sparse, sets)
     worst = robust_satisfaction(
         interval, task, objective=objective, nature="adversarial", tolerance=tolerance
@@ -179,23 +182,51 @@ def learn_guarantee(
 def _confidence_of_sets(model: SparseMDP, graph: Graph, confidence: float) -> float:
     """Confidence left for probabilities, after the graph's share of the failures."""
     require_graph(graph)
+    host = model.host
+    width = np.diff(host.entry_start)
+    loops = np.bincount(host.row, host.successor == host.state[host.row], host.num_rows) == width
+    missing = (width < host.num_states) & ~loops
     if isinstance(graph, LeastProbability):
+        if not missing.any():  # no transition was excluded by numbers of samples
+            return confidence
         if not graph.failure < 1 - confidence:
             raise ValueError(
                 f"graph.failure={graph.failure:g}; it must be below 1 - confidence, "
                 f"{1 - confidence:g}."
             )
         return confidence + graph.failure
-    host = model.host
-    width = np.diff(host.entry_start)
-    loops = np.bincount(host.row, host.successor == host.state[host.row], host.num_rows) == width
-    if graph == "complete" and ((width < host.num_states) & ~loops).any():
-        row = int(np.argmax((width < host.num_states) & ~loops))
+    if graph == "complete" and missing.any():
+        row = int(np.argmax(missing))
         raise ValueError(
             f"graph='complete', but choice {row} has {width[row]} of {host.num_states} successors; "
             "give the assumption by which the model was made."
         )
     return confidence
+
+
+def _without_unlikely(model: SparseMDP, sets: ConfidenceSets, least: float) -> ConfidenceSets:
+    """The sets without probabilities between 0 and the least one of possible transitions.
+
+    A transition with an upper bound below it is impossible, and one that was observed has at least
+    this probability: in the event in which the sets hold, so that no failure is added.
+    """
+    if sets.radius is not None:
+        return sets
+    lower, upper = (np.asarray(x, np.float64) for x in (sets.lower, sets.upper))
+    seen = np.asarray(sets.center, np.float64) * sets.num_samples[model.host.row] > 0.5
+    unlikely = (upper < least) & (seen | (lower > 0))
+    for entry in first_true(unlikely):
+        row = model.host.row[entry]
+        raise ValueError(
+            f"graph: with the confidence asked for, the transition of choice {row} to state "
+            f"{model.host.successor[entry]} has a probability of at most {upper[entry]:.3g}, below "
+            f"the least probability {least:g}; assume a smaller one."
+        )
+    return replace(
+        sets,
+        lower=np.where(seen, np.maximum(lower, np.nextafter(least, 0)), lower),
+        upper=np.where(upper < least, 0, upper),
+    )
 
 
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:

@@ -225,6 +225,10 @@ def test_a_transition_that_was_not_observed_is_not_taken_for_impossible():
                 terminal=["bay", "pit"],
                 graph=graph,
             )
+            if name == "too large" and fall:  # the log refutes it
+                with pytest.raises(ValueError, match="assume a smaller one"):
+                    learn_guarantee(model, count, "F bay", 0.95, graph=graph)
+                continue
             found = learn_guarantee(model, count, "F bay", 0.95, graph=graph)
             assert found.confidence == 0.95 and found.optimistic > 1 - rare
             assert found.assumption == describe_graph(graph)
@@ -232,6 +236,29 @@ def test_a_transition_that_was_not_observed_is_not_taken_for_impossible():
     assert wrong["complete"] <= 0.05 * num_logs and wrong["least"] <= 0.05 * num_logs
     # Assumptions that do not hold.
     assert wrong["seen"] > 0.3 * num_logs and wrong["too large"] > 0.3 * num_logs
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_assumption_never_guarantees_less_than_none(seed):
+    """A least probability only shrinks the confidence sets of the complete graph."""
+    rng = np.random.default_rng(seed)
+    true = rng.dirichlet(np.ones(4), (3, 2)) * 0.9 + 0.025
+    pairs = np.argwhere(np.ones((3, 2), bool))
+    drawn = np.array([rng.multinomial(10 ** rng.integers(1, 5), true[s, a]) for s, a in pairs])
+    row, successor = np.nonzero(drawn)
+    counts = make_counts(*pairs[row].T, successor, drawn[row, successor], states=list("abcd"))
+    made = {"initial": "a", "labels": {"d": ["d"], "c": ["c"]}, "terminal": ["d"]}
+    for formula in ("F d & G !c", "G !d"):
+        bounds = []
+        for graph in ("complete", *(LeastProbability(p) for p in (1e-6, 0.001, 0.01, 0.025))):
+            model, count = model_from_counts(counts, graph=graph, **made)
+            found = learn_guarantee(model, count, formula, 0.95, graph=graph)
+            bounds.append(found.bound)
+        assert (np.diff(bounds) >= -1e-6).all()
+    counts = make_counts([0, 0], [0, 0], [0, 1], [10**6, 1], states=["a", "b"])
+    model, count = model_from_counts(counts, initial="a", labels={"b": ["b"]}, graph=graph)
+    with pytest.raises(ValueError, match=r"graph: .* state 1 .* assume a smaller one"):
+        learn_guarantee(model, count, "F b", 0.9, graph=graph)
 
 
 @pytest.mark.parametrize(("value", "num_choices"), [(0.3, 1), (0.05, 7), (0.6, 3)])
