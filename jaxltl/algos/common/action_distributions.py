@@ -80,6 +80,12 @@ def log_density(
     return -jnp.sum(scaled**2 / 2 + log_deviation + np.log(2 * np.pi) / 2)
 
 
+def probabilities(logits: jax.Array, allowed: jax.Array | None) -> jax.Array:
+    """Probabilities of finitely many actions, zero where they are not allowed."""
+    share = jax.nn.softmax(_masked(logits, allowed))
+    return share if allowed is None else jnp.where(allowed, share, 0)
+
+
 def entropy(
     actions: Actions, parameters: PyTree, allowed: jax.Array | None, squash: str
 ) -> jax.Array:

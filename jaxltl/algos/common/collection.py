@@ -83,7 +83,21 @@ def acting(
     memory: PyTree = (),
 ) -> Agent:
     """The agent of an actor `evaluate`; `how`: whether actions are sampled, and their squash."""
-    return Agent(Partial(_act, struct.Static(how), (actions, evaluate)), memory)
+    finite = isinstance(actions, actions_of.Finite)
+    act = Partial(_act, struct.Static(how), (actions, evaluate))
+    return Agent(act, memory, _probabilities if finite else None)
+
+
+def _probabilities(
+    act: Partial, memory: PyTree, observation: PyTree, allowed: jax.Array | None
+) -> jax.Array:
+    """Probabilities ``float[A]`` of the actions of :func:`acting`."""
+    how, (actions, evaluate) = act.args
+    logits = evaluate(memory, observation).action
+    if how.value[0]:
+        return actions_of.probabilities(logits, allowed)
+    action = actions_of.chosen(None, actions, logits, allowed, sampled=False, squash=None)
+    return jax.nn.one_hot(action, logits.shape[-1], dtype=logits.dtype)
 
 
 def _act(

@@ -48,6 +48,8 @@ class Agent:
       act: ``(memory, observation, allowed, key) -> (action, memory)``; `allowed` is ``bool[A]``, or
         None where all actions are available.
       memory: the initial memory, a tree of arrays; ``()`` for none.
+      probabilities: of an agent that samples, ``(act, memory, observation, allowed) -> float[A]``, the
+        probabilities of its actions; static. None where they are not known.
 
     >>> first = Agent(lambda memory, observation, allowed, key: (allowed.argmax(), memory))
     >>> int(first.act((), None, jnp.array([False, True]), None)[0])
@@ -56,6 +58,7 @@ class Agent:
 
     act: Callable[..., tuple[PyTree, PyTree]]
     memory: PyTree = ()
+    probabilities: Callable[..., jax.Array] | None = struct.field(pytree_node=False, default=None)
 
 
 def make_agent(function: Callable[..., PyTree]) -> Agent:
@@ -284,7 +287,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
 def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
     """The environment inside :func:`with_time_limit` and the limit; any other environment and None."""
     timed: PyTree = require_environment(environment)
-    if timed.step.func is not _step_clock:
+    if getattr(timed.step, "func", None) is not _step_clock:
         return environment, None
     parts = {
         name: part and part.args[-1]

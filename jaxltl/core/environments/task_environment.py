@@ -286,19 +286,27 @@ def task_environment(
             f"the tables are of {tables.weight.shape[-1]} propositions, and the world has "
             f"{len(names)}: {', '.join(names) or '(none)'}. Make them with the world's own."
         )
-    return _beside(inner, tables)
+    return with_tables(inner, tables)
 
 
 def with_task_tables(environment: Environment, tables: TaskTables) -> Environment:
     """The task environment with another task over the same propositions; runs under ``jit`` and ``vmap``."""
     task_tables(environment)
     validation.instance("tables", tables, TaskTables, "those of make_task_tables")
-    tasked: PyTree = environment
+    return with_tables(without_task(environment)[0], tables)
+
+
+def without_task(environment: Environment) -> tuple[Environment, TaskTables | None]:
+    """The environment inside :func:`task_environment` and the tables; any other environment and None."""
+    tasked = cast(PyTree, require_environment(environment))
+    if getattr(tasked.observe, "func", None) is not _observe:
+        return environment, None
     parts: dict[str, PyTree] = {
         name: None if (part := getattr(tasked, name)) is None else part.args[-1]
         for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
     }
-    return _beside(replace(environment, **parts, observations=tasked.observations.world), tables)
+    inner = replace(environment, **parts, observations=tasked.observations.world)
+    return inner, task_tables(environment)
 
 
 def task_tables(environment: Environment) -> TaskTables:
@@ -387,7 +395,8 @@ def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree)
 # --- the functions of the joint world -------------------------------------------------------------
 
 
-def _beside(inner: Environment, tables: TaskTables) -> Environment:
+def with_tables(inner: Environment, tables: TaskTables) -> Environment:
+    """The product of an environment and the tables of a task over its propositions."""
     if tables.embedding is None:
         memory = make_box(0, 1, tables.delta.shape[-2:-1])
     else:
@@ -486,11 +495,14 @@ def _read_on(
 def _observe(
     tables: TaskTables, observe: Callable[..., PyTree], joint: TaskWorld
 ) -> TaskObservation:
+    return TaskObservation(observe(joint.world), memory_seen(tables, joint.memory))
+
+
+def memory_seen(tables: TaskTables, memory: jax.Array) -> jax.Array:
+    """What a :class:`TaskObservation` has of an automaton state."""
     if tables.embedding is None:
-        memory = jax.nn.one_hot(joint.memory, tables.delta.shape[-2])
-    else:
-        memory = jnp.asarray(tables.embedding)[joint.memory]
-    return TaskObservation(observe(joint.world), memory)
+        return jax.nn.one_hot(memory, tables.delta.shape[-2])
+    return jnp.asarray(tables.embedding)[memory]
 
 
 # --- tables ---------------------------------------------------------------------------------------

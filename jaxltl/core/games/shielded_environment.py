@@ -14,6 +14,8 @@ from jaxltl.core import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core.environments.episodes import with_time_limit, without_time_limit
+from jaxltl.core.environments.task_environment import with_tables, without_task
 from jaxltl.core.environments.environment import (
     Environment,
     Finite,
@@ -75,7 +77,8 @@ def shield_environment(
       strategy: of a model or a game with one move for each step of the world; or a mask
         ``bool[S, A]``, or ``bool[S, Q, A]``.
       state_of: ``world -> int``, the model's state of a world; of a mask with more axes a tuple of
-        them. Default: the world itself.
+        them. Default: the world itself; with a time limit or a task, the world inside of it is
+        shielded.
 
     Returns:
       The environment.
@@ -96,6 +99,13 @@ def shield_environment(
     environment = require_environment(environment)
     if not isinstance(environment.actions, Finite):
         raise ValueError("a shield is for finitely many actions; this world's are of a box.")
+    if state_of is None:  # the model's states are those of the world below a clock or a task
+        inner, limit = without_time_limit(environment)
+        if limit is not None:
+            return with_time_limit(shield_environment(inner, strategy), limit)
+        inner, tables = without_task(environment)
+        if tables is not None:
+            return with_tables(shield_environment(inner, strategy), tables)
     place = Partial(_itself) if state_of is None else as_partial(state_of, "state_of")
     if isinstance(strategy, Permissive | Winning):
         guide = _guide(strategy)
@@ -145,9 +155,12 @@ def _require_places(environment: Environment, place: Callable[..., PyTree], coun
     if len(parts) != count or any(
         not hasattr(x, "dtype") or x.shape != () or x.dtype.kind not in "iu" for x in parts
     ):
+        is_default = getattr(place, "func", None) is _itself
+        subject = "the worlds of the environment are" if is_default else "state_of returns"
+        wanted = "an integer" if count == 1 else f"a tuple of {count} integers"
         raise ValueError(
-            f"state_of returns {states}; return {'an integer' if count == 1 else 'a tuple of '}"
-            f"{'' if count == 1 else f'{count} integers'}, the state of the model that a world is."
+            f"{subject} {states}; {'give state_of, which returns' if is_default else 'return'} "
+            f"{wanted}, the state of the model that a world is."
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
+import jaxltl as jl
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import Agent, run_episode
 from jaxltl.core.environments.model_environment import model_environment
@@ -208,3 +209,43 @@ def test_a_box_of_actions_has_no_mask():
     )
     with pytest.raises(ValueError, match="finitely many actions"):
         shield_environment(world, np.ones((1, 2), bool))
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("tasked", [True, False])
+def test_a_world_below_a_clock_or_a_task_is_shielded(timed, tasked):
+    """As if the shield were put on first: masks on all paths are equal."""
+    model = jl.gridworld("a b .\n. . .", initial="a")
+    strategy = jl.permissive_strategy(model, "G !b")
+    world = jl.environments.model_environment(model)
+    wrap = [lambda x: jl.environments.with_time_limit(x, 9)] if timed else []
+    wrap += [lambda x: jl.task_environment(x, "G !b")] if tasked else []
+    late, early = world, jl.games.shield_environment(world, strategy)
+    for layer in wrap:
+        late, early = layer(late), layer(early)
+    late = jl.games.shield_environment(late, strategy)
+    key = jax.random.key(0)
+    one, other = late.reset(key), early.reset(key)
+    for i in range(6):
+        mask = np.asarray(late.allowed(one))
+        np.testing.assert_array_equal(mask, early.allowed(other))
+        assert i or not mask.all()
+        action = int(np.flatnonzero(mask)[-1])
+        one, other = (
+            x.step(w, action, jax.random.fold_in(key, i)).world
+            for x, w in ((late, one), (early, other))
+        )
+
+
+def test_worlds_that_are_no_states_ask_for_state_of():
+    model = jl.gridworld("a . b", initial="a")
+    strategy = jl.permissive_strategy(model, "G !b")
+    world = jl.environments.model_environment(model)
+    twice = world.replace(
+        reset=lambda key: (world.reset(key), world.reset(key)),
+        step=lambda at, action, key: world.step(at[0], action, key),
+    )
+    with pytest.raises(ValueError, match=r"worlds of the environment are .*; give state_of"):
+        jl.games.shield_environment(twice, strategy)
+    with pytest.raises(ValueError, match="state_of returns"):
+        jl.games.shield_environment(world, strategy, lambda at: at / 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,8 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, as_partial
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.environments.tabulate import TabulatedEnvironment
-from jaxltl.core.environments.episodes import without_time_limit
+from jaxltl.core.environments.episodes import Agent, without_time_limit
+from jaxltl.core.environments.task_environment import TaskObservation, memory_seen, without_task
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, product
@@ -94,7 +95,7 @@ class OptimalityGap(NamedTuple):
 
 
 def tabulate_policy(
-    policy: Callable[..., jax.Array],
+    policy: Callable[..., jax.Array] | Agent,
     environment: Environment,
     table: TabulatedEnvironment,
     num_memory: int,
@@ -103,8 +104,12 @@ def tabulate_policy(
 
     Args:
       policy: function of ``(observation, memory)`` to an action or the probabilities ``float[A]``;
-        `memory` is ``int32[]``, the automaton state. A ``Partial`` is compiled once.
-      environment, table: the tabulated environment and its table.
+        `memory` is ``int32[]``, the automaton state. A ``Partial`` is compiled once. Or an
+        :class:`~jaxltl.core.environments.episodes.Agent` without memory, such as
+        ``ppo.policy(state, problem, hparams)`` of a network without memory.
+      environment, table: the tabulated environment and its table. For an agent of
+        :func:`~jaxltl.core.environments.task_environment.task_environment`, that one, whose
+        observations contain the automaton state.
       num_memory: Q.
 
     Returns:
@@ -126,28 +131,50 @@ def tabulate_policy(
       >>> tabulate_policy(to_the_right, corridor, tabulate(corridor), 2).tolist()
       [[1, 0], [1, 0], [1, 0], [1, 0], [1, 0]]
     """
-    inner, _ = without_time_limit(environment)
     validation.instance("table", table, TabulatedEnvironment, "one of tabulate")
     num_memory = validation.integer("num_memory", num_memory, least=1, limit=2**24)
     count = table.model.num_states
     size = max(1, min(count, _BATCH // num_memory))
-    policy = as_partial(policy, "policy")
+    if isinstance(policy, Agent):
+        _require_tabular(policy)
+    else:
+        policy = as_partial(policy, "policy")
+    inner, tables = without_task(without_time_limit(environment)[0])
+    inner, _ = without_time_limit(inner)
     memory = jnp.arange(num_memory, dtype=jnp.int32)
     parts = []
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
         some = jax.tree.map(lambda x, i=place: jnp.asarray(x)[i], table.world)
-        parts.append(np.asarray(_acts(policy, inner, memory, some))[: count - begin])
+        parts.append(np.asarray(_acts(policy, (inner, tables), memory, some))[: count - begin])
     return np.concatenate(parts)
 
 
 @jit()
-def _acts(policy: PyTree, environment: Environment, memory: jax.Array, worlds: PyTree) -> jax.Array:
-    def one(world: PyTree) -> jax.Array:
-        result: jax.Array = jax.vmap(partial(policy, environment.observe(world)))(memory)
-        return result
+def _acts(policy: PyTree, observed: PyTree, memory: jax.Array, worlds: PyTree) -> jax.Array:
+    environment, tables = observed
 
-    return jax.vmap(one)(worlds)
+    def one(world: PyTree, memory: jax.Array) -> jax.Array:
+        observation = environment.observe(world)
+        if tables is not None:
+            observation = TaskObservation(observation, memory_seen(tables, memory))
+        allowed = None if environment.allowed is None else environment.allowed(world)
+        if not isinstance(policy, Agent):
+            return cast(jax.Array, policy(observation, memory))
+        if policy.probabilities is not None:
+            return policy.probabilities(policy.act, policy.memory, observation, allowed)
+        return cast(jax.Array, policy.act(policy.memory, observation, allowed, None)[0])
+
+    return jax.vmap(lambda world: jax.vmap(partial(one, world))(memory))(worlds)
+
+
+def _require_tabular(agent: Agent) -> None:
+    """Raises ValueError for an agent whose actions depend on more than the observation."""
+    if jax.tree.leaves(agent.memory):
+        raise ValueError(
+            "policy is an Agent with a memory of its own, which is no function of the state; give an "
+            "agent without memory, or evaluate(key, agent, environment)."
+        )
 
 
 def optimality_gap(

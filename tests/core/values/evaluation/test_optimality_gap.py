@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
+from jaxltl.algos import ppo
 from jaxltl.core.automata.automaton import accepts_lasso, letter_index
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Timestep, make_environment
-from jaxltl.core.environments.episodes import Agent, run_episode
+from jaxltl.core.environments.episodes import Agent, run_episode, with_time_limit
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import task_environment
@@ -245,3 +246,40 @@ def test_what_does_not_fit_is_named():
         optimality_gap(table, TASKS[1], np.full((count, 3, A), np.nan), num_steps=3)
     with pytest.raises(ValueError, match="cuts episodes off"):
         optimality_gap(table, TASKS[1], np.full((count, 3, A), 0.5))
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_a_learned_agent_is_tabulated_as_it_acts(sampled):
+    """Of a PPO agent in the environment of its task: its probabilities, or its likeliest actions."""
+    corridor = make_environment(
+        lambda key: jnp.int32(2),
+        lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+        lambda at: at[None] / 4,
+        actions=2,
+        labels=lambda at: at == jnp.array([0, 4]),
+        propositions=["a", "b"],
+    )
+    task, table = task_environment(with_time_limit(corridor, 9), "F (a & F b)"), tabulate(corridor)
+    count = len(to_automaton("F (a & F b)").delta)
+    problem = ppo.make_problem(task)
+    hparams = ppo.Hparams(discount=0.9, num_envs=2, num_steps=2, num_minibatches=1)
+    state = ppo.init(jax.random.key(0), problem, hparams)
+    agent = (ppo.policy if sampled else ppo.greedy)(state, problem, hparams)
+    found = tabulate_policy(agent, task, table, count)
+    assert found.shape == (5, count, 2)
+    np.testing.assert_allclose(found.sum(-1), 1, rtol=1e-5)
+    keys = jax.random.split(jax.random.key(2), 4000)
+    world = task.reset(jax.random.key(1))
+    for place in range(5):
+        seen = task.observe(world._replace(world=(jnp.int32(place), jnp.int32(0))))
+        acts = jax.vmap(lambda key, seen=seen: agent.act((), seen, None, key)[0])(keys)
+        row = found[np.asarray(table.world).tolist().index(place), int(world.memory)]
+        np.testing.assert_allclose(float(acts.mean()), row[1], atol=0.04)
+    assert optimality_gap(table, "F (a & F b)", found).mean[1] >= 0
+
+
+def test_an_agent_with_memory_is_refused():
+    world = letter_world(layout="a .\n. b", letters=2, horizon=8)
+    agent = Agent(lambda memory, *rest: (0, memory), memory=jnp.zeros(3))
+    with pytest.raises(ValueError, match="policy is an Agent with a memory"):
+        tabulate_policy(agent, world, tabulate(world), 2)
