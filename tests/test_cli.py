@@ -421,6 +421,33 @@ def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F
     assert written["best_achievable"]["minimum"]["value"] == 0
 
 
+@pytest.mark.parametrize(("starts", "others"), [("o", ""), ("o | w", " and the other 1 initial")])
+def test_a_task_that_is_lost_from_every_start_is_an_error(tmp_path, starts, others):
+    shown = {"demonstrations": [{"cells": [[1, 3], [2, 3]], "actions": ["down", "left"]}]}
+    (tmp_path / "shown.json").write_text(json.dumps(shown))
+    (tmp_path / "task.toml").write_text(
+        f'''name = "lost"
+[world]
+map = """
+s . o
+w o g
+"""
+initial = "{starts}"
+[task]
+formula = "!o & !w & (!o U g)"
+[demonstrations]
+file = "shown.json"
+[learner]
+method = "mlirl"
+discount = 0.5'''
+    )
+    for command in ("learn", "check"):
+        out = () if command == "check" else ("--out", tmp_path / "out")
+        result = run(command, tmp_path / "task.toml", *out)
+        assert result.exit_code == 2
+        assert f"from row 1, column 3{others}" in result.output, result.output
+
+
 @pytest.mark.parametrize(
     ("replacement", "message"),
     [

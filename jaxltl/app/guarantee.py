@@ -104,6 +104,19 @@ def ask(
     return Guarantee(requested, over, best, actions, lost, cost, used=used)
 
 
+def require_possible(model: Product, world: World, best: Solution) -> None:
+    """Raises ValueError if no policy satisfies the formula from any initial state."""
+    starts = np.argwhere(np.asarray(model.initial) > 0)
+    if (np.asarray(best.upper)[tuple(starts.T)] > 0).any():
+        return
+    place = world.position_text(int(starts[0, 0]))
+    others = "" if len(starts) == 1 else f" and the other {len(starts) - 1} initial states"
+    raise ValueError(
+        f"initial: no policy satisfies the formula with positive probability from {place}{others}; "
+        "change initial, the map or the formula."
+    )
+
+
 def used_steps(
     model: Product, best: Solution, mistake: np.ndarray, demonstrations: Trajectories
 ) -> np.ndarray:

@@ -27,6 +27,7 @@ from jaxltl.app.guarantee import (
     Search,
     check_formula,
     guarantee_entry,
+    require_possible,
     StepBound,
     about_steps,
     neg_log_likelihood,
@@ -366,6 +367,8 @@ def prepare(task: MlirlFile, seed: int) -> Setup:
         model = product(world.mdp, task.formula, label_on=task.label_on)
         trivial = check_formula(model.automaton)
     best = optimal_satisfaction(model)
+    with errors_in(f"{task.path}: [world] "):
+        require_possible(model, world, best)
     table = task.demonstrations
     if table.file is not None:
         demonstrations, dropped = load_demonstrations(task, world), 0

@@ -434,12 +434,8 @@ class _Parser(TokenStream):
         comparison = self.expression(SIMPLE)
         if comparison.is_literal and isinstance(comparison.value, bool):
             return TRUE if comparison.value else FALSE
-        self.require(
-            comparison.operator != "name" or comparison.value in self.known.variables,
-            f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
-            f"such as {start.text}=1",
-            start,
-        )
+        is_variable = comparison.operator != "name" or comparison.value in self.known.variables
+        self.require(is_variable, _instead_of(start.text), start)
         is_number = comparison.operator in _NUMBERS or comparison.is_literal
         self.require(not is_number, "a comparison, such as x+1<=3")
         return self.defined(Comparison(self.written(start), comparison))
@@ -554,10 +550,40 @@ class _Parser(TokenStream):
 
     def reach_content(self, wanted: str = "F and a state formula") -> Formula:
         start = self.token
+        following = self.tokens[min(self.place + 1, len(self.tokens) - 1)]
+        is_bounded = start.text == "F" and following.text in (
+            "<=",
+            "<",
+            ">=",
+            ">",
+            "=",
+            "[",
+            "{",
+            "^",
+        )
+        self.require(
+            not is_bounded,
+            f"{wanted}; F without a bound, since a reward until a bounded path is not solved for",
+            following,
+        )
         path = self.path()
         if isinstance(path, Bounded) or path.operator != "F" or not is_boolean(path.operands[0]):
+            if isinstance(path, Formula) and path.operator == "F":
+                wanted += "; only labels and comparisons, not a path, under F"
             raise self.error(wanted, start)
         return path
+
+
+def _instead_of(word: str) -> str:
+    """What is expected in place of a word that is neither a name nor an operator."""
+    if word in ("Y", "Z", "O", "H", "S", "B", "T"):
+        return "an operator of the future, X F G U W R; those of the past, such as Y O H S, are not read"
+    if set(word) <= set("XFGUWRM"):
+        return (
+            "X, F or G, with blanks between operators; U, W and R stand between two formulas, and "
+            "a M b is (b) U (a & b)"
+        )
+    return f'a label in double quotes, such as "{word}", or a comparison of variables, such as {word}=1'
 
 
 _AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")

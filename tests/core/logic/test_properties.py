@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
-from jaxltl.core.logic.comparisons import program_definitions
+from jaxltl.core.logic.comparisons import Definitions, program_definitions
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.logic.properties import parse_properties, parse_property
 
@@ -334,3 +334,32 @@ def test_names_of_a_program_are_used_in_properties():
     assert [found[i].reward for i in (1, 2)] == [None, "b"]
     assert (found[3].path.reward, found[3].path.limit) == ("b", 4)
     assert len(found) == 6
+
+
+NEAR_MISSES = {
+    'R=? [ F<=3 "a" ]': "column 8: found '<=', .* F without a bound",
+    "R=? [ F<=3 a ]": "column 8: found '<=', .* F without a bound",
+    'T=? [ F[1,3] "a" ]': r"column 8: found '\[', .* F without a bound",
+    'R=? [ F G "a" ]': "column 7: .* not a path, under F",
+    'P=? [ O "a" ]': "column 7: found 'O', .* those of the past",
+    "P=? [ O a ]": "column 7: found 'O', .* those of the past",
+    "P=? [ WX a ]": "column 7: found 'WX', .* with blanks between",
+    'P=? [ F "a" || F "b" ]': "column 13: .*conditional probability.*at least one of them",
+    'P=? [ "a" U "b" || "c" ]': "conditional probability",
+    'P=? [ F<=3 "a" || F "b" || "c" ]': "conditional probability",
+    "Pmax=? [ F a ]": 'column 12: found .a., expected a label in double quotes, such as "a"',
+}
+
+
+@pytest.mark.parametrize("text", NEAR_MISSES)
+def test_near_misses_name_what_is_meant(text):
+    with pytest.raises(ValueError, match=NEAR_MISSES[text]):
+        parse_properties(text)
+
+
+def test_a_remainder_is_written_as_in_programs():
+    known = Definitions(variables=("s",))
+    for text in ("P=? [ F s%2=1 ]", "P=? [ F s % 2 = 1 ]", "P=? [ F (s%2)=1 ]"):
+        (found,) = parse_properties(text, known)
+        ((_, comparison),) = found.definitions
+        assert comparison.holds({"s": np.arange(4)}).tolist() == [False, True, False, True]
