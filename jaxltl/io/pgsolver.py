@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.games.objective import Parity
+from jaxltl.core.games.objective import Parity, fewest_priorities
 from jaxltl.core.models import Game, SparseMDP, make_game, make_sparse
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.ops.array_namespace import to_jax
@@ -69,9 +69,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
 
 def min_even(priority: Integers) -> Integers:
     """Converts max-even to min-even priorities, compressed to the fewest values."""
-    values, place = np.unique(-priority, return_inverse=True)
-    number = np.cumsum([*(values[:1] % 2), *(np.diff(values) % 2)])
-    return number[place.reshape(priority.shape)].astype(np.int32)
+    return fewest_priorities(-priority)
 
 
 _SPACE = re.compile(r"(?:\s+|//[^\n]*)*")

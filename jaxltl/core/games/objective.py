@@ -246,8 +246,18 @@ def parity(
             raise ValueError(
                 f"state {state.tolist()} has priority {values.min()}; priorities start at 0."
             )
+        if values.max(initial=0) > 2 * values.size:  # most of them are not in use
+            priority = values = fewest_priorities(values)
         num_priorities = int(values.max(initial=0)) + 1
     return _parity(game, priority, num_priorities, safe)
+
+
+def fewest_priorities(priority: np.ndarray) -> np.ndarray:
+    """The least nonnegative priorities with the same order of even and odd ones, ``int32``."""
+    values, place = np.unique(priority, return_inverse=True)
+    parity = values % 2
+    number = np.cumsum([*parity[:1], *(parity[1:] != parity[:-1])])
+    return number[place.reshape(priority.shape)].astype(np.int32)
 
 
 def _parity(

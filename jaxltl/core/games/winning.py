@@ -7,8 +7,8 @@ both win surely. Regions are computed on supports, exactly, as fixed points of a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import NamedTuple, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -256,47 +256,114 @@ class _Arena(NamedTuple):
     objective: Parity
 
 
+_MAX_TRACED = 64  # priorities in a traced game, whose loops are nested as deeply
+
+
 def solve_parity(
     graph: Graph, system: Array, objective: Parity, moves: Array | None = None
 ) -> _Found:
     """Winning region of a parity game, with moves of both players."""
+    if graph.xp is not np and objective.num_priorities > _MAX_TRACED:
+        raise ValueError(
+            f"the objective has {objective.num_priorities} priorities; inside of jit at most "
+            f"{_MAX_TRACED} are supported. Solve the game outside of jit."
+        )
     moves = graph.available if moves is None else moves & graph.available
     start = _Found(objective.won & ~objective.lost, graph.first(moves)[1])
     open_ = ~(objective.won | objective.lost)
-    return _level(_Arena(graph, system, objective), 0, start, open_, moves)
+    return _solved(_Arena(graph, system, objective), _Level(0, start, open_, moves))
 
 
-def _level(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
-    """The undecided states from which the system wins, if reaching `won` is winning too."""
-    if p == arena.objective.num_priorities:
-        return won
-    solve = _even if p % 2 == 0 else _odd
-    return solve(arena, p, won, open_, allowed)
+class _Level(NamedTuple):
+    """Undecided states with priorities of at least p, in which reaching `won` is winning."""
+
+    p: int
+    won: _Found
+    open_: Array
+    allowed: Array
 
 
-def _even(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
+# Levels yield the levels below them and are sent their solutions.
+_Solving: TypeAlias = Generator[_Level, PyTree, PyTree]
+
+
+def _solved(arena: _Arena, level: _Level) -> _Found:
+    """The undecided states from which the system wins, with levels on a stack of their own."""
+    stack: list[_Solving] = []
+    solution: PyTree = None
+    task: _Level | None = level
+    while True:
+        if task is not None:
+            p = _next_priority(arena, task)
+            if p == arena.objective.num_priorities:
+                solution, task = task.won, None
+            else:
+                solve = _even if p % 2 == 0 else _odd
+                stack.append(solve(arena, p, *task[1:]))
+                solution = None
+        if task is None and not stack:
+            return cast(_Found, solution)
+        try:
+            task = stack[-1].send(solution)
+        except StopIteration as stop:
+            stack.pop()
+            solution, task = stop.value, None
+
+
+def _next_priority(arena: _Arena, level: _Level) -> int:
+    """The least priority from p on; of concrete arrays, of those that undecided states have.
+
+    An odd level relies on an even one around it, without undecided states of its priority or with.
+    """
+    count = arena.objective.num_priorities
+    if arena.graph.xp is not np:
+        return level.p
+    p = int(arena.objective.priority[level.open_].min(initial=count))
+    return p - 1 if p < count and p % 2 == 1 and level.p % 2 == 0 else p
+
+
+def _repeat(arena: _Arena, body: Callable[[PyTree], _Solving], carry: PyTree) -> _Solving:
+    """Repeats `body` while the last entry of the carry is true."""
+    if arena.graph.xp is not np:
+        return arena.graph.repeat(lambda x: _drained(arena, body(x)), carry)
+    while carry[-1]:
+        carry = yield from body(carry)
+    return carry
+
+
+def _drained(arena: _Arena, solving: _Solving) -> PyTree:
+    """The result of a level, whose levels below are traced in it."""
+    solution: PyTree = None
+    while True:
+        try:
+            solution = _solved(arena, solving.send(solution))
+        except StopIteration as stop:
+            return stop.value
+
+
+def _even(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Solving:
     """Greatest fixpoint: the system can remain, and meeting p infinitely often is winning."""
     graph, system, objective = arena
     xp = graph.xp
     here = open_ & (objective.priority == p)
 
-    def body(carry: PyTree) -> PyTree:
+    def body(carry: PyTree) -> _Solving:
         inside, solution, _ = carry
         # The environment can force the play out with positive probability.
         escaped = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
         action = xp.where(inside & escaped.region, escaped.action, solution.action)
         inside = inside & ~escaped.region
         good = _Found(won.region | (here & inside), action)
-        deeper = _level(arena, p + 1, good, open_ & ~here & inside, allowed)
+        deeper = yield _Level(p + 1, good, open_ & ~here & inside, allowed)
         return deeper.region, deeper, xp.any(deeper.region != inside)
 
     inside = won.region | open_
-    inside, solution, _ = graph.repeat(body, (inside, won, xp.asarray(True)))
+    inside, solution, _ = yield from _repeat(arena, body, (inside, won, xp.asarray(True)))
     stays = graph.first(allowed & graph.forall(inside))[1]
     return _Found(inside, xp.where(here & inside & system, stays, solution.action))
 
 
-def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
+def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Solving:
     """Least fixpoint: the system can avoid meeting p infinitely often."""
     graph, system, objective = arena
     xp = graph.xp
@@ -304,7 +371,7 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _F
     # The system makes no move that may leave what an even priority above has it remain in.
     allowed = allowed & (graph.forall(won.region | open_) | ~graph.on_choices(system))
 
-    def body(carry: PyTree) -> PyTree:
+    def body(carry: PyTree) -> _Solving:
         solution, _ = carry
         drawn = attract(graph, solution.region, allowed, rule=system, among=open_)
         new = drawn.region & ~solution.region & system
@@ -312,10 +379,10 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _F
         remain = open_ & ~here & ~attracted.region
         # The environment's other moves help the system.
         closer = graph.exists(attracted.region) & ~graph.on_choices(system)
-        deeper = _level(arena, p + 1, attracted, remain, allowed & ~closer)
+        deeper = yield _Level(p + 1, attracted, remain, allowed & ~closer)
         return deeper, xp.any(deeper.region != attracted.region)
 
-    solution, _ = graph.repeat(body, (won, xp.asarray(True)))
+    solution, _ = yield from _repeat(arena, body, (won, xp.asarray(True)))
     avoids = graph.first(allowed & ~graph.exists(solution.region))[1]
     refused = here & ~solution.region & ~system
     return _Found(solution.region, xp.where(refused, avoids, solution.action))

@@ -24,6 +24,7 @@ from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
+from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.graph import attractor as host_attract
 from tests import reference, reference_games
 from tests.support import as_mdp, bit_labels, counts, random_product
@@ -558,3 +559,29 @@ def test_nested_depth_on_the_host(monkeypatch):
         found = solve(objective)
         np.testing.assert_array_equal(found.region, region)
         assert verify(found)
+
+
+def test_many_priorities():
+    """Priorities that are far apart, all different or beyond 2^31 stand for the same game."""
+    rng = np.random.default_rng(7)
+    for play in larger_games(rng, 12, shapes=((20, 2, 2), (40, 2, 2))):
+        game, count = as_game(play), play.model.num_states
+        priority = rng.integers(NUM_PRIORITIES, size=count)
+        expected = winning_region(game, parity(game, priority)).region
+        apart = priority * (2 * count + 1)
+        for same in (apart, apart + 2 * rng.permutation(count), priority + 2**40):
+            found = winning_region(game, parity(game, same))
+            np.testing.assert_array_equal(found.region, expected)
+            assert verify(found)
+
+
+def test_hundreds_of_priorities_in_one_component():
+    length = 700
+    successor = np.roll(np.arange(length), -1)
+    circle = make_sparse(None, np.arange(length + 1), successor, np.ones(length))
+    game = make_game(circle, np.arange(length) % 3 == 0)
+    for least in (0, 1):
+        found = winning_region(game, parity(game, np.arange(length) + least))
+        assert (np.asarray(found.region) == (least == 0)).all() and verify(found)
+    with pytest.raises(ValueError, match="inside of jit at most"):
+        compiled(game, parity(game, np.arange(length)))
