@@ -79,7 +79,7 @@ cache_all_programs()
 import jax  # noqa: E402
 import jax.experimental  # noqa: E402
 
-# In JAX 0.7 tests find two functions where later versions have them.
+# Tests find two functions where later versions than JAX 0.7 and 0.8 have them.
 if not hasattr(jax, "enable_x64"):
     jax.enable_x64 = jax.experimental.enable_x64
 if not hasattr(jax.monitoring, "unregister_event_duration_listener"):

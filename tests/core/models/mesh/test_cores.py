@@ -70,6 +70,9 @@ def test_lanes_are_as_if_alone(number, double):
         assert_equal(jax.jit(batch)(states(number), 4.0), found)
 
 
+@pytest.mark.skipif(
+    jax.__version_info__ < (0, 10), reason="older JAX makes callbacks of parts one after another"
+)
 def test_the_parts_are_computed_at_once():
     meeting = threading.Barrier(2, timeout=TIMEOUT)
 
