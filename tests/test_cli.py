@@ -421,7 +421,7 @@ def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F
     assert written["best_achievable"]["minimum"]["value"] == 0
 
 
-@pytest.mark.parametrize(("starts", "others"), [("o", ""), ("o | w", " and the other 1 initial")])
+@pytest.mark.parametrize(("starts", "others"), [("o", ""), ("o | w", " and the other 2 initial")])
 def test_a_task_that_is_lost_from_every_start_is_an_error(tmp_path, starts, others):
     shown = {"demonstrations": [{"cells": [[1, 3], [2, 3]], "actions": ["down", "left"]}]}
     (tmp_path / "shown.json").write_text(json.dumps(shown))
