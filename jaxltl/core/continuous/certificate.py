@@ -330,11 +330,8 @@ def prove(
     dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
 ) -> tuple[Certificate, Abstraction, Bounds]:
     """The certificate of a step under the best actions of a grid, and its parts."""
-    settings: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
-    settings["tolerance"] = validation.finite_number("tolerance", settings.get("tolerance", 1e-3))
-    if settings.get("threshold") is not None:
-        settings["threshold"] = validation.finite_number("threshold", settings["threshold"])
-    limits = Limits(**settings)
+    limits = _limits(options)
+    validation.instance("formula", formula, (str, Formula), "a formula or its text")
     _require_initial_inside(dynamics)
     grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
@@ -348,6 +345,23 @@ def prove(
     seconds, text = abstraction.seconds, str(formula)
     certificate = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
     return certificate, abstraction, bounds
+
+
+def _limits(options: ProofOptions) -> Limits:
+    """The checked options of a proof, without its first grid."""
+    settings: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
+    for name, value in settings.items():
+        if name == "tolerance":
+            validation.require_in_range(name, value)
+        elif name == "threshold" and value is not None:
+            settings[name] = validation.fraction(name, value)
+        elif name in ("max_cells", "max_sweeps"):
+            settings[name] = validation.integer(name, value, least=1)
+        elif name == "upper":
+            settings[name] = validation.boolean(name, value)
+        elif name == "report":
+            validation.function(name, value)
+    return Limits(**settings)
 
 
 def _require_initial_inside(dynamics: Dynamics) -> None:
@@ -399,7 +413,8 @@ def first_grid(
         ends = dynamics.initial.high[:, axis]
         ends = np.nextafter(ends[~np.isin(ends, edges)], np.inf)
         breakpoints.append(np.unique([*edges, *dynamics.initial.low[:, axis], *ends]))
-    shape = tuple(int(k) for k in np.atleast_1d(cells))
+    each = [cells] if np.ndim(cells) == 0 else validation.sequence("cells", cells)
+    shape = tuple(validation.integer("cells", k, least=1, limit=2**31 - 1) for k in each)
     count = int(np.prod([float(k) for k in shape]))
     limit = min(max_cells, PAIRS // num_actions)
     if count > limit:
@@ -453,6 +468,9 @@ def counterexample(
       >>> len(run), bool(run[-1, 0] >= 0.8)
       (4, True)
     """
+    num_steps = validation.integer("num_steps", num_steps, least=1, limit=2**31 - 1)
+    if certificate is not None:
+        validation.instance("certificate", certificate, Certificate, "that of certify_policy")
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     if certificate is not None:
         cells = np.flatnonzero(certificate.initial)

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
 
@@ -114,10 +115,14 @@ def make_grid(
       >>> make_grid(np.zeros(1), np.ones(1), [4], [[0.3]]).edges[0].tolist()
       [0.0, 0.3, 0.5, 0.75, 1.0]
     """
-    if len(shape) != len(low) or any(int(k) < 1 for k in shape):
+    low, high = validation.float_array("low", low), validation.float_array("high", high)
+    sizes = validation.sequence("cells", shape)
+    if low.ndim != 1 or high.shape != low.shape or len(sizes) != len(low):
         raise ValueError(
-            f"cells={tuple(shape)} for {len(low)} coordinates; give one positive number for each."
+            f"cells={validation.shorten(sizes)} for a domain of shapes {list(low.shape)} and "
+            f"{list(high.shape)}; give low and high float[n], and one positive number for each axis."
         )
+    shape = [validation.integer("cells", k, least=1, limit=2**31 - 1) for k in sizes]
     edges = []
     for axis, count in enumerate(shape):
         e = np.linspace(low[axis], high[axis], int(count) + 1)

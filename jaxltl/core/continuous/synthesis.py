@@ -21,6 +21,7 @@ from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.environments.environment import Environment, Finite, Timestep, make_environment
 from jaxltl.core.games.shielded_environment import ShieldedWorld, of_world
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.types import require_shape
 from jaxltl.core.pretty_print import brief
 
 
@@ -203,6 +204,9 @@ def simulate_cells(
       >>> bool(jnp.allclose(states[:, 0], jnp.array([0.1, -0.1, -0.3, -0.5]), atol=1e-6))
       True
     """
+    validation.instance("policy", policy, CellPolicy, "that of synthesize_policy")
+    num_steps = validation.integer("num_steps", num_steps, limit=2**31 - 1)
+    require_shape("state", state, (policy.dynamics.num_states,))
 
     def step(
         carry: tuple[jax.Array, Array], key: jax.Array

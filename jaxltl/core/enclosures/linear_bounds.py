@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Array
 from jaxltl.core.enclosures import elementwise
 from jaxltl.core.enclosures.elementwise import Relaxation
@@ -481,8 +482,8 @@ def enclose(
       >>> bool(low <= 0), bool(0.25 <= high < 0.4)
       (True, True)
     """
-    if method not in METHODS:
-        raise ValueError(f"method={method!r}; it must be one of {', '.join(METHODS)}.")
+    validation.choice("method", method, METHODS)
+    validation.function("function", function)
 
     def enclosed(low: PyTree, high: PyTree) -> tuple[PyTree, PyTree]:
         known = over_boxes(function, low, high, method == "linear")
