@@ -10,7 +10,7 @@ that are left, so that a policy realises it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.qualitative import end_components, shortest_path_rows
-from jaxltl.core.sparse.linear.rationals import rational_distribution
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.multi_objective.weighted_sum import FinalComponents
 
@@ -36,6 +35,14 @@ class Goal(NamedTuple):
     place: int  # without a reward: the number of the probability
     pending: Booleans | None  # bool[N], where stopping is worth infinity: the target is missed
     least: Fraction | None  # the threshold
+
+
+class ExactModel(NamedTuple):
+    """A model with rational probabilities."""
+
+    mdp: HostMDP
+    distribution: Callable[[int], dict[int, Fraction]]  # of the successors of a row
+    start: dict[int, Fraction]  # the initial distribution
 
 
 class _TooLarge(Exception):
@@ -64,19 +71,19 @@ class _Column(NamedTuple):
 
 
 def solve_exactly(
-    mdp: HostMDP,
-    start: dict[int, Fraction],
+    model: ExactModel,
     where: FinalComponents,
     goals: Sequence[Goal],
     index: int | None = None,
 ) -> ExactAnswer | None:
     """Decides the thresholds of goals, and maximises one under them; None if the model is large."""
+    mdp = model.mdp
     rows = np.flatnonzero(where.rows)
     states = np.flatnonzero(mdp.states_of(where.rows))
     size = states.size + len(goals)
     if size * (rows.size + states.size + size) > _MAX_CELLS:
         return None
-    columns = _columns(mdp, rows, where, goals)
+    columns = _columns(model, rows, where, goals)
     try:
         # Unless a reward is infinite, a circulation that is not reached is of no use.
         cyclic = end_components(mdp, rows=where.rows).inside
@@ -89,7 +96,7 @@ def solve_exactly(
             if goal.least is not None
         ]
         basis = _proper_columns(mdp, states, columns)
-        simplex = _connected(_Program(columns, basis, start, constraints), endless)
+        simplex = _connected(_Program(columns, basis, model.start, constraints), endless)
         if simplex is None:
             return ExactAnswer(False, None)
         return ExactAnswer(True, None if index is None else simplex.largest_goal(index))
@@ -98,16 +105,16 @@ def solve_exactly(
 
 
 def _columns(
-    mdp: HostMDP, rows: Integers, where: FinalComponents, goals: Sequence[Goal]
+    model: ExactModel, rows: Integers, where: FinalComponents, goals: Sequence[Goal]
 ) -> list[_Column]:
     """The columns of rows, of stopping, and of infinite rewards."""
+    mdp = model.mdp
     zero, one = Fraction(0), Fraction(1)
     columns = []
     for r in rows.tolist():
-        s, span = int(mdp.state[r]), slice(*mdp.entry_start[r : r + 2].tolist())
+        s = int(mdp.state[r])
         flow = {s: one}
-        shares = rational_distribution(mdp.probability[span].tolist())
-        for t, p in zip(mdp.successor[span].tolist(), shares, strict=True):
+        for t, p in model.distribution(r).items():
             flow[t] = flow.get(t, zero) - p
         earned = [zero if g.reward is None else g.reward[r] for g in goals]
         columns.append(_Column(s, flow, earned, row=r))

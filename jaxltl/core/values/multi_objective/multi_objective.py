@@ -53,7 +53,7 @@ def achievable(
     Each weighted sum adds a point that its policy attains and a half-space that no policy leaves
     (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a mixture of points meets them, and
     not if a half-space excludes them. On the boundary, small models are decided by a linear program
-    in fractions, those that their doubles stand for: 0.1 is one tenth.
+    in rational arithmetic.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.

@@ -5,16 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward
+from jaxltl.core.models.number_source import Rationals
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, reward_structure
+from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.graph.qualitative import end_components
-from jaxltl.core.sparse.linear.rationals import rational, rational_distribution
-from jaxltl.core.sparse.multi_objective.exact_program import ExactAnswer, Goal, solve_exactly
+from jaxltl.core.sparse.multi_objective.exact_program import (
+    ExactAnswer,
+    ExactModel,
+    Goal,
+    solve_exactly,
+)
 from jaxltl.core.sparse.multi_objective.weighted_sum import (
     FinalComponents,
     WeightedProblem,
@@ -23,6 +31,8 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import (
 from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.values.multi_objective.answers import Front
 from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
+
+MAX_ROWS = 5000  # of models whose numbers are read as fractions, before it is known what is used
 
 
 class Query(NamedTuple):
@@ -86,34 +96,48 @@ class Query(NamedTuple):
     ) -> ExactAnswer | None:
         """The answer in rational arithmetic; None if the model is large.
 
-        Probabilities, rewards and thresholds are the fractions that their doubles stand for. The
-        value is that of objective `index`, infinity if None.
+        Probabilities and rewards are those of :func:`exact_numbers`. The value is that of objective
+        `index`, infinity if None.
         """
         if self.ends is None:
             return ExactAnswer(False, None)
-        goals = []
+        if self.problem.mdp.num_rows > MAX_ROWS or self.model.num_rows > MAX_ROWS:
+            return None
+        numbers, goals = exact_numbers(self.model), []
         for part, limit in zip(self.parts, limits, strict=True):
             least = None
             if limit is not None:
-                exact = rational(limit) if isinstance(limit, float) else Fraction(limit)
-                least = part.sign * exact + (part.kind == "sure" and part.sign < 0)
+                least = part.sign * Fraction(limit) + (part.kind == "sure" and part.sign < 0)
             pending = part.pending if part.kind == "gain" else None
-            goals.append(Goal(self._rewards(part), part.place, pending, least))
-        mdp, start = self.problem.mdp, np.flatnonzero(self.problem.start)
-        shares = rational_distribution(self.problem.start[start].tolist())
-        initial = dict(zip(start.tolist(), shares, strict=True))
-        answer = solve_exactly(mdp, initial, self.ends, goals, index)
+            goals.append(Goal(self._rewards(part, numbers), part.place, pending, least))
+        first = np.flatnonzero(self.problem.start)
+        shares = [Fraction(x) for x in self.problem.start[first].tolist()]
+        start = {s: p / sum(shares) for s, p in zip(first.tolist(), shares, strict=True)}
+        model = ExactModel(self.problem.mdp, partial(self._distribution, numbers), start)
+        answer = solve_exactly(model, self.ends, goals, index)
         if answer is None or index is None or answer.value is None:
             return answer
         part = self.parts[index]
         value = part.sign * answer.value + (part.kind == "sure" and part.sign < 0)
         return answer._replace(value=value)
 
-    def _rewards(self, part: Part) -> list[Fraction] | None:
+    def _distribution(self, numbers: Rationals, row: int) -> dict[int, Fraction]:
+        """The successors of a row of the product, with their probabilities."""
+        mdp, base = self.problem.mdp, numbers.mdp.rows[int(self.product.base_row[row])]
+        s = int(mdp.state[row])
+        if self.product.still[s]:
+            return {s: Fraction(1)}
+        successors = mdp.successor[mdp.entry_start[row] : mdp.entry_start[row + 1]].tolist()
+        return {t: base[int(self.product.base_state[t])] for t in successors}
+
+    def _rewards(self, part: Part, numbers: Rationals) -> list[Fraction] | None:
         """The rewards of the product's rows, negative if minimised; None of a probability."""
         if part.kind == "sure":
             return None
-        reward = _exact_reward(self.model, self.objectives[part.number].reward)
+        reward_of = self.objectives[part.number].reward
+        structure = reward_structure(self.model, reward_of)
+        name = reward_of if isinstance(reward_of, str) else None
+        reward = exact_reward(self.model, numbers, structure, name)
         state = self.problem.mdp.state
         counted = np.ones(state.size, bool) if part.pending is None else part.pending[state]
         return [
@@ -142,27 +166,4 @@ def multi_objective_query(
 
 def bounds_of(value: Fraction | None) -> tuple[float, float]:
     """The doubles next to a fraction, below and above; infinity for None."""
-    if value is None:
-        return math.inf, math.inf
-    nearest = float(value)
-    low = nearest if Fraction(nearest) <= value else math.nextafter(nearest, -math.inf)
-    return low, nearest if Fraction(nearest) >= value else math.nextafter(nearest, math.inf)
-
-
-def _exact_reward(model: SparseMDP, reward: Array | str | None) -> list[Fraction]:
-    """The expected reward of each row, of the fractions that doubles stand for."""
-    parts, mdp = reward_structure(model, reward), model.host
-    total = [Fraction(0)] * mdp.num_rows
-    for part, owner in ((parts.state, mdp.state), (parts.choice, np.arange(mdp.num_rows))):
-        if part is not None:
-            numbers = [rational(x) for x in np.asarray(part, np.float64).tolist()]
-            total = [x + numbers[i] for x, i in zip(total, owner.tolist(), strict=True)]
-    if parts.transition is not None:
-        earned = np.asarray(parts.transition, np.float64).tolist()
-        for r in range(mdp.num_rows):
-            span = range(*mdp.entry_start[r : r + 2].tolist())
-            shares = rational_distribution(mdp.probability[span.start : span.stop].tolist())
-            total[r] += sum(
-                (p * rational(earned[e]) for p, e in zip(shares, span, strict=True)), Fraction(0)
-            )
-    return total
+    return double_bounds(math.inf if value is None else value)

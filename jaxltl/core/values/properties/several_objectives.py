@@ -80,7 +80,11 @@ def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
             f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
             "and T are supported."
         )
-    reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
+    # By name, so that its exact numbers are those of the model's source.
+    name = next(iter(model.rewards)) if len(model.rewards) == 1 else None
+    reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward or name
+    if reward is None:
+        reward = choice_reward(model, None)  # which names the rewards
     if isinstance(path, Formula):
         target = states_satisfying(model, path.operands[0], prop.text)
         return {"reward": reward, "target": target}

@@ -10,12 +10,11 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.multi_objective import Objective, multi_objective
 from tests.reference_multi_objective import Question, Unfolded, answer
 
-SPLITS = [
-    (Fraction(1, 2), Fraction(1, 2)),
-    (Fraction(1, 3), Fraction(2, 3)),
-    (Fraction(3, 10), Fraction(7, 10)),
+SPLITS = [  # doubles mean themselves, divided by their sum
+    tuple(Fraction(x) / (Fraction(x) + Fraction(y)) for x, y in pair)
+    for pair in [[(0.5, 0.5)] * 2, [(1 / 3, 2 / 3), (2 / 3, 1 / 3)], [(0.3, 0.7), (0.7, 0.3)]]
 ]
-REWARDS = [Fraction(0)] * 4 + [Fraction(1), Fraction(1, 10), Fraction(2, 3)]
+REWARDS = [Fraction(0)] * 4 + [Fraction(1), Fraction(0.1), Fraction(2 / 3)]
 
 
 def random_case(rng):
