@@ -407,6 +407,7 @@ def about_steps(
         "quickest": bound.quickest.steps.value,
         "quickest_bounds": [bound.quickest.steps.lower, bound.quickest.steps.upper],
         "least": bound.quickest.least,
+        "quickest_status": bound.quickest.status.name,
         "limit": bound.limit,
         "factor": bound.factor if np.isfinite(bound.limit) else None,
         "share": mixture.share,

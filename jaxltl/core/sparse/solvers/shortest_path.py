@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
@@ -13,24 +15,37 @@ _TOLERANCE = 1e-8  # width of the expected times, relative
 _TIE = 1e-10  # relative difference up to which expected times are equal
 
 
+class Fastest(NamedTuple):
+    """Rows ``int[S]`` with the least expected number of steps to a goal, and this number."""
+
+    row: Integers
+    time: Floats
+
+
 def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) -> Integers:
     """The first rows ``int[S]`` that reach a goal in the least expected number of steps."""
+    fastest = fastest_policy(mdp, rows, goal, row)
+    return row if fastest is None else fastest.row
+
+
+def fastest_policy(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) -> Fastest | None:
+    """:func:`fastest_rows` with their time; None without a certificate of it."""
     if goal.all():
-        return row
+        return None
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)
     time = total_reward(mdp, cost, goal, maximize=False, tolerance=_TOLERANCE)
     if not np.isfinite(time.upper).all():
-        return row
+        return None
     width = time.upper - time.lower
     if not (width <= _TOLERANCE * time.upper).all():
-        return row
+        return None
     ahead = np.where(rows, 1 + mdp.expectation(time.value), np.inf)
     slack = np.maximum(_TIE * time.value, width)
     best = mdp.over_choices(np.minimum, ahead) + slack
     first = mdp.first_choice(ahead <= best[mdp.state])[1]
     # A policy still ends if every step costs less than a whole one more.
     chosen = np.where(slack < 0.1, first, time.row)
-    return np.where(goal, row, chosen)
+    return Fastest(np.where(goal, row, chosen), time.value)
 
 
 def expected_steps(mdp: HostMDP, row: Integers, goal: Booleans) -> Floats | None:

@@ -26,10 +26,12 @@ from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.certificates import rounding_unit
 from jaxltl.core.values.engine.host_solution import complement_event, solution_from_enclosure
-from jaxltl.core.values.undiscounted.reachability import (
+from jaxltl.core.values.undiscounted.fastest import (
     QUICK_LIMIT,
     attained_by_ties,
     conserving_rows,
+)
+from jaxltl.core.values.undiscounted.reachability import (
     enclose,
     on_actions,
     rows_of_model,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Unpack, cast
 
 import jax
@@ -22,13 +21,10 @@ from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance, as_width
-from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_states
 from jaxltl.core.values.engine.host_solution import (
     induced_chain,
@@ -40,10 +36,10 @@ from jaxltl.core.values.engine.host_solution import (
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_reachability
 from jaxltl.core.values.undiscounted import optimum
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT as QUICK_LIMIT
+from jaxltl.core.values.undiscounted.fastest import fastest_optimum
 
 _FINE_LIMIT = 4096  # states up to which bounds are as narrow as the dtype allows; it costs a round
-QUICK_LIMIT = 100_000  # states up to which ties are broken by the expected time
-_TIE_ROUNDINGS = 4  # that a bound gives up for each step, for ties to attain it
 
 
 @validated(method=("auto", "direct", "iterative"))
@@ -191,9 +187,7 @@ def _on_host(
         host, _, depth = induced_chain(model, sparse, policy)
     enclosure = enclose(host, target, objective, fine, stay=stay, depth=depth)
     if policy is None and stay is None and not is_sparse(model):
-        enclosure = replace(
-            enclosure, row=_fastest(host, np.asarray(target, bool).ravel(), objective, enclosure)
-        )
+        enclosure = fastest_optimum(host, np.asarray(target, bool).ravel(), objective, enclosure)
     return with_given_policy(
         solution_from_enclosure(
             model,
@@ -278,72 +272,6 @@ def enclose(
         tolerance=tolerance,
         depth=depth,
     )
-
-
-# --- ties -----------------------------------------------------------------------------------------
-
-
-def conserving_rows(mdp: HostMDP, objective: str, enclosure: Enclosure) -> Booleans:
-    """Rows in undecided states by which every policy that decides almost surely attains the bound."""
-    # ``P l >= l`` for the lower bound l of a maximum makes l a submartingale, and bounds the value
-    # of a policy of such rows from below by its limit, which is 0 or 1; likewise ``P u <= u`` for
-    # the upper bound of a minimum.
-    undecided = enclosure.lower != enclosure.upper
-    unit = _backup_unit(mdp)
-    if objective == "max":
-        keeps = mdp.expectation(enclosure.lower) * (1 - unit) >= enclosure.lower[mdp.state]
-        keeps |= end_components(mdp, undecided).inside
-    else:
-        keeps = mdp.expectation(enclosure.upper) * (1 + unit) <= enclosure.upper[mdp.state]
-    result: Booleans = keeps & undecided[mdp.state]
-    return result
-
-
-def attained_by_ties(mdp: HostMDP, objective: str, enclosure: Enclosure) -> Enclosure | None:
-    """Enclosure with a bound that every policy of tied rows may attain."""
-    # The value less a few roundings for each step that the slowest policy of tied rows takes; it is
-    # not proven, except by :func:`conserving_rows`. None if such policies may never decide.
-    largest, undecided = objective == "max", enclosure.lower != enclosure.upper
-    sign, pessimistic, optimistic = 1, enclosure.lower, enclosure.upper
-    if not largest:
-        sign, pessimistic, optimistic = -1, optimistic, pessimistic
-    unit = _backup_unit(mdp)
-    ahead = mdp.expectation(optimistic)
-    ties = sign * ahead + unit * ahead >= sign * pessimistic[mdp.state]
-    ties[enclosure.row] = True
-    free = ~undecided[mdp.state]
-    if largest:
-        free |= end_components(mdp, undecided).inside
-    rows = np.flatnonzero(ties | free)
-    count = np.bincount(mdp.state[rows], minlength=mdp.num_states)
-    tied, _ = mdp.select(offsets_from_counts(count), rows)
-    cost = np.where(free[rows], 0.0, 1.0)
-    time = solver.reward_forever(tied, cost, maximize=True).value
-    if not np.isfinite(time).all():
-        return None
-    bound = np.clip(enclosure.value - sign * _TIE_ROUNDINGS * unit * time, 0, 1)
-    bound = np.where(undecided, bound, pessimistic)
-    return replace(enclosure, lower=bound) if largest else replace(enclosure, upper=bound)
-
-
-def _backup_unit(mdp: HostMDP) -> float:
-    """The relative rounding of a backup."""
-    return (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
-
-
-def _fastest(mdp: HostMDP, target: Booleans, objective: str, enclosure: Enclosure) -> Integers:
-    """The rows of the policy with the least expected time to decide, among those that attain."""
-    if mdp.num_states > QUICK_LIMIT:
-        return enclosure.row
-    good = conserving_rows(mdp, objective, enclosure)
-    undecided = enclosure.lower != enclosure.upper
-    good[enclosure.row[undecided]] = True
-    decided = ~undecided
-    if objective == "max":
-        one = enclosure.lower == 1
-        good |= one[mdp.state] & ~mdp.support.some_successor_in(~one)
-        decided &= ~one | target
-    return fastest_rows(mdp, good, decided, enclosure.row)
 
 
 # --- large products -------------------------------------------------------------------------------

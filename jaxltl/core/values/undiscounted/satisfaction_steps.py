@@ -26,11 +26,12 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.sparse.solvers.shortest_path import with_exits
-from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import Chain, induced_chain, status_between
 from jaxltl.core.values.engine.state_quantities import safe_ends
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.undiscounted.fastest import possibly_optimal_rows, tied_rows
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.policy_gradient import transient_factors
 from jaxltl.core.values.undiscounted.reachability import on_actions, on_rows, rows_of_model
@@ -46,7 +47,8 @@ _PART_WIDTH = 1e-9  # relative width to which each part is solved
 _TOLERANCE = 1e-6  # relative width of a converged enclosure
 _MAX_SWEEPS = 1_000_000  # of the rates of acceptance
 _PROBABILITY_WIDTH = 1e-10  # width of probabilities; the default width may need exact fractions
-_LOSS = 1e-9  # of the satisfaction probability, that counts as a rounding error
+_OPTIMUM_WIDTH = 1e-11  # relative width of the maximal probability, for its ties
+_LOSS = 1e-9  # of the satisfaction probability, relative, that counts as a rounding error
 
 
 @brief
@@ -86,8 +88,10 @@ class Quickest(NamedTuple):
     Attributes:
       policy: ``int32[S, Q]``, an optimal policy.
       steps: its :class:`Steps`.
-      least: lower bound of the steps of every policy inside the mask of optimal actions; equal to
-        the policy's up to six digits for co-safe tasks.
+      least: lower bound of the steps of every optimal policy.
+      status: CONVERGED if the bounds meet, so that the policy is the quickest up to six digits;
+        PRECISION if a quicker optimal policy is not excluded, which may be so for tasks without
+        end. A policy counts as optimal if it loses at most a share of 1e-9 of the probability.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -100,6 +104,7 @@ class Quickest(NamedTuple):
     policy: np.ndarray
     steps: Steps
     least: float
+    status: Status = Status.PRECISION
 
 
 @validated()
@@ -205,29 +210,59 @@ class StepAnalysis:
 
     def quickest(self, actions: OptimalActions) -> Quickest:
         """:func:`quickest_policy` inside a mask of optimal actions."""
-        best = np.asarray(actions.best.policy)
+        best = np.asarray(actions.best.policy).astype(np.int32)
         if self.problem.opposite:
-            return Quickest(best, self.steps(best), 0.0)
+            return Quickest(best, self.steps(best), 0.0, Status.CONVERGED)
+        host, target = self.sparse.host, np.asarray(self.problem.target).ravel()
+        optimum = optimal.reachability(
+            host, target, maximize=True, tolerance=RelativeTolerance(_OPTIMUM_WIDTH)
+        )
+        highest = self.mean(optimum, 1.0)[2]
+        wide = possibly_optimal_rows(host, "max", optimum)
+        first, least = self._soonest(wide)
+        rounds, inner = 0.0, first
+        if self.problem.accepting is not None:
+            rounds, inner = self._fewest_between_rounds(on_rows(self.sparse, actions.allowed))
+            least = (least + rounds) * (1 - _EPS)
+        masks = wide, wide & tied_rows(host, "max", optimum), on_rows(self.sparse, actions.allowed)
+        quickest: Quickest | None = None
+        for rows in (None, *masks):
+            policy = best
+            if rows is not None:
+                if quickest is not None and quickest.status == Status.CONVERGED:
+                    break
+                row = first if rows is wide else self._soonest(rows)[0]
+                row = np.where(target, inner, row) if self.problem.accepting is not None else row
+                policy = np.asarray(self.sparse.action)[row].reshape(best.shape).astype(np.int32)
+            loses = highest - self._share_reached(policy) > _LOSS * highest
+            if loses and rows is not None:
+                continue
+            steps = self.steps(policy)
+            if quickest is None or steps.upper < quickest.steps.upper:
+                meets = steps.upper <= least * (1 + _TOLERANCE) and not loses
+                status = Status.CONVERGED if meets else Status.PRECISION
+                quickest = Quickest(policy, steps, least, status)
+        assert quickest is not None
+        return quickest
+
+    def _soonest(self, rows: Booleans) -> tuple[Integers, float]:
+        """Rows with the least expected time in undecided states, and a lower bound of its mean."""
         host = self.sparse.host
-        rows = on_rows(self.sparse, actions.allowed)
         cost = np.where(rows, self.undecided[host.state], np.inf)
         total = optimal.reward_forever(host, cost, maximize=False, tolerance=_PART_WIDTH)
-        least = self.mean(total)[1]
-        shape = self.model.state_shape
-        taken = np.asarray(self.sparse.action)[total.row].reshape(shape)
-        if self.problem.accepting is not None:
-            rounds, inner = self._fewest_between_rounds(rows)
-            least = (least + rounds) * (1 - _EPS)
-            region = np.asarray(self.problem.accepting.region)
-            taken = np.where(region, inner.reshape(shape), best)
-        quickest = Quickest(best.astype(np.int32), self.steps(best), least)
-        if quickest.steps.upper <= least * (1 + _TOLERANCE):
-            return quickest
-        steps = self.steps(taken)
-        loss = self.probability(best)[1] - self.probability(taken)[1]
-        if steps.upper < quickest.steps.upper and loss <= _LOSS:
-            return Quickest(taken.astype(np.int32), steps, least)
-        return quickest
+        return total.row, self.mean(total)[1]
+
+    def _share_reached(self, policy: Array) -> float:
+        """Lower bound of the probability of the target, to a width relative to it."""
+        chain = induced_chain(self.model, self.sparse, policy)
+        own = optimal.reachability(
+            chain.mdp,
+            np.asarray(self.problem.target).ravel(),
+            maximize=True,
+            tolerance=RelativeTolerance(_PROBABILITY_WIDTH),
+            depth=chain.depth,
+        )
+        return self.mean(own, 1.0)[1]
 
     def probability(self, policy: Array) -> tuple[float, float, float]:
         """Satisfaction probability from the initial distribution: value, lower and upper bound."""
@@ -309,8 +344,8 @@ class StepAnalysis:
         least = np.asarray(accepting.least).ravel()[host.state][host.row]
         hits = np.where((read == least) & region[host.state][host.row], host.probability, 0)
         small, reward, row = _among(host, inner, np.add.reduceat(hits, start))
-        action = np.asarray(self.sparse.action)[row[_gain(small, reward).row]]
-        return share / rate[2] * (1 - 2 * _EPS) if rate[2] > 0 else np.inf, action
+        taken: Integers = row[_gain(small, reward).row]
+        return share / rate[2] * (1 - 2 * _EPS) if rate[2] > 0 else np.inf, taken
 
 
 def _gain(mdp: HostMDP, reward: Floats) -> Enclosure:
