@@ -14,6 +14,7 @@ from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid, count_in, covered, cumulative, volume
 from jaxltl.core.continuous.images import Images, NoiseBox, Step, image_boxes
 from jaxltl.core.continuous.noise import Distribution
+from jaxltl.core.continuous.regions import UndefinedError
 from jaxltl.core.continuous.task_product import TaskProduct, task_product
 from jaxltl.core.continuous.transition_bounds import (
     TooManyProbabilitiesError,
@@ -357,6 +358,16 @@ class Abstraction:
                 return bounds
             refined = self._refined(bounds, *finer)
 
+    def vacuous(self, grid: Grid) -> Bounds:
+        """Bounds 0 and 1 in all states, where a value may be NaN."""
+        try:
+            bounds = self._first(grid)
+        except UndefinedError:  # in the function of a label
+            bounds = self._first(grid, labelled=False)
+        shape = bounds.lower.shape
+        unproven = np.full(shape, UNPROVEN, np.int8)
+        return replace(bounds, lower=np.zeros(shape), upper=np.ones(shape), how=unproven)
+
     def safe_actions(self, bounds: Bounds) -> Booleans:
         """Actions ``bool[Q, C, A]`` that lead only to states of lower bound 1.
 
@@ -373,13 +384,13 @@ class Abstraction:
         safe[task.decided == 1] = True
         return safe
 
-    def _first(self, grid: Grid) -> Bounds:
+    def _first(self, grid: Grid, labelled: bool = True) -> Bounds:
         """Bounds 0 and 1."""
         dynamics, names = self.dynamics, self.dynamics.propositions
         low, high = grid.boxes()
         certain, possible = np.zeros((2, grid.num_cells, len(names)), bool)
         for i, name in enumerate(names):
-            if name in dynamics.labels:
+            if labelled and name in dynamics.labels:
                 certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
         task = task_product(self.formula, names, certain, possible, dynamics.outside)
         # The initial boxes are closed: a cell that only touches the upper edge of one is initial too.

@@ -26,7 +26,7 @@ from jaxltl.core.continuous.abstraction import (
 )
 from jaxltl.core.continuous.dynamics import Dynamics, Step, to_environment
 from jaxltl.core.continuous.grid import Grid, make_grid
-from jaxltl.core.continuous.regions import box
+from jaxltl.core.continuous.regions import UndefinedError, box
 from jaxltl.core.environments.environment import Environment, traced
 from jaxltl.core.environments.episodes import Agent, Episode, make_agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
@@ -197,9 +197,11 @@ class Certificate:
         probability 1, 1 by value iteration, 0 without a proof; see :meth:`summary`.
       initial: ``bool[C]``, cells that meet the initial states.
       status: ``CONVERGED`` if the bounds of all initial states are as narrow as the tolerance, or
-        decide the threshold; ``MAX_STEPS`` otherwise.
+        decide the threshold; ``NONFINITE``, with all bounds 0 and 1, if the step, the policy or the
+        function of a label may be NaN in the domain; ``MAX_STEPS`` otherwise.
       seconds: wall time by stage.
       formula: text of the formula.
+      reason: where a value may be NaN if the status is ``NONFINITE``, else empty.
 
     Example:
       >>> from jaxltl.core.continuous import make_dynamics
@@ -218,6 +220,7 @@ class Certificate:
     status: Status
     seconds: dict[str, float]
     formula: str
+    reason: str = ""
 
     @property
     def initial_bounds(self) -> tuple[float, float]:
@@ -247,6 +250,8 @@ class Certificate:
             f"{int((self.how[self.initial] == key).sum())} {text}" for key, text in HOW.items()
         ]
         stages = ", ".join(f"{name} {x:.2g} s" for name, x in self.seconds.items())
+        if self.status == Status.NONFINITE:
+            return f"{self.formula}: nothing is proven, since {self.reason}"
         return (
             f"{self.formula}: satisfied with probability at least {lower} from every initial state "
             f"(least upper bound {upper}). Of {count:,} initial cells: {', '.join(shares)}. "
@@ -336,14 +341,21 @@ def prove(
     grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
     abstraction = Abstraction(dynamics, formula, step, actions, limits)
-    bounds = abstraction.bounds(grid)
+    reason = ""
+    try:
+        bounds = abstraction.bounds(grid)
+    except UndefinedError as error:
+        bounds, reason = abstraction.vacuous(grid), str(error)
     lower, upper = bounds.initial_bounds()
     how = bounds.task.initial(bounds.how.astype(np.float64)).astype(np.int8)
     ends = lower[bounds.initial], upper[bounds.initial]
     decided = (ends[1] - ends[0]).max() <= limits.tolerance or limits.decides(*ends)
     status = Status.CONVERGED if decided else Status.MAX_STEPS
+    status = Status.NONFINITE if reason else status
     seconds, text = abstraction.seconds, str(formula)
-    certificate = Certificate(bounds.grid, lower, upper, how, bounds.initial, status, seconds, text)
+    certificate = Certificate(
+        bounds.grid, lower, upper, how, bounds.initial, status, seconds, text, reason
+    )
     return certificate, abstraction, bounds
 
 

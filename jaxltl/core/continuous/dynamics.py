@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.continuous.noise import Distribution
-from jaxltl.core.continuous.regions import Region, as_region, box, extended
+from jaxltl.core.continuous.regions import Region, UndefinedError, as_region, box, extended
 from jaxltl.core.environments.environment import (
     Box,
     Environment,
@@ -236,7 +236,7 @@ def make_dynamics(
         region = extended(as_region(f"label {name!r}", labels[name], len(low)), low, high)
         with validation.errors_in(f"label {name!r}: "):
             _check_functions(region, len(low))
-            if not region.membership(low[None], np.nextafter(high, np.inf)[None])[1][0]:
+            if _is_outside(region, low, high):
                 raise ValueError("no state of the domain belongs to it; give a set that meets it.")
         regions[name] = region
     noise_option = options.get("noise", ())
@@ -407,6 +407,14 @@ def _check_step(dynamics: Dynamics) -> None:
             )
             raise ValueError(f"step returns {kind}; return float[{n}], a state.")
     _check_finite(dynamics)
+
+
+def _is_outside(region: Region, low: Floats, high: Floats) -> bool:
+    """True if no state of the domain belongs to a region."""
+    try:
+        return not region.membership(low[None], np.nextafter(high, np.inf)[None])[1][0]
+    except UndefinedError:  # on the domain as one cell
+        return False
 
 
 def _check_functions(region: Region, num_states: int) -> None:

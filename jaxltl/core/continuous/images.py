@@ -21,6 +21,7 @@ import scipy.optimize
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.grid import Grid
+from jaxltl.core.continuous.regions import UndefinedError
 from jaxltl.core.enclosures.interval import Interval
 from jaxltl.core.enclosures.linear_bounds import AffineForm, Enclosed, propagate
 from jaxltl.core.enclosures.program import Elementwise, Program, make_program
@@ -184,6 +185,7 @@ def image_boxes(
 
     Raises:
       ValueError: if `step` cannot be traced or enclosed, with the place, or is unbounded on a cell.
+      UndefinedError: if it may be NaN on a cell.
     """
     cells = np.asarray(cells)
     sizes = grid.num_axes, actions.shape[1], len(noise.low)
@@ -195,6 +197,7 @@ def image_boxes(
     order, noise_of = tuple(range(n)), (-1,) * n
     index = np.stack(np.unravel_index(cells, grid.shape), -1)
     usual: Floats | None = None
+    adversarial: Integers | None = None  # a cell on which a derivative in the noise is unbounded
     for length in _LENGTHS:
         size = tuple(min(length, k) for k in grid.shape)
         rows = np.flatnonzero(todo)
@@ -210,25 +213,45 @@ def image_boxes(
             mine = np.flatnonzero((of_block >= first) & (of_block < first + many))
             for part in np.array_split(mine, -(-len(mine) * num_actions // _ROWS)):
                 here = rows[part]
-                image, accepted = _cell_images(
-                    form, random, grid, cells[here], of_block[part] - first
-                )
+                block = of_block[part] - first
+                image, accepted = _cell_images(form, random, grid, cells[here], block)
                 accepted |= max(size) == 1
+                missing = accepted & random.unknown[block] & (len(program.outputs) > 1)
+                if missing.any():
+                    adversarial = cells[here[missing]][:1]
                 for array, new in zip(arrays, image, strict=True):
                     array[here[accepted]] = new[accepted]
                 todo[here[accepted]] = False
         if not todo.any():
             break
-    unbounded = ~np.isfinite(arrays[1] - arrays[0]).all((1, 2))
+    undefined = np.isnan(arrays[0]).any((1, 2))
+    if undefined.any():
+        raise UndefinedError(
+            f"the step or the policy may be NaN on the cell {_text(grid, cells[[undefined.argmax()]])}; "
+            "define it in the whole domain, or give more cells, or a domain without such states."
+        )
+    with np.errstate(invalid="ignore"):
+        unbounded = ~np.isfinite(arrays[1] - arrays[0]).all((1, 2))
     if unbounded.any():
-        low, high = (x[0].round(6).tolist() for x in grid.boxes(cells[[unbounded.argmax()]]))
         raise ValueError(
-            f"the step or the policy is unbounded, as far as intervals show, on the cell {low} to "
-            f"{high}; bound it by jnp.clip or jnp.where, give more cells, or a domain without such "
-            "states."
+            "the step or the policy is unbounded, as far as intervals show, on the cell "
+            f"{_text(grid, cells[[unbounded.argmax()]])}; bound it by jnp.clip or jnp.where, give more "
+            "cells, or a domain without such states."
+        )
+    if adversarial is not None:
+        warnings.warn(
+            "a derivative of the step in the noise is unbounded, as far as intervals show, on the cell "
+            f"{_text(grid, adversarial)}: there {_ADVERSARY}",
+            stacklevel=2,
         )
     low, high, gain, varying = (x.reshape(-1, n) for x in arrays)
     return Images(cells, low, high, _compact(gain), noise_of, _compact(varying), order)
+
+
+def _text(grid: Grid, cell: Integers) -> str:
+    """The ends of one cell."""
+    low, high = (x[0].round(6).tolist() for x in grid.boxes(cell))
+    return f"{low} to {high}"
 
 
 def _blocks(
@@ -292,7 +315,10 @@ def _forms(
         gains = gain_bounds(known, (len(row), k, n))
         slope = np.zeros((len(row), width, n))
         slope[:, : form.slope.shape[1]] = form.slope
-        parts_of_chunk = (bounds.low, bounds.high, form.middle, form.error, *gains, slope)
+        usable = np.isfinite(form.error)
+        slope, middle = np.where(usable[:, None], slope, 0.0), np.where(usable, form.middle, 0.0)
+        error = np.where(usable, form.error, np.inf)
+        parts_of_chunk = (bounds.low, bounds.high, middle, error, *gains, slope)
         return [np.broadcast_to(x, (len(row), *x.shape[1:])) for x in parts_of_chunk]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -353,7 +379,6 @@ def _cell_images(
     unknown = ~(np.isfinite(low) & np.isfinite(high))
     low = np.where(unknown, form.low[of_block] - own * noise_high, low)
     high = np.where(unknown, form.high[of_block] - own * noise_low, high)
-    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     return [low, high, own, varying], (small & ~unknown).all((1, 2))
 
 
@@ -367,6 +392,7 @@ class _Random:
     low: Floats  # [n], bounds of the random noise
     high: Floats
     usual: Floats  # [n], gains to which nearly equal ones are set
+    unknown: Booleans  # [N], blocks on which a derivative in random noise has no bounds
 
 
 def _random_part(
@@ -378,6 +404,8 @@ def _random_part(
     radius = (noise.high - noise.low) / 2
     reach = np.abs(form.gains).sum(2)
     gain, varying = np.zeros(reach.shape), np.zeros(reach.shape)
+    bounded = np.isfinite(form.gain_low) & np.isfinite(form.gain_high)
+    unknown: Booleans = ~bounded[:, :, noise.random].all(axis=(1, 2, 3))
     for i, j in enumerate(noise_of):
         if j < 0:
             continue
@@ -407,4 +435,4 @@ def _random_part(
         reach[:, :, i] += np.abs(slope - own * radius[j]) - np.abs(slope)
         reach[:, :, i] = np.maximum(reach[:, :, i], 0) + np.abs(slope) * _ROUNDING
     low, high = np.array(ends).T
-    return _Random(gain, reach, varying, low, high, typical)
+    return _Random(gain, reach, varying, low, high, typical, unknown)

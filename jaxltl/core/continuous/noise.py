@@ -204,6 +204,11 @@ class Distribution:
         safe = np.where(inside, x, np.nextafter(some, np.inf)).reshape(-1)
         with enable_x64(True):  # constants of the function in double precision
             sides = enclose(self.function, "interval")(safe, safe)
+        unknown = inside & ~np.isfinite(sides[1] - sides[0]).reshape(x.shape)
+        if unknown.any():
+            raise ValueError(
+                f"cdf may be infinite or not a number at {x[unknown][0]:g}; define it on the whole support."
+            )
         lower, upper = (np.clip(np.asarray(y, np.float64).reshape(x.shape), 0, 1) for y in sides)
         outside = np.where(x >= high, 1.0, 0.0)
         return np.where(inside, lower, outside), np.where(inside, upper, outside)

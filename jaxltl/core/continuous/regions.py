@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array
+from jaxltl.core.enclosures.interval import may_be_nan
 from jaxltl.core.enclosures.linear_bounds import over_boxes
 from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.pretty_print import brief, count
@@ -22,6 +23,10 @@ Function = Callable[[jax.Array], jax.Array]
 Booleans = NDArray[np.bool_]
 
 _CHUNK = 2**15  # cells of which a function is enclosed at a time
+
+
+class UndefinedError(ValueError):
+    """A value that may be NaN, of which nothing can be proven."""
 
 
 def _facts(region: Region) -> list[str]:
@@ -89,7 +94,8 @@ class Region:
 
         Certain cells ``bool[C]`` have all their states ``low <= x < high`` in the region, and only
         possible ones have any. Exact for boxes, but a cell covered by two boxes together is not
-        certain; bounds of half-spaces and functions over the closed cell are rounded outward.
+        certain; bounds of half-spaces and functions over the closed cell are rounded outward. Raises
+        ValueError for a function that may be NaN on a cell.
 
         Example:
           >>> certain, possible = box([0.0], [1.0]).membership([[0.0], [0.5], [1.0]], [[1.0], [1.5], [2.0]])
@@ -114,7 +120,16 @@ class Region:
             for start in range(0, len(low), _CHUNK):
                 part = slice(start, start + _CHUNK)
                 with enable_x64(True):  # constants of the function in double precision
-                    (bounds,) = over_boxes(function, low[part], high[part]).outputs(True)
+                    known = over_boxes(function, low[part], high[part])
+                    (bounds,) = known.outputs(True)
+                output = known.intervals[known.program.outputs[0]]
+                missing = np.asarray(may_be_nan(output))[:, 0] & ~certain[part]
+                if missing.any():
+                    i = start + int(np.argmax(missing))
+                    raise UndefinedError(
+                        f"a function of where_positive may be NaN on the cell {low[i].tolist()} to "
+                        f"{high[i].tolist()}; define it in the whole domain, or give more cells."
+                    )
                 certain[part] |= np.asarray(bounds.low)[:, 0] > 0
                 possible[part] |= ~(np.asarray(bounds.high)[:, 0] <= 0)
         return certain, possible | certain

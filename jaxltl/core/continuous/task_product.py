@@ -123,7 +123,8 @@ def _translated(
     """
     violates, beyond = outside in (None, "violates"), frozenset([str(outside)])
     label = not violates and outside != "clip"
-    letters = inside | ({beyond} if label else set())
+    # A state that is NaN has no label: no formula is decided by staying in the domain alone.
+    letters = inside | {beyond if label else frozenset()}
     automaton = to_automaton(formula, letters=sorted(letters, key=sorted))
     sure, live = universal_states(automaton), live_states(automaton)
     if violates and sure.any():

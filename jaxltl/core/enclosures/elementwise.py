@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +17,17 @@ from jaxltl.core.enclosures.interval import (
     ULPS,
     Interval,
     eps,
+    may_be_nan,
     module_of,
     monotone,
     outward,
+    size_of,
     point,
     unbounded,
+    undefined,
 )
-from jaxltl.core.enclosures.program import Elementwise, narrows
+from jaxltl.core.enclosures.primitives import narrows
+from jaxltl.core.enclosures.program import Elementwise
 
 Function = Callable[[Array], Array]
 Rule = Callable[[Elementwise, list[Interval]], Interval]
@@ -36,6 +41,12 @@ def _erf(x: Array) -> Array:
     return scipy.special.erf(x) if module_of(x) is np else jax.scipy.special.erf(x)
 
 
+def _acosh(x: Array) -> Array:
+    xp = module_of(x)
+    result: Array = xp.log1p((x - 1) + xp.sqrt(x - 1) * xp.sqrt(x + 1))  # accurate near 1
+    return result
+
+
 def _named(name: str) -> Function:
     return lambda x: getattr(module_of(x), name)(x)
 
@@ -43,12 +54,17 @@ def _named(name: str) -> Function:
 INCREASING: dict[str, Function] = {
     **{name: _named(name) for name in (
         "exp", "exp2", "expm1", "log", "log2", "log1p", "tanh", "sqrt", "cbrt", "asinh", "sinh", "floor",
-        "ceil", "round", "sign")},
+        "ceil", "sign")},
     "atan": _named("arctan"), "asin": _named("arcsin"), "asinh": _named("arcsinh"),
-    "logistic": _logistic, "erf": _erf,
+    "logistic": _logistic, "erf": _erf, "acosh": _acosh, "atanh": _named("arctanh"),
 }  # fmt: skip
 _RANGE = {"exp": (0, np.inf), "exp2": (0, np.inf), "sqrt": (0, np.inf), "logistic": (0, 1),
-          "tanh": (-1, 1), "erf": (-1, 1), "cosh": (1, np.inf)}  # fmt: skip
+          "tanh": (-1, 1), "erf": (-1, 1), "cosh": (1, np.inf), "expm1": (-1, np.inf),
+          "acosh": (0, np.inf), "rsqrt": (0, np.inf), "pow": (0, np.inf), "share": (0, 1)}  # fmt: skip
+# Elsewhere values are NaN.
+_DOMAIN = {"log": (0, np.inf), "log2": (0, np.inf), "log1p": (-1, np.inf), "sqrt": (0, np.inf), "rsqrt": (0, np.inf),
+           "asin": (-1, 1), "acos": (-1, 1), "atanh": (-1, 1), "acosh": (1, np.inf),
+           "pow": (0, np.inf)}  # fmt: skip
 
 
 def bounds(operation: Elementwise, inputs: list[Interval]) -> Interval:
@@ -57,11 +73,16 @@ def bounds(operation: Elementwise, inputs: list[Interval]) -> Interval:
     For Boolean results `low` is whether it is certainly true, and `high` whether possibly.
     """
     name, x = operation.name, inputs[0]
-    if name in INCREASING:
-        return _clip(name, _increasing(name, x))
     if name in _COMPARISONS:
         return _compare(operation, *inputs)
-    return _clip(name, _RULES[name](operation, inputs))
+    if name in INCREASING:
+        result = _clip(name, _increasing(name, x))
+    else:
+        result = _clip(name, _RULES[name](operation, inputs))
+    if name not in _DOMAIN:
+        return result
+    low, high = _DOMAIN[name]
+    return undefined(~((x.low >= low) & (x.high <= high)), result)
 
 
 def _increasing(name: str, x: Interval) -> Interval:
@@ -84,14 +105,15 @@ _COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
 def _compare(operation: Elementwise, x: Interval, y: Interval) -> Interval:
     if operation.name in ("gt", "ge"):
         x, y = y, x
+    # With NaN, each comparison below is false: its result is possible, and not certain.
     if operation.name in ("lt", "gt"):
-        return Interval(x.high < y.low, x.low < y.high)
+        return Interval(x.high < y.low, ~(x.low >= y.high))
     if operation.name in ("le", "ge"):
-        return Interval(x.high <= y.low, x.low <= y.high)
+        return Interval(x.high <= y.low, ~(x.low > y.high))
     certain = (x.low == x.high) & (y.low == y.high) & (x.low == y.low)
-    possible = (x.low <= y.high) & (y.low <= x.high)
-    if operation.inputs[0] == operation.inputs[1]:  # a test for NaN: values are numbers
-        certain = possible = possible | True
+    possible = ~((x.low > y.high) | (y.low > x.high))
+    if operation.inputs[0] == operation.inputs[1]:  # a test for NaN
+        certain, possible = x.low <= x.high, possible | True
     return Interval(certain, possible) if operation.name == "eq" else Interval(~possible, ~certain)
 
 
@@ -121,23 +143,56 @@ def _convert(operation: Elementwise, inputs: list[Interval]) -> Interval:
     was_float = jnp.issubdtype(x.low.dtype, jnp.floating)
     if was_float and not jnp.issubdtype(new, jnp.floating):
         raise ValueError(
-            f"{operation.place}: a number that depends on the argument is converted to {new}; keep it "
-            "a float."
+            f"{operation.place}: a number that depends on the argument, or is NaN, is converted to {new}; "
+            "keep it a float."
         )
     ulps = 1 if narrows(new, x.low.dtype) else 0
     return monotone(lambda side: side.astype(new), x, ulps)
 
 
 def _power(operation: Elementwise, inputs: list[Interval]) -> Interval:
-    """`x ** y` for positive x and a known y: monotone in x."""
+    """`x ** y` for x that is not negative: monotone in both, so that extrema are at corners."""
     x, y = inputs
-    if y.low is not y.high:
-        raise ValueError(
-            f"{operation.place}: `pow` needs a constant exponent; write exp(y log(x))."
-        )
-    xp = module_of(x.low)
-    sides = [xp.where(x.low >= 0, side, xp.nan) ** y.low for side in (x.low, x.high)]
-    return outward(xp.minimum(*sides), xp.maximum(*sides), ULPS["pow"])
+    xp, base = module_of(x.low), arithmetic.absolute(x)
+    exponents = [y.low] if y.low is y.high else [y.low, y.high]
+    corners = [side**exponent for side in (base.low, base.high) for exponent in exponents]
+    hull = outward(reduce(xp.minimum, corners), reduce(xp.maximum, corners), ULPS["pow"])
+    return undefined(may_be_nan(x) | may_be_nan(y), hull)
+
+
+def _round(operation: Elementwise, inputs: list[Interval]) -> Interval:
+    """To the nearest integer, ties to even or away from zero."""
+    to_even = operation.params.get("rounding_method", jax.lax.RoundingMethod.TO_NEAREST_EVEN)
+    if to_even == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        return monotone(_named("round"), inputs[0], 0)
+
+    def away(x: Array) -> Array:
+        xp = module_of(x)
+        whole = xp.trunc(x)
+        rest = xp.where(xp.isfinite(x), size_of(x - whole), 0)
+        result: Array = whole + xp.where(rest >= 0.5, xp.sign(x), 0)
+        return result
+
+    return monotone(away, inputs[0], 0)
+
+
+def _is_finite(_: Elementwise, inputs: list[Interval]) -> Interval:
+    certain = ~arithmetic.may_be_infinite(inputs[0])
+    return Interval(certain, certain | True)
+
+
+def _share(_: Elementwise, inputs: list[Interval]) -> Interval:
+    """`e / (e + rest)` for `e = exp(x)` and a sum `rest` of exponentials: in [0, 1] for finite x."""
+    part, rest, x = inputs
+    xp = module_of(part.low)
+
+    def ratio(a: Array, b: Array, empty: float) -> Array:
+        safe = xp.isfinite(a) & xp.isfinite(b) & (a + b > 0)
+        result: Array = xp.where(safe, a / xp.where(safe, a + b, 1), empty)
+        return result
+
+    quotient = outward(ratio(part.low, rest.high, 0.0), ratio(part.high, rest.low, 1.0), 4)
+    return undefined(arithmetic.may_be_infinite(x) | may_be_nan(rest), quotient)
 
 
 def _by_sides(name: str) -> Rule:
@@ -161,6 +216,9 @@ def _decreasing(function: Function) -> Rule:
 
 
 _RULES: dict[str, Rule] = {
+    "round": _round,
+    "is_finite": _is_finite,
+    "share": _share,
     "add": lambda _, x: arithmetic.add(*x),
     "sub": lambda _, x: arithmetic.subtract(*x),
     "mul": _multiply,
@@ -236,6 +294,15 @@ def relax(
         inverse = arithmetic.reciprocal(inputs[1])
         slope = arithmetic.multiply(arithmetic.negate(inputs[0]), arithmetic.power(inverse, 2))
         return _mean_value(operation, inputs, (inverse, slope))
+    if name == "share":
+        part, rest, _ = inputs
+        scale = arithmetic.power(arithmetic.reciprocal(arithmetic.add(part, rest)), 2)
+        derivatives = (
+            arithmetic.multiply(rest, scale),
+            arithmetic.multiply(arithmetic.negate(part), scale),
+            point(zero),
+        )
+        return _mean_value(operation, inputs, derivatives)
     if name == "atan2":
         return _relax_angle(operation, inputs)
     if name == "integer_pow":
@@ -246,7 +313,12 @@ def relax(
         return _smooth(operation, inputs[0], output, _DERIVATIVES[name])
     if name == "select_n":
         return _relax_select(inputs, output)
-    zeros = (output.low * 0,) * len(inputs)
+    return _constant(inputs, output)
+
+
+def _constant(inputs: list[Interval], output: Interval) -> Relaxation:
+    """The output's own bounds."""
+    zeros = (module_of(output.low).zeros_like(output.low),) * len(inputs)
     return Relaxation(zeros, output.low, zeros, output.high)
 
 
@@ -333,6 +405,11 @@ def _relax_product(x: Interval, y: Interval) -> Relaxation:
     rest = arithmetic.multiply(point(x.radius), point(y.radius)).high
     offsets = outward(-middle.high - rest, -middle.low + rest, 2)
     slopes = tuple(xp.broadcast_to(side.middle, offsets.low.shape) for side in (y, x))
+    # Of infinite or NaN factors, of which no slope is a bound.
+    missing = ~(xp.isfinite(offsets.low) & xp.isfinite(offsets.high))
+    if xp is jnp or missing.any():
+        offsets = arithmetic.where(missing, unbounded(offsets.low), offsets)
+        slopes = tuple(xp.where(missing, 0, slope) for slope in slopes)
     return Relaxation(slopes, offsets.low, slopes, offsets.high)
 
 
@@ -373,8 +450,7 @@ def _relax_select(inputs: list[Interval], output: Interval) -> Relaxation:
     """The case itself where the test is certain, and constants elsewhere."""
     xp, dtype = module_of(output.low), output.low.dtype
     if len(inputs) > 3 or inputs[0].low.dtype != bool:
-        zeros = (output.low * 0,) * len(inputs)
-        return Relaxation(zeros, output.low, zeros, output.high)
+        return _constant(inputs, output)
     yes, no = inputs[0].low, ~inputs[0].high
     slopes = tuple(
         xp.broadcast_to(case, output.low.shape).astype(dtype) for case in (yes & no, no, yes)

@@ -1,11 +1,16 @@
-"""Interval arithmetic with outward rounding (Moore 1966), on NumPy or JAX arrays."""
+"""Interval arithmetic with outward rounding (Moore 1966), on NumPy or JAX arrays.
+
+A value may be NaN, as a logarithm of a negative number is: then both bounds are NaN, and every result
+that depends on it has NaN bounds too. A value with an infinite bound may be infinite itself, so that
+`inf - inf`, `0 * inf` and the sine of infinity may be NaN.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,7 +25,8 @@ from jaxltl.core.pretty_print import brief
 ULPS = {
     "exp": 16, "exp2": 16, "expm1": 32, "log": 16, "log2": 16, "log1p": 32, "logistic": 32, "tanh": 32,
     "atan": 16, "asin": 32, "asinh": 32, "acos": 32, "sinh": 32, "cosh": 32, "erf": 32,
-    "sin": 16, "tan": 32, "atan2": 16, "pow": 64, "sqrt": 1, "rsqrt": 8, "cbrt": 16,
+    "sin": 16, "tan": 32, "atan2": 16, "pow": 64, "sqrt": 1, "rsqrt": 8, "cbrt": 16, "acosh": 32,
+    "atanh": 32,
 }  # fmt: skip
 LARGEST_ANGLE = 1e4  # larger arguments of sin, cos and tan are not reduced: all values are possible
 
@@ -31,7 +37,8 @@ class Interval:
     """Elementwise bounds of an array.
 
     Attributes:
-      low, high: arrays of one shape; infinite where no bound is known.
+      low, high: arrays of one shape; infinite where no bound is known, and both NaN where the value
+        may be NaN.
 
     Example:
       >>> x = Interval(np.array([-1.0]), np.array([3.0]))
@@ -51,9 +58,12 @@ class Interval:
 
     @property
     def middle(self) -> Array:
-        """A point inside, elementwise; near the centre."""
+        """A point inside, elementwise; near the centre, and finite if there is a finite one."""
         xp = module_of(self.low)
-        result: Array = xp.clip(0.5 * self.low + 0.5 * self.high, self.low, self.high)
+        centre = 0.5 * self.low + 0.5 * self.high
+        if xp is jnp or not np.isfinite(centre).all():
+            centre = xp.where(xp.isfinite(centre), centre, 0)
+        result: Array = xp.minimum(xp.maximum(centre, self.low), self.high)
         return result
 
     @property
@@ -61,6 +71,8 @@ class Interval:
         """At least the distance from :attr:`middle` to either bound."""
         xp, middle = module_of(self.low), self.middle
         distance = xp.maximum(self.high - middle, middle - self.low)
+        if xp is jnp or not np.isfinite(distance).all():
+            distance = xp.where(xp.isfinite(distance), distance, xp.inf)
         result: Array = distance * (1 + 4 * eps(self.low)) + tiny(self.low)
         return result
 
@@ -78,12 +90,19 @@ def size_of(x: Array) -> Array:
 
 def eps(x: Array) -> float:
     """The unit in the last place of 1."""
-    return float(jnp.finfo(x.dtype).eps)
+    return _limits(x.dtype)[0]
 
 
 def tiny(x: Array) -> float:
     """An absolute error that covers the flush of subnormal numbers to zero."""
-    return float(4 * jnp.finfo(x.dtype).tiny)
+    return _limits(x.dtype)[1]
+
+
+@cache
+def _limits(dtype: np.dtype) -> tuple[float, float, float]:
+    """Unit in the last place of 1, four times the least normal number, and the largest number."""
+    limits = jnp.finfo(dtype)
+    return float(limits.eps), float(4 * limits.tiny), float(limits.max)
 
 
 def point(x: Array) -> Interval:
@@ -92,16 +111,72 @@ def point(x: Array) -> Interval:
 
 
 def outward(low: Array, high: Array, ulps: float = 1) -> Interval:
-    """Interval with bounds moved outward by `ulps` units in the last place; NaN is unbounded.
+    """Interval with bounds moved outward by `ulps` units in the last place; NaN remains.
 
-    A result `x` with an error of k ulps satisfies `|x - exact| <= k eps |x| + tiny`.
+    A result `x` with an error of k ulps satisfies `|x - exact| <= k eps |x| + tiny`, or overflows.
     """
     if low.dtype.kind in "biu":  # counts of Boolean variables
         return Interval(low, high)
-    xp, relative, absolute = module_of(low), ulps * eps(low), tiny(low)
+    xp, (unit, absolute, most) = module_of(low), _limits(low.dtype)
+    relative = ulps * unit
     down = low - (size_of(low) * relative + absolute)
     up = high + (size_of(high) * relative + absolute)
-    return Interval(xp.where(xp.isnan(down), -xp.inf, down), xp.where(xp.isnan(up), xp.inf, up))
+    return Interval(xp.where(low == xp.inf, most, down), xp.where(high == -xp.inf, -most, up))
+
+
+def without_nan(x: Interval) -> Interval:
+    """The same bounds, infinite where they are NaN.
+
+    For bounds that do not decide whether a value may be NaN, and for results.
+    """
+    xp = module_of(x.low)
+    if xp is np and not (np.isnan(x.low).any() or np.isnan(x.high).any()):
+        return x
+    missing = xp.isnan(x.low) | xp.isnan(x.high)
+    return Interval(xp.where(missing, -xp.inf, x.low), xp.where(missing, xp.inf, x.high))
+
+
+def undefined(where: Array, x: Interval) -> Interval:
+    """The same bounds, NaN where the value may be NaN."""
+    xp = module_of(x.low)
+    if xp is np and not np.any(where):
+        return x
+    return Interval(xp.where(where, xp.nan, x.low), xp.where(where, xp.nan, x.high))
+
+
+def may_be_nan(x: Interval) -> Array:
+    """True where the value may be NaN."""
+    xp = module_of(x.low)
+    result: Array = xp.isnan(x.low) | xp.isnan(x.high)
+    return result
+
+
+def may_be_infinite(x: Interval) -> Array:
+    """True where the value may be infinite, or NaN."""
+    xp = module_of(x.low)
+    result: Array = ~(xp.isfinite(x.low) & xp.isfinite(x.high))
+    return result
+
+
+def _are_finite(*intervals: Interval) -> bool:
+    """True if all bounds are seen to be finite."""
+    return all(
+        module_of(x.low) is np and bool(np.isfinite(x.low).all() and np.isfinite(x.high).all())
+        for x in intervals
+    )
+
+
+def _signed(
+    x: Interval, nonnegative: Callable[[], Array], nonpositive: Callable[[], Array]
+) -> Interval:
+    """Bounds without values of a sign that rounding alone has added."""
+    xp, low, high = module_of(x.low), x.low, x.high
+    small = tiny(low) * 4
+    if xp is jnp or bool(((low < 0) & (low >= -small)).any()):
+        low = xp.where(nonnegative(), xp.maximum(low, 0), low)
+    if xp is jnp or bool(((high > 0) & (high <= small)).any()):
+        high = xp.where(nonpositive(), xp.minimum(high, 0), high)
+    return Interval(low, high)
 
 
 def unbounded(like: Array) -> Interval:
@@ -128,19 +203,43 @@ def negate(x: Interval) -> Interval:
 
 
 def add(x: Interval, y: Interval) -> Interval:
-    """Sum."""
-    return outward(x.low + y.low, x.high + y.high)
+    """Sum; NaN where infinities may cancel."""
+    if x.low.dtype.kind in "biu":
+        return Interval(x.low + y.low, x.high + y.high)
+    xp, result = module_of(x.low), outward(x.low + y.low, x.high + y.high)
+    result = _signed(result, lambda: x.low >= -y.low, lambda: x.high <= -y.high)
+    if _are_finite(result):
+        return result
+    cancel = ((x.high == xp.inf) & (y.low == -xp.inf)) | ((x.low == -xp.inf) & (y.high == xp.inf))
+    return undefined(cancel | may_be_nan(x) | may_be_nan(y), result)
 
 
 def subtract(x: Interval, y: Interval) -> Interval:
     """Difference of independent arrays."""
-    return outward(x.low - y.high, x.high - y.low)
+    return add(x, negate(y))
 
 
 def multiply(x: Interval, y: Interval) -> Interval:
-    """Product of independent arrays; `0 * inf` is 0, since bounds are limits of numbers."""
+    """Product of independent arrays; NaN where one may be 0 and the other infinite.
+
+    `0 * inf` is 0 elsewhere, since bounds are limits of numbers.
+    """
     ends = [y.low] if y.low is y.high else [y.low, y.high]
-    return outward(*_hull([times(a, b) for a in (x.low, x.high) for b in ends]))
+    finite = _are_finite(x, y)
+    product = module_of(x.low).multiply if finite else times
+    result = outward(*_hull([product(a, b) for a in (x.low, x.high) for b in ends]))
+    if result.low.dtype.kind in "biu":
+        return result
+    result = _signed(
+        result,
+        lambda: ((x.low >= 0) & (y.low >= 0)) | ((x.high <= 0) & (y.high <= 0)),
+        lambda: ((x.low >= 0) & (y.high <= 0)) | ((x.high <= 0) & (y.low >= 0)),
+    )
+    if finite:
+        return result
+    zero_x, zero_y = ((z.low <= 0) & (z.high >= 0) for z in (x, y))
+    missing = (zero_x & may_be_infinite(y)) | (zero_y & may_be_infinite(x))
+    return undefined(missing | may_be_nan(x) | may_be_nan(y), result)
 
 
 def _hull(values: list[Array]) -> tuple[Array, Array]:
@@ -161,7 +260,8 @@ def reciprocal(x: Interval) -> Interval:
     xp = module_of(x.low)
     safe = (x.low > 0) | (x.high < 0)
     bounds = outward(1 / xp.where(safe, x.high, 1), 1 / xp.where(safe, x.low, 1))
-    return where(safe, bounds, unbounded(x.low))
+    bounds = _signed(bounds, lambda: x.low > 0, lambda: x.high < 0)
+    return undefined(may_be_nan(x), where(safe, bounds, unbounded(x.low)))
 
 
 def absolute(x: Interval) -> Interval:
@@ -175,13 +275,13 @@ def power(x: Interval, exponent: int) -> Interval:
     if exponent < 0:
         return reciprocal(power(x, -exponent))
     if exponent == 0:
-        ones = x.low * 0 + 1
+        ones = module_of(x.low).ones_like(x.low)
         return Interval(ones, ones)
     even = exponent % 2 == 0
     base = absolute(x) if even else x
     # Repeated multiplication: each factor adds one rounding.
     bounds = outward(base.low**exponent, base.high**exponent, 2 * exponent)
-    return Interval(module_of(x.low).maximum(bounds.low, 0), bounds.high) if even else bounds
+    return _signed(bounds, lambda: base.low >= 0, lambda: base.high <= 0)
 
 
 def monotone(function: Callable[[Array], Array], x: Interval, ulps: float) -> Interval:
@@ -205,10 +305,11 @@ def sine(x: Interval, phase: float = 0.0) -> Interval:
     unreduced, reduction = _angle_reduction(x)
     top = _contains_multiple(x, phase - math.pi / 2, 2 * math.pi) | unreduced
     bottom = _contains_multiple(x, phase + math.pi / 2, 2 * math.pi) | unreduced
-    return Interval(
+    result = Interval(
         xp.where(bottom, -1.0, xp.maximum(bounds.low - reduction, -1)).astype(x.low.dtype),
         xp.where(top, 1.0, xp.minimum(bounds.high + reduction, 1)).astype(x.low.dtype),
     )
+    return undefined(may_be_infinite(x), result)
 
 
 def tangent(x: Interval) -> Interval:
@@ -218,10 +319,11 @@ def tangent(x: Interval) -> Interval:
     bounds = monotone(xp.tan, x, ULPS["tan"])
     low, high = (xp.where(pole, 0.0, side) for side in (bounds.low, bounds.high))
     # The derivative 1 + tan^2 multiplies the error.
-    return Interval(
+    result = Interval(
         xp.where(pole, -xp.inf, low - error * (1 + low * low)),
         xp.where(pole, xp.inf, high + error * (1 + high * high)),
     )
+    return undefined(may_be_infinite(x), result)
 
 
 def _angle_reduction(x: Interval) -> tuple[Array, Array]:
@@ -237,7 +339,8 @@ def angle(y: Interval, x: Interval) -> Interval:
     bounds = outward(*_hull(corners), ULPS["atan2"])
     cut = (x.low <= 0) & (y.low <= 0) & (y.high >= 0)
     pi = math.pi * (1 + 4 * eps(x.low))
-    return Interval(xp.where(cut, -pi, bounds.low), xp.where(cut, pi, bounds.high))
+    result = Interval(xp.where(cut, -pi, bounds.low), xp.where(cut, pi, bounds.high))
+    return undefined(may_be_nan(x) | may_be_nan(y), result)
 
 
 def _contains_multiple(x: Interval, shift: float, period: float) -> Array:

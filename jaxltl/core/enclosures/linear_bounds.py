@@ -29,13 +29,17 @@ from jaxltl.core.enclosures.interval import (
     Interval,
     eps,
     intersect,
+    may_be_nan,
     module_of,
     outward,
     point,
     size_of,
     times,
     tiny,
+    undefined,
+    without_nan,
 )
+from jaxltl.core.enclosures.matrix_product import nonnegative, product
 from jaxltl.core.enclosures.program import (
     Elementwise,
     MatrixProduct,
@@ -75,7 +79,7 @@ class LinearForm:
         low_terms, high_terms = size_of(self.lower_slope).sum(1), size_of(self.upper_slope).sum(1)
         factor = 2 * (self.lower_slope.shape[1] + 2) * eps(self.lower)
         low, high = self.lower - low_terms, self.upper + high_terms
-        return outward(low - low_terms * factor, high + high_terms * factor, 2)
+        return without_nan(outward(low - low_terms * factor, high + high_terms * factor, 2))
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ class Enclosed:
             bounds = self.intervals[y]
             if linear and y not in self.program.known and y not in self.program.inputs:
                 bounds = intersect(bounds, backward(self, y).interval())
-            outputs.append(bounds)
+            outputs.append(without_nan(bounds))
         return outputs
 
 
@@ -108,6 +112,7 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
     for x, value in program.known.items():
         intervals[x] = point(xp.asarray(value)[None])
     intervals |= dict(zip(program.inputs, boxes, strict=True))
+    boxes = [undefined(may_be_nan(x), x) for x in boxes]
     middle = xp.concatenate([x.middle for x in boxes], -1)
     radius = xp.concatenate([x.radius for x in boxes], -1)
     forms: dict[int, AffineForm] = {}
@@ -116,15 +121,21 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
     last_use = {x: i for i, each in enumerate(program.operations) for x in each.inputs}
     for position, operation in enumerate(program.operations):
         y = operation.output
-        if isinstance(operation, MatrixProduct) and _is_bounded(forms.get(operation.inputs[0])):
+        if (
+            isinstance(operation, MatrixProduct)
+            and operation.is_finite
+            and _is_bounded(forms.get(operation.inputs[0]))
+        ):
             # Interval arithmetic is rarely narrower here, and costs as much as the form.
             forms[y] = _forward_product(operation.matrix, forms[operation.inputs[0]])
-            intervals[y] = forms[y].interval()
+            intervals[y] = nonnegative(
+                operation, intervals[operation.inputs[0]], forms[y].interval()
+            )
         else:
             values = [intervals[x] for x in operation.inputs]
             match operation:
                 case MatrixProduct():
-                    bounds = _product(operation.matrix, *values)
+                    bounds = product(operation, *values)
                 case Select():
                     bounds = _select(operation, values)
                 case Elementwise():
@@ -152,7 +163,12 @@ def _input_forms(boxes: list[Interval], radius: Array) -> list[AffineForm]:
         n = box.low.shape[-1]
         unit = np.eye(start + n, dtype=radius.dtype)[:, start:]
         slope = xp.asarray(unit)[None] * radius[:, None, start : start + n]
-        forms.append(AffineForm(slope, box.middle, box.middle * 0))
+        error = box.middle * 0
+        finite = xp.isfinite(radius[:, start : start + n]) & xp.isfinite(error)
+        if xp is jnp or not finite.all():
+            error = xp.where(finite, error, xp.inf)
+            slope = xp.where(finite[:, None], slope, 0)
+        forms.append(AffineForm(slope, box.middle, error))
         start += n
     return forms
 
@@ -174,22 +190,6 @@ def _joined(arrays: list[Array]) -> Array:
     return result
 
 
-def _product(matrix: Array, x: Interval) -> Interval:
-    """Products with a matrix by middle and radius (Rump 1999)."""
-    xp = module_of(x.low)
-    matrix = xp.asarray(matrix)
-    size = size_of(matrix).T
-    middle, radius = x.middle @ matrix.T, x.radius @ size
-    error = (x.magnitude @ size) * (2 * (matrix.shape[1] + 2) * eps(middle))
-    bounds = outward(middle - radius - error, middle + radius + error, 4)
-    finite = xp.isfinite(error)
-    low = xp.where(finite, bounds.low, -xp.inf)
-    # A sum of non-negative terms is not negative: its square root has a lower bound.
-    positive = (xp.min(matrix) >= 0) & (x.low >= 0).all(-1, keepdims=True)
-    low = xp.where(positive, xp.maximum(low, 0), low)
-    return Interval(low, xp.where(finite, bounds.high, xp.inf))
-
-
 # --- forward --------------------------------------------------------------------------------------
 
 
@@ -209,7 +209,7 @@ class AffineForm:
         """Bounds over the box."""
         terms = self.slope_size() + self.error
         terms = terms * (1 + 2 * (self.slope.shape[1] + 2) * eps(self.middle))
-        return outward(self.middle - terms, self.middle + terms, 2)
+        return without_nan(outward(self.middle - terms, self.middle + terms, 2))
 
     def slope_size(self) -> Array:
         """Sum of the slopes' magnitudes."""
@@ -258,8 +258,9 @@ def _constant(x: Interval, dtype: np.dtype) -> AffineForm:
         return AffineForm(slope, zeros, zeros)
     if x.low.dtype != dtype:  # parameters in single precision over boxes in double precision
         x = outward(x.low.astype(dtype), x.high.astype(dtype))
+    finite = xp.isfinite(x.low)
     if x.low is x.high:
-        return AffineForm(slope, x.low, x.low * 0)
+        return AffineForm(slope, xp.where(finite, x.low, 0), xp.where(finite, x.low * 0, xp.inf))
     finite = xp.isfinite(x.low) & xp.isfinite(x.high)
     return AffineForm(slope, xp.where(finite, x.middle, 0), xp.where(finite, x.radius, xp.inf))
 
@@ -419,7 +420,7 @@ def _back_elementwise(
     ):
         if not jnp.issubdtype(value.low.dtype, jnp.floating):
             continue
-        a, b = a[:, None], b[:, None]
+        a, b = (xp.where(xp.isfinite(s), s, 0)[:, None] for s in (a, b))  # offsets are infinite
         new = (up * a + down * b, above * b + below * a)
         state.rounded(*new, value.magnitude, 2)
         state.add(x, *new)
@@ -436,10 +437,11 @@ def _resolved(state: _Coefficients, target: int) -> LinearForm:
         parts.append(state.slopes.get(x, (zeros, zeros)))
     lower, upper = (_joined([p[side] for p in parts]) for side in (0, 1))
     state.constant(point(known.middle), lower, upper)
-    slopes = [xp.swapaxes(a * known.radius[:, None], 1, 2) for a in (lower, upper)]
+    slopes = [xp.swapaxes(times(a, known.radius[:, None]), 1, 2) for a in (lower, upper)]
     state.rounded(lower, upper, known.radius, 1)
     error = state.error * (1 + 1024 * state.eps)
     offsets = outward(state.lower - error, state.upper + error, 4)
+    offsets = without_nan(undefined(may_be_nan(known.intervals[target]), offsets))
     return LinearForm(slopes[0], offsets.low, slopes[1], offsets.high)
 
 
@@ -453,7 +455,7 @@ METHODS = ("linear", "interval")
 
 
 def enclose(
-    function: Callable[[PyTree], PyTree], method: str = "linear"
+    function: Callable[[PyTree], PyTree], method: str = "linear", batched: bool = False
 ) -> Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]:
     """Bounds of a function's values over boxes of its argument.
 
@@ -466,16 +468,20 @@ def enclose(
     Args:
       function: JAX function of one array or pytree of floating-point arrays.
       method: ``"linear"`` or ``"interval"``, which is looser and cheaper.
+      batched: if the arrays of ``low`` and ``high`` have one leading axis more than those of the
+        argument, for a batch of boxes; the results have it too.
 
     Returns:
-      Function of two pytrees ``low`` and ``high`` with the structure of the argument, either of its
-      shapes or with one leading axis more for a batch of boxes. NumPy arrays are answered by NumPy,
-      without compilation; JAX arrays inside ``jit``, ``vmap`` and ``grad`` by JAX, differentiable in
-      both. Infinite where no bound is known, as for a quotient by a number that may be 0.
+      Function of two pytrees ``low`` and ``high`` with the structure and the shapes of the argument.
+      NumPy arrays are answered by NumPy, without compilation; JAX arrays inside ``jit``, ``vmap`` and
+      ``grad`` by JAX, differentiable in both. Infinite where no bound is known, as for a quotient by
+      a number that may be 0, and on both sides where a value may be NaN, as for the logarithm of a
+      number that may be negative.
 
     Raises:
       ValueError: on the call, if a primitive has no enclosure (named with its source line), a loop's
-        length depends on values, or ``low`` and ``high`` differ in shape.
+        length depends on values, ``low`` and ``high`` differ in shape, or a lower bound exceeds its
+        upper one.
 
     Example:
       >>> low, high = enclose(lambda x: x - x * x)(np.float32(0), np.float32(0.5))
@@ -486,12 +492,16 @@ def enclose(
     validation.function("function", function)
 
     def enclosed(low: PyTree, high: PyTree) -> tuple[PyTree, PyTree]:
+        if batched and len({np.shape(x)[:1] for x in jax.tree.leaves(low)} - {()}) > 1:
+            shapes = ", ".join(str(list(np.shape(x))) for x in jax.tree.leaves(low))
+            raise ValueError(f"low has arrays of shapes {shapes}; give one leading axis of boxes.")
         known = over_boxes(function, low, high, method == "linear")
         program = known.program
         sides: list[list[Array]] = [[], []]
         for y, bounds in zip(program.outputs, known.outputs(method == "linear"), strict=True):
             for side, x in zip(sides, (bounds.low, bounds.high), strict=True):
-                side.append(x.reshape((*x.shape[:1], *program.shapes[y].shape)))
+                rows = module_of(x).broadcast_to(x, (len(known.radius), *x.shape[1:]))
+                side.append(rows.reshape((*rows.shape[:1], *program.shapes[y].shape)))
         tree = program.output_tree
         return tree.unflatten(sides[0]), tree.unflatten(sides[1])
 
@@ -500,7 +510,7 @@ def enclose(
         result: tuple[PyTree, PyTree] = jax.tree.map(lambda x: x[0], batched)
         return result
 
-    return shaped
+    return enclosed if batched else shaped
 
 
 def linear_bounds(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], PyTree]:
@@ -548,6 +558,14 @@ def over_boxes(
             raise ValueError(f"low has shape {a.shape} and high {b.shape}; give equal shapes.")
         if not jnp.issubdtype(a.dtype, jnp.floating) or a.dtype != b.dtype:
             raise ValueError(f"low is {a.dtype} and high is {b.dtype}; give floats of one dtype.")
+        if not a.ndim:
+            raise ValueError("low is a number; give arrays with a leading axis of boxes.")
+        if module_of(a) is np and (a > b).any():
+            place = np.argwhere(a > b)[0]
+            raise ValueError(
+                f"low={a[tuple(place)]:g} exceeds high={b[tuple(place)]:g} in box {place[0]} at "
+                f"{place[1:].tolist()}; give low <= high."
+            )
         boxes.append(Interval(a.reshape(len(a), -1), b.reshape(len(b), -1)))
         specs.append(jax.ShapeDtypeStruct(a.shape[1:], a.dtype))
     program = make_program(function, structure.unflatten(specs))

@@ -9,8 +9,8 @@ unrolled.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +18,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from numpy.typing import DTypeLike
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.enclosures.interval import module_of
+from jaxltl.core.enclosures.primitives import (
+    letters_of,
+    matrix_of,
+    narrows,
+    refusal,
+    selection,
+    shape_of,
+    spec_of,
+)
 from jaxltl.core.models.protocols import PyTree
 
 MAX_OPERATIONS = 20_000  # after loops are unrolled
 MAX_MATRIX = 2**26  # entries of the matrix of one product
+MAX_SHARES = 2**16  # entries of the matrix of a softmax
+_SMALL = 64  # entries of constants that are compared
 _OWN = (str(Path(jax.__file__).parent), str(Path(__file__).parent))
 
 ELEMENTWISE = {
     "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sign", "floor", "ceil", "round",
     "exp", "exp2", "expm1", "log", "log2", "log1p", "logistic", "tanh", "sqrt", "rsqrt", "cbrt",
-    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "asinh", "erf",
+    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh",
+    "erf", "is_finite",
     "square", "one_minus_square", "integer_pow", "pow", "convert_element_type", "select_n",
     "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not",
 }  # fmt: skip
@@ -64,6 +75,9 @@ class MatrixProduct:
     inputs: tuple[int]
     output: int
     matrix: Array  # float[n, m]
+    zeros_count: bool = False  # entries 0 multiply numbers: `0 * inf` is NaN
+    is_finite: bool = True  # entries are seen to be finite
+    nonnegative: bool = False  # entries are seen to be at least 0
 
 
 @dataclass(frozen=True)
@@ -108,7 +122,7 @@ def make_program(function: Callable[..., PyTree], *args: PyTree) -> Program:
             "Use jnp.where and jnp functions in place of `if`, float() and NumPy."
         ) from None
     builder = _Builder()
-    inputs = [builder.new(_spec(v)) for v in closed.jaxpr.invars]
+    inputs = [builder.new(spec_of(v)) for v in closed.jaxpr.invars]
     outputs = builder.inline(closed.jaxpr, closed.consts, inputs)
     return Program(
         tuple(builder.operations),
@@ -128,6 +142,19 @@ class _Builder:
         self.known: dict[int, Array] = {}
         self.shapes: dict[int, jax.ShapeDtypeStruct] = {}
         self.place = "the function"  # of the innermost call that is inlined
+        self.made: dict[int, Operation] = {}  # by output
+        # Variables by what computes them: equal ones are one, so that x[0] * x[0] is a square.
+        self.equal: dict[Hashable, int] = {}
+
+    def add(self, key: Hashable, operation: Operation, output: jax.ShapeDtypeStruct) -> int:
+        """The variable of an operation: its output, or that of an equal operation."""
+        key = (key, operation.inputs, output.shape, output.dtype)
+        if key in self.equal:
+            return self.equal[key]
+        y = self.equal[key] = self.new(output)
+        self.made[y] = replace(operation, output=y)
+        self.operations.append(self.made[y])
+        return y
 
     def new(self, aval: jax.ShapeDtypeStruct) -> int:
         """A new variable of a shape and dtype."""
@@ -137,11 +164,15 @@ class _Builder:
 
     def constant(self, value: Array) -> int:
         """A variable with a known value."""
+        key: Hashable = len(self.shapes)  # of no other variable
         if not isinstance(value, jax.core.Tracer):
             value = np.asarray(value)
-        index = self.new(jax.ShapeDtypeStruct(value.shape, value.dtype))
-        self.known[index] = value.reshape(-1)
-        return index
+            if value.size < _SMALL:
+                key = value.shape, value.dtype, value.tobytes()
+        if key not in self.equal:
+            self.equal[key] = self.new(jax.ShapeDtypeStruct(value.shape, value.dtype))
+            self.known[self.equal[key]] = value.reshape(-1)
+        return self.equal[key]
 
     def _place(self, equation: core.JaxprEqn) -> str:
         """Source line of an equation: the innermost frame outside JAX and this package.
@@ -165,7 +196,7 @@ class _Builder:
         def read(atom: core.Var | core.Literal) -> int:
             if isinstance(atom, core.Var):
                 return variables[atom]
-            return self.constant(np.asarray(atom.val, _spec(atom).dtype))
+            return self.constant(np.asarray(atom.val, spec_of(atom).dtype))
 
         for equation in _needed(jaxpr):
             outputs = self._append(equation, [read(x) for x in equation.invars])
@@ -195,7 +226,7 @@ class _Builder:
             return self._evaluate(equation, inputs)
         if name in _SELECTIONS:
             return self._select(name, equation, inputs)
-        output = _spec(equation.outvars[0])
+        output = spec_of(equation.outvars[0])
         if name in _REDUCTIONS:
             return [self._reduce(_REDUCTIONS[name], equation, inputs[0])]
         if name in ("reduce_sum", "cumsum"):
@@ -214,15 +245,22 @@ class _Builder:
         if name == "clamp":
             low = self._elementwise("max", equation, [inputs[1], inputs[0]], output)
             return [self._elementwise("min", equation, [low, inputs[2]], output)]
+        same = len(inputs) == 2 and self.shapes[inputs[0]].shape == output.shape
+        if name == "div" and same and (parts := self._share(*inputs)) is not None:
+            return [self._elementwise("share", equation, parts, output)]
         if name in ELEMENTWISE:
-            return [self._elementwise(name, equation, inputs, output)]
-        raise ValueError(f"{self._place(equation)}: {_refusal(name)}")
+            result = self._elementwise(name, equation, inputs, output)
+            if name == "sub" and same and self._is_log_share(*inputs):
+                zero = self.constant(np.zeros((), output.dtype))
+                result = self._elementwise("min", equation, [result, zero], output)
+            return [result]
+        raise ValueError(f"{self._place(equation)}: {refusal(name)}")
 
     def _is_exact(self, name: str, equation: core.JaxprEqn, inputs: list[int]) -> bool:
         """True for an operation on known numbers that is evaluated without rounding."""
         if not all(x in self.known for x in inputs):
             return False
-        exact = not any(jnp.issubdtype(_spec(v).dtype, jnp.floating) for v in equation.outvars)
+        exact = not any(jnp.issubdtype(spec_of(v).dtype, jnp.floating) for v in equation.outvars)
         # A comparison with what is not a number is unknown, and so is its integer.
         exact = exact and not any(self._may_be_nan(x) for x in inputs)
         widens = name == "convert_element_type" and self._converts(equation, inputs[0])
@@ -252,6 +290,11 @@ class _Builder:
 
     def _evaluate(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """A primitive of known numbers."""
+        if any(jnp.issubdtype(spec_of(v).dtype, jax.dtypes.extended) for v in equation.outvars):
+            raise ValueError(
+                f"{self._place(equation)}: `{equation.primitive}` makes random keys; draw random numbers "
+                "outside of the function."
+            )
         with jax.ensure_compile_time_eval():
             arrays = [jnp.asarray(self.known[x]).reshape(self.shapes[x].shape) for x in inputs]
             values = equation.primitive.bind(*arrays, **equation.params)
@@ -274,8 +317,8 @@ class _Builder:
             numbers.append(self._numbers(x) + start)
             start += numbers[-1].size
         known = [self.known[x].reshape(self.shapes[x].shape) for x in indices]
-        entries = _selection(name, equation, numbers, known)
-        selected = list(zip(map(np.asarray, entries), map(_spec, equation.outvars), strict=True))
+        entries = selection(name, equation, numbers, known)
+        selected = list(zip(map(np.asarray, entries), map(spec_of, equation.outvars), strict=True))
         if name == "gather" and any((index < 0).any() for index, _ in selected):
             # Entries out of range have a value of their own, by default NaN.
             fill = equation.params["fill_value"]
@@ -291,19 +334,16 @@ class _Builder:
 
     def _selected(self, inputs: Sequence[int], index: Array, output: jax.ShapeDtypeStruct) -> int:
         """A new variable of some entries of the inputs."""
-        y = self.new(output)
-        self.operations.append(Select(tuple(inputs), y, np.asarray(index).reshape(-1)))
-        return y
+        index = np.asarray(index).reshape(-1)
+        return self.add(index.tobytes(), Select(tuple(inputs), -1, index), output)
 
     def _elementwise(
         self, name: str, equation: core.JaxprEqn, inputs: list[int], output: jax.ShapeDtypeStruct
     ) -> int:
         inputs = [self._broadcast(x, output.shape) for x in inputs]
-        index = self.new(output)
-        self.operations.append(
-            Elementwise(name, equation.params, tuple(inputs), index, self._place(equation))
-        )
-        return index
+        params, place = equation.params, self._place(equation)
+        key = name, params.get("y"), params.get("rounding_method")
+        return self.add(key, Elementwise(name, params, tuple(inputs), -1, place), output)
 
     def _broadcast(self, x: int, shape: tuple[int, ...]) -> int:
         """An input of an elementwise function in the shape of its output."""
@@ -318,7 +358,7 @@ class _Builder:
 
     def _reduce(self, name: str, equation: core.JaxprEqn, x: int) -> int:
         """A reduction as a chain of elementwise operations."""
-        axes, output = equation.params["axes"], _spec(equation.outvars[0])
+        axes, output = equation.params["axes"], spec_of(equation.outvars[0])
         here = jax.ShapeDtypeStruct(output.shape, self.shapes[x].dtype)
         parts = np.moveaxis(self._numbers(x), axes, range(len(axes)))
         first, *others = parts.reshape(-1, math.prod(output.shape))
@@ -330,7 +370,7 @@ class _Builder:
 
     def _linear(self, equation: core.JaxprEqn, inputs: list[int], index: int) -> int:
         """A primitive that is linear in one input and knows the others, by its matrix."""
-        shape, output = self.shapes[inputs[index]].shape, _spec(equation.outvars[0])
+        shape, output = self.shapes[inputs[index]].shape, spec_of(equation.outvars[0])
         rows, columns = math.prod(output.shape), math.prod(shape)
         if not columns:  # such as of a world without actions
             return self.constant(np.zeros(output.shape, output.dtype))
@@ -339,19 +379,25 @@ class _Builder:
                 f"{self._place(equation)}: a product with a matrix of {rows} by {columns} entries, "
                 f"{8 * rows * columns:.1e} bytes; split the array."
             )
-        matrix = _matrix(equation, [self.known.get(x) for x in inputs], index)
-        y = self.new(output)
-        self.operations.append(MatrixProduct((inputs[index],), y, matrix))
-        return y
+        matrix = matrix_of(equation, [self.known.get(x) for x in inputs], index)
+        zeros_count, is_finite = False, True
+        if len(inputs) > 1:
+            other = self.known[inputs[1 - index]]
+            numpy = isinstance(other, np.ndarray)
+            zeros_count = not numpy or bool((other == 0).any())
+            is_finite = numpy and bool(np.isfinite(other).all())
+        nonnegative = isinstance(matrix, np.ndarray) and bool((matrix >= 0).all())
+        product = MatrixProduct((inputs[index],), -1, matrix, zeros_count, is_finite, nonnegative)
+        return self.add(len(self.shapes), product, output)
 
     def _dot(self, equation: core.JaxprEqn, inputs: list[int]) -> int:
         """A dot product: with a known array a matrix; else products of entries, and their sums."""
         for index in (0, 1):
             if inputs[1 - index] in self.known:
                 return self._linear(equation, inputs, index)
-        left, right, out, summed = _letters(equation)
-        sizes = dict(zip(left + right, _shape(equation, 0) + _shape(equation, 1), strict=True))
-        output, order = _spec(equation.outvars[0]), out + summed
+        left, right, out, summed = letters_of(equation)
+        sizes = dict(zip(left + right, shape_of(equation, 0) + shape_of(equation, 1), strict=True))
+        output, order = spec_of(equation.outvars[0]), out + summed
         full = jax.ShapeDtypeStruct(tuple(sizes[c] for c in order), output.dtype)
         factors = []
         for x, letters in zip(inputs, (left, right), strict=True):
@@ -363,9 +409,55 @@ class _Builder:
         products = self._elementwise("mul", equation, factors, full)
         rows = math.prod(output.shape)
         matrix = np.repeat(np.eye(rows, dtype=full.dtype), math.prod(full.shape) // rows, axis=1)
-        y = self.new(output)
-        self.operations.append(MatrixProduct((products,), y, matrix))
-        return y
+        product = MatrixProduct((products,), -1, matrix, nonnegative=True)
+        return self.add(len(self.shapes), product, output)
+
+    def _source(self, x: int) -> tuple[int, np.ndarray]:
+        """The variable of which a variable has entries, and their numbers."""
+        index = self._numbers(x).reshape(-1)
+        while isinstance(made := self.made.get(x), Select) and len(made.inputs) == 1:
+            (x,), index = made.inputs, made.index[index]
+        return x, index
+
+    def _sum_of_exponentials(self, x: int, total: int, entries: np.ndarray) -> np.ndarray | None:
+        """Weights ``float[n, n]`` of sums of the exponentials x, one for each entry of x; or None."""
+        total, rows = self._source(total)
+        rows = rows[entries]
+        product, exponential = self.made.get(total), self.made.get(x)
+        if not isinstance(product, MatrixProduct) or not isinstance(exponential, Elementwise):
+            return None
+        source, columns = self._source(product.inputs[0])
+        if exponential.name != "exp" or source != x or not product.nonnegative:
+            return None
+        if len(rows) * len(rows) > MAX_SHARES or len(columns) != len(rows):
+            return None
+        weights = np.zeros((len(rows), len(rows)), product.matrix.dtype)
+        weights[:, columns] = product.matrix[rows]
+        return weights if (np.diag(weights) == 1).all() else None
+
+    def _share(self, x: int, total: int) -> list[int] | None:
+        """Exponential, sum of all others, and argument of a quotient `e_i / sum_j e_j`; or None."""
+        total = self._broadcast(total, self.shapes[x].shape)
+        weights = self._sum_of_exponentials(x, total, self._numbers(total).reshape(-1))
+        if weights is None:
+            return None
+        np.fill_diagonal(weights, 0)
+        spec = self.shapes[x]
+        others = MatrixProduct((x,), -1, weights, nonnegative=True)
+        return [x, self.add(weights.tobytes(), others, spec), *self.made[x].inputs]
+
+    def _is_log_share(self, x: int, total: int) -> bool:
+        """True for `x_i - log sum_j exp(x_j)`, which is not positive."""
+        source, rows = self._source(self._broadcast(total, self.shapes[x].shape))
+        logarithm = self.made.get(source)
+        if not isinstance(logarithm, Elementwise) or logarithm.name != "log":
+            return False
+        key = ("exp", None, None), (x,), self.shapes[x].shape, self.shapes[x].dtype
+        exponential, product = self.equal.get(key), logarithm.inputs[0]
+        return (
+            exponential is not None
+            and self._sum_of_exponentials(exponential, product, rows) is not None
+        )
 
     def _unroll(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
         """The operations of each step of a scan, with slices of its arrays."""
@@ -401,7 +493,7 @@ class _Builder:
             (condition,) = self.inline(test.jaxpr, test.consts, [*inputs[:first], *carry])
             value = self.known.get(condition)
             if not isinstance(value, np.ndarray):
-                raise ValueError(f"{self._place(equation)}: {_refusal('while')}")
+                raise ValueError(f"{self._place(equation)}: {refusal('while')}")
             if not value.all():
                 return carry
             carry = self.inline(body.jaxpr, body.consts, [*inputs[first:last], *carry])
@@ -416,7 +508,7 @@ class _Builder:
         results = [self.inline(branch.jaxpr, branch.consts, operands) for branch in branches]
         outputs = []
         for variable, cases in zip(equation.outvars, zip(*results, strict=True), strict=True):
-            equal, spec = len(set(cases)) == 1, _spec(variable)
+            equal, spec = len(set(cases)) == 1, spec_of(variable)
             choice = [index, *cases]
             outputs.append(
                 cases[0] if equal else self._elementwise("select_n", equation, choice, spec)
@@ -429,10 +521,12 @@ class _Builder:
         return self.inline(closed.jaxpr, closed.consts, inputs)[0]
 
 
-def _equal_ranks(outside: Sequence[core.Var], inside: Sequence[core.Var]) -> int:
+def _equal_ranks(
+    outside: Sequence[core.Var | core.Literal], inside: Sequence[core.Var | core.Literal]
+) -> int:
     """The number of variables with as many axes inside a loop as outside."""
     pairs = zip(outside, inside, strict=True)
-    return sum(len(_spec(x).shape) == len(_spec(y).shape) for x, y in pairs)
+    return sum(len(spec_of(x).shape) == len(spec_of(y).shape) for x, y in pairs)
 
 
 def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
@@ -444,109 +538,3 @@ def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
             equations.append(equation)
             needed |= {v for v in equation.invars if isinstance(v, core.Var)}
     return equations[::-1]
-
-
-def narrows(new: DTypeLike, old: DTypeLike) -> bool:
-    """True if a conversion to a dtype of floats loses digits."""
-    new, old = jnp.dtype(new), jnp.dtype(old)
-    if not jnp.issubdtype(new, jnp.floating):
-        return False
-    if jnp.issubdtype(old, jnp.integer):
-        return jnp.iinfo(old).bits > jnp.finfo(new).nmant
-    return jnp.issubdtype(old, jnp.floating) and jnp.finfo(new).bits < jnp.finfo(old).bits
-
-
-def _selection(
-    name: str, equation: core.JaxprEqn, numbers: list[np.ndarray], indices: list[Array]
-) -> list[Array]:
-    """The numbers that the primitive selects; without compilation for the common ones."""
-    p, x = equation.params, numbers[0]
-    if name == "reshape":
-        return list(numbers)
-    if name == "transpose":
-        return [x.transpose(p["permutation"])]
-    if name == "slice":
-        strides = p["strides"] or (1,) * x.ndim
-        cut = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
-        return [x[tuple(slice(*c) for c in cut)]]
-    if name == "rev":
-        return [np.flip(x, p["dimensions"])]
-    if name == "concatenate":
-        return [np.concatenate(numbers, p["dimension"])]
-    if name == "stack":
-        return [np.stack(numbers, p["axis"])]
-    if name == "unstack":
-        return list(np.moveaxis(x, p["axis"], 0))
-    if name == "broadcast_in_dim":
-        place = [1] * len(p["shape"])
-        for axis, size in zip(p["broadcast_dimensions"], x.shape, strict=True):
-            place[axis] = size
-        return [np.broadcast_to(x.reshape(place), p["shape"])]
-    with jax.ensure_compile_time_eval():
-        if name == "scatter":
-            options = {x: p[x] for x in ("indices_are_sorted", "unique_indices", "mode")}
-            place, arrays = p["dimension_numbers"], [x, *indices, numbers[1]]
-            return [jax.lax.scatter(*map(jnp.asarray, arrays), place, **options)]
-        if name == "gather":
-            p = p | {"fill_value": -1}  # marks entries out of range
-        entries = equation.primitive.bind(*map(jnp.asarray, [*numbers, *indices]), **p)
-    return list(entries) if equation.primitive.multiple_results else [entries]
-
-
-def _matrix(equation: core.JaxprEqn, known: list[Array | None], index: int) -> Array:
-    """Matrix of a primitive that is linear in one input: its values at unit vectors."""
-    shape, output = _shape(equation, index), _spec(equation.outvars[0])
-    units = np.eye(math.prod(shape), dtype=output.dtype).reshape(-1, *shape)
-    columns: Array
-    if str(equation.primitive) == "reduce_sum":
-        columns = units.sum(tuple(a + 1 for a in equation.params["axes"]))
-    elif str(equation.primitive) == "cumsum":
-        axis, step = equation.params["axis"] + 1, -1 if equation.params["reverse"] else 1
-        ordered = np.moveaxis(units, axis, 0)[::step]
-        columns = np.moveaxis(np.cumsum(ordered, 0)[::step], 0, axis)
-    else:
-        *letters, out, _ = _letters(equation)
-        other = known[1 - index]
-        assert other is not None
-        other = other.reshape(_shape(equation, 1 - index)).astype(output.dtype)
-        subscripts = f"Z{letters[index]},{letters[1 - index]}->Z{out}"
-        columns = module_of(other).einsum(subscripts, units, other)
-    return columns.reshape(len(units), -1).T
-
-
-def _spec(atom: core.Var | core.Literal) -> jax.ShapeDtypeStruct:
-    """Shape and dtype of a variable or literal."""
-    aval: Any = atom.aval
-    return jax.ShapeDtypeStruct(aval.shape, aval.dtype)
-
-
-def _shape(equation: core.JaxprEqn, index: int) -> tuple[int, ...]:
-    """Shape of an input."""
-    return tuple(_spec(equation.invars[index]).shape)
-
-
-def _letters(equation: core.JaxprEqn) -> tuple[str, str, str, str]:
-    """Subscripts of a dot product: left, right, output, and the contracted ones."""
-    (left_sum, right_sum), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    names = iter("abcdefghijklmnopqrstuvwxyz")
-    left = [next(names) for _ in _shape(equation, 0)]
-    right = [next(names) for _ in _shape(equation, 1)]
-    for a, b in zip((*left_sum, *left_batch), (*right_sum, *right_batch), strict=True):
-        right[b] = left[a]
-    batch = [left[a] for a in left_batch]
-    summed = [left[a] for a in left_sum]
-    free = [c for c in left + right if c not in batch + summed]
-    return "".join(left), "".join(right), "".join(batch + free), "".join(summed)
-
-
-def _refusal(name: str) -> str:
-    """Remedy for an unsupported primitive."""
-    if name == "while":
-        return (
-            f"`{name}` depends on values that are not known. Use a loop of fixed length (lax.scan, or "
-            "lax.fori_loop with constant bounds) and jnp.where."
-        )
-    return (
-        f"the primitive `{name}` has no enclosure. Supported are arithmetic, dot products, elementary "
-        "functions, min, max, clip, where, indexing by constants, reshapes and loops of fixed length."
-    )
