@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from jaxltl.core.models.number_source import Part, Rationals
+from jaxltl.core.models.number_source import NumberSource, Part, Rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 
@@ -20,16 +20,16 @@ def exact_numbers(model: SparseMDP) -> Rationals:
 
     Otherwise they are the doubles, as rows that are divided by their sums.
     """
-    read = model.numbers.read
-    if read is None:
+    source: NumberSource = model.numbers
+    if source.read is None:
         return _doubles_of(model)
-    for successor, probability, numbers in model.numbers.known:
+    for successor, probability, numbers in source.known:
         if successor is model.successor and probability is model.probability:
             return numbers
-    written = read(model)
+    written = source.read(model)
     if written is None or not _agrees(written.mdp, model):
         written = _doubles_of(model)
-    model.numbers.known[:] = [(model.successor, model.probability, written)]
+    source.known[:] = [(model.successor, model.probability, written)]
     return written
 
 

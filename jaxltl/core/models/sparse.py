@@ -21,6 +21,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce
 from jaxltl.core.models.ops.underflow import underflow_text, underflows
 from jaxltl.core.pretty_print import brief
@@ -95,8 +96,7 @@ class SparseMDP:
       valuation: values of named variables in each state, ``[S]`` each.
       propositions: the P names; static.
       action_names: names of the actions by number, or empty; static.
-      numbers: the rational numbers that the probabilities and rewards stand for, which decide
-        thresholds of small models; static.
+      numbers: the source of exact numbers, which decide thresholds of small models; static.
 
     Example:
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2], [1, 0.5, 0.5, 1, 1],
@@ -116,7 +116,7 @@ class SparseMDP:
     valuation: dict[str, Array] = struct.field(default_factory=dict)
     propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
     action_names: tuple[str, ...] = struct.field(pytree_node=False, default=())
-    numbers: NumberSource = struct.field(pytree_node=False, default=NumberSource())
+    numbers: PyTree = struct.field(pytree_node=False, default=NumberSource())
 
     @property
     def num_states(self) -> int:

@@ -35,6 +35,7 @@ Method = Literal["build", "partial"]
 Report = Callable[[int, int, Answer], None]  # of the numbers of states found and expanded
 
 _FIRST = 1000  # states before the first solve
+_SMALL = 1000  # states of a model whose thresholds are decided in rational arithmetic
 _GROWTH = {"dtmc": 2.0, "mdp": 1.3}  # of their number between two solves
 _LIKELY_SHARE = 0.1  # states with this share of the largest weight are expanded together
 _SHARE = 50  # of an mdp at least 1 / _SHARE of the known states are, so that batches are large
@@ -110,9 +111,13 @@ def solve_program(
             "explored in part; build the model."
         )
     try:
-        return _narrowed(
-            _Part(program, _event(program, prop), prop, max_states), prop, tolerance, report
-        )
+        part = _Part(program, _event(program, prop), prop, max_states)
+        answer = _narrowed(part, prop, tolerance, report)
+        if prop.relation is not None and not part.frontier.any() and part.num_states <= _SMALL:
+            # All states are known: thresholds that are met with equality need fractions.
+            whole = solve_program(program, prop, tolerance=tolerance, max_states=max_states)
+            return whole._replace(method=f"{answer.method}; {whole.method}")
+        return answer
     except LanguageError as error:
         raise program.source.located(error) from None
 

@@ -40,6 +40,7 @@ from jaxltl.core.sparse.solvers.shortest_path_problem import (
 )
 
 _EPS = float(np.finfo(np.float64).eps)
+_TINY = 1e-200  # upper bounds below which the graph decides whether a total reward is 0
 # A model mixes well, so that sweeps beat elimination, if a search meets many states in few steps.
 _LARGE, _MET, _STEPS = 20_000, 4096, 10  # of as many interior states: that many, in that many steps
 _SOME, _FEW = 400, 5  # of fewer states: half of them
@@ -124,7 +125,27 @@ def total_reward(
     must not be taken; `depth` is the number of roundings behind each number of the model.
     """
     reduced = reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth)
-    return _solve(reduced, tolerance)
+    return _with_zeros(mdp, reward, target, maximize, _solve(reduced, tolerance))
+
+
+def _with_zeros(
+    mdp: HostMDP, reward: Floats, target: Booleans, maximize: bool, enclosure: Enclosure
+) -> Enclosure:
+    """The enclosure of a total reward, exactly 0 where the graph decides that it is.
+
+    Only where the upper bound is tiny: errors of values that are 0 are.
+    """
+    tiny = (enclosure.lower <= 0) & (enclosure.upper > 0) & (enclosure.upper < _TINY)
+    if not tiny.any():
+        return enclosure
+    if maximize:
+        inner = ~target[mdp.state]
+        zero = ~backward_reachable(mdp, mdp.states_of(inner & (reward > 0)), inner)
+    else:
+        zero = almost_sure_reachability(mdp, target, reward == 0)[0]
+    parts = (np.where(tiny & zero, 0, x) for x in (enclosure.value, enclosure.upper))
+    value, upper = parts
+    return replace(enclosure, value=value, upper=upper)
 
 
 def reward_forever(
@@ -165,7 +186,8 @@ def reward_forever(
     inner = shortest_path_rows(mdp, some, components.inside)
     outer = shortest_path_rows(mdp, rich, np.ones(mdp.num_rows, bool))
     endless = np.where(some, first, np.where(rich, inner, outer))
-    return _at(enclosure, part.node, np.where(infinite, endless, leaving))
+    whole = _at(enclosure, part.node, np.where(infinite, endless, leaving))
+    return _with_zeros(mdp, reward, np.zeros(mdp.num_states, bool), True, whole)
 
 
 # --- qualitative preprocessing --------------------------------------------------------------------

@@ -14,13 +14,13 @@ from jaxltl.core.models.compiled import flatten_policy, is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.protocols import ActionModel, Array, Model
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.discounted import discounted_value
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution, Status, row_tolerance
-from jaxltl.core.values.engine.state_quantities import finite_reward
+from jaxltl.core.values.engine.state_quantities import clipped, discounted_span, finite_reward
 
 
 def status_between(
@@ -190,6 +190,8 @@ def discounted(
         host, earned, magnitude, float(discount), tolerance=requested, depth=depth
     )
     solution = solution_from_enclosure(model, sparse, enclosure, requested, relative=False)
+    span = discounted_span(reward_structure(sparse, reward), float(discount))
+    solution = clipped(solution, span) if is_sparse(model) else solution
     return with_given_policy(solution, policy)
 
 

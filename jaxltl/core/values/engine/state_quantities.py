@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from typing import cast
 
@@ -94,6 +95,20 @@ def reward_span(rewards: Rewards, num_steps: int = 1) -> Span:
             numbers = np.asarray(part, np.float64)
             low, high = low + Fraction(float(numbers.min())), high + Fraction(float(numbers.max()))
     return double_bounds(num_steps * low)[0], double_bounds(num_steps * high)[1]
+
+
+def discounted_span(rewards: Rewards, discount: float) -> Span:
+    """Bounds of discounted sums of the rewards of steps."""
+    least, largest = (Fraction(x) / (1 - Fraction(discount)) for x in reward_span(rewards))
+    return double_bounds(least)[0], double_bounds(largest)[1]
+
+
+def clipped(solution: Solution, span: Span) -> Solution:
+    """A solution of NumPy arrays within the span of its quantity."""
+    parts: dict[str, Array] = {
+        name: np.clip(getattr(solution, name), *span) for name in ("value", "lower", "upper")
+    }
+    return replace(solution, **parts)
 
 
 def nonnegative_reward(

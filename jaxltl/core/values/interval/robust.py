@@ -28,6 +28,8 @@ from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.values.engine.host_solution import status_between
 from jaxltl.core.values.engine.state_quantities import (
+    clipped,
+    discounted_span,
     nonnegative_reward,
     state_mask,
     transition_reward,
@@ -205,7 +207,8 @@ def robust_discounted_value(
     values = discounted_value(
         DiscountedModel(sides.host, earned, discounts), sides.query(requested)
     )
-    return robust_solution(world, sides, values, requested, relative=False)
+    solution = robust_solution(world, sides, values, requested, relative=False)
+    return clipped(solution, discounted_span(structure, float(discount)))
 
 
 @of_one_player
