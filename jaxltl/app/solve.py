@@ -20,6 +20,7 @@ from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
+from jaxltl.core.pretty_print import is_vacuous
 from jaxltl.core.models import Game, IntervalMDP, SparseMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.sparse.mdp import HostMDP
@@ -260,8 +261,9 @@ def result_entry(result: Result) -> Record:
     if result.query.parsed is not None and result.query.parsed.name is not None:
         entry["name"] = result.query.parsed.name
     if isinstance(answer, Answer):
+        known = np.where(is_vacuous(answer.lower, answer.upper), np.nan, answer.value)
         entry |= {
-            "value": _over_states(answer.value.tolist() if answer.holds is None else answer.holds),
+            "value": _over_states(known.tolist() if answer.holds is None else answer.holds),
             **{key: _over_states(getattr(answer, key).tolist()) for key in ("lower", "upper")},
             "method": answer.method,
         }
@@ -302,7 +304,8 @@ def _number(x: object) -> Any:
 
 def text(result: Result) -> str:
     """Answer to a property, as text."""
-    lines = render("jaxltl.app.reports", "solve.txt", result=result, answer=result.answer)
+    values = {"result": result, "answer": result.answer, "vacuous": is_vacuous}
+    lines = render("jaxltl.app.reports", "solve.txt", **values)
     return lines.rstrip("\n")
 
 

@@ -19,6 +19,8 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Booleans, Floats
+
 WIDTH, LINES = 100, 10  # characters of a line, and lines, that a repr has at most
 READ = 2**20  # entries of an array up to which its values are read
 _LIST = 6  # entries that are shown one by one
@@ -225,6 +227,20 @@ def value_range(value: object) -> str:
     low, high, missing = known.min(), known.max(), read.size - known.size
     text = f"all {number(low)}" if low == high else f"{number(low)} to {number(high)}"
     return f"{text}, {missing:,} nan" if missing else text
+
+
+def is_vacuous(lower: Floats, upper: Floats) -> Booleans:
+    """Marks bounds that exclude no probability, or no reward on one side.
+
+    >>> is_vacuous(np.array([0, 0, 2, np.inf]), np.array([1, 0.5, np.inf, np.inf])).tolist()
+    [True, False, True, False]
+    """
+    low, high = np.asarray(lower, float), np.asarray(upper, float)
+    infinite = np.isinf(low) | np.isinf(high)
+    marked: Booleans = (
+        ((low <= 0) & (high == 1)) | (infinite & (low != high)) | np.isnan(low) | np.isnan(high)
+    )
+    return marked
 
 
 def bounds_text(lower: object, upper: object) -> str:

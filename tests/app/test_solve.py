@@ -344,3 +344,17 @@ def test_at_most_six_files_pass_the_tolerance_on(model_file, text):
         sys.setprofile(None)
     assert paths and all(len(path) <= 6 for path in paths), paths
     assert all(path[-2:] == ("app/solve.py", "cli.py") for path in paths)
+
+
+@pytest.mark.parametrize("low, high", [(0.0, 1.0), (0.0, np.inf), (3.0, np.inf)])
+def test_no_number_is_given_where_the_bounds_exclude_nothing(low, high):
+    query = module.parse_queries(['Pmax=? [ F "a" ]'])[0]
+    bounds = (np.array([x]) for x in (0.25, low, high))
+    answer = module.Answer(
+        np.zeros(1, int), *bounds, None, jaxltl.Status.PRECISION, "value iteration", None
+    )
+    result = module.Result(query, answer, 0.0)
+    text = module.text(result)
+    assert "0.25" not in text and f"in [{low}, {high}]" in text and "PRECISION" in text
+    assert module.result_entry(result)["value"] is None
+    assert "0.25" not in repr(answer) and "PRECISION" in repr(answer)

@@ -31,7 +31,7 @@ _STEPS = 16  # refinements of one policy
 _TIES = 0.0, 1e-10, 1e-5, 1.0, 16.0  # of the last step: values that differ by less may be equal
 _NOISE = 8  # times the residual of a policy's own rows: smaller gains are rounding
 _TRUSTED = 1e-9  # residual up to which gains are believed
-_MAX_SHARE = 1e-3  # up to which second-order terms are covered by `perturbation_bound`
+MAX_SHARE = 1e-3  # up to which second-order terms are covered by `perturbation_bound`
 
 _MAX_BAND, _MAX_WORK = 2**27, 4e9  # entries of a band, and its multiplications
 MAX_FRACTIONS = 1000  # unknowns of a system in fractions
@@ -142,7 +142,7 @@ def refined_optimum(
             over = np.maximum(equation.sign * gap, 0)
             over[policy] = np.abs(gap[policy])
             share = perturbation_bound(_largest_share(over, scale) + 2 * unit, policy.size)
-            if share <= _MAX_SHARE and (high >= 0).all() and _leaves(equation, policy):
+            if share <= MAX_SHARE and (high >= 0).all() and _leaves(equation, policy):
                 if best is None or share < best.share:
                     best = RefinedOptimum(high, share, policy, round_)
                 if best.share <= tolerance / 4:

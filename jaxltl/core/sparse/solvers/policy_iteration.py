@@ -35,6 +35,7 @@ from jaxltl.core.sparse.linear.extended_precision import (
     refined_optimum,
 )
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation, propagate_improvements
+from jaxltl.core.sparse.linear.ordered_sweeps import CostRows, OrderedSweeps, short_policy
 from jaxltl.core.sparse.linear.topological_order import (
     Edges,
     Levels,
@@ -68,6 +69,9 @@ _MAX_ROUNDS = 300
 # Unknowns from which value iteration is tried, its sweeps, and a change at its end, in tolerances;
 # elimination takes longer in cores of zeroconf with 120,000 unknowns.
 _LARGE_CORE, _MAX_SWEEPS, _CONVERGED = 20_000, 400, 0.01
+_LONG = 1000  # tolerances that extra costs may have in sum before sweeps are tried
+_PENALTIES = 1e-2, 1e-4, 1e-7  # costs of a step, in tolerances, for policies that do not wait
+_EVALUATIONS = 4  # of a policy, between sweeps that converge slowly
 _USEFUL = 0.1  # bounds of this width give a start policy for extended precision
 
 
@@ -215,22 +219,25 @@ class _CoreSolver:
         """Bounds, by double precision if that suffices."""
         equation, rounds = self.equation, 0
         value, converged = self._value_iteration()
-        last = first = self._made_proper(equation.greedy_policy(value, 1))
+        first = self._made_proper(equation.greedy_policy(value, 1))
         best = self._by_sweeps(value, first) if converged else None
         if best is None or not self._is_narrow(best, self.tolerance):
-            best, rounds, last = self._iterate(first)
-        for method in (self._by_refinement, self._by_gth_refinement, self._by_fractions):
+            best, rounds = self._iterate(first, equation.size <= _SMALL_CORE)
+        for method in (
+            self._by_refinement,
+            self._by_converged_sweeps,
+            self._by_gth_refinement,
+            self._by_fractions,
+            self._by_ordered_sweeps,
+        ):
             if best is not None and self._is_narrow(best, self.tolerance):
                 break
             # A policy of the extra cost without a close bound may stay nearly for ever.
             useful = best is not None and self._is_narrow(best, _USEFUL)
             more = method(best.policy if best is not None and useful else first)
-            if more is not None:
+            if more is not None and (best is None or self._width(more) < self._width(best)):
                 best = replace(more, rounds=rounds + more.rounds)
-        if best is None:
-            low, high = np.zeros(equation.size), np.full(equation.size, np.inf)
-            attained, outer = (low, high) if equation.sign > 0 else (high, low)
-            best = _CoreValues(attained, outer, low, last, rounds, "nothing proven")
+        assert best is not None  # the last method has some bounds
         return replace(best, policy=self.row[best.policy])
 
     def _value_iteration(self) -> tuple[Floats, bool]:
@@ -292,11 +299,18 @@ class _CoreSolver:
             time, stays = time + stays, rows @ stays
         return None
 
-    def _iterate(self, policy: Integers) -> tuple[_CoreValues | None, int, Integers]:
-        """Policy iteration with an extra cost per step: the best bounds, rounds, last policy."""
+    def _iterate(self, policy: Integers, patient: bool) -> tuple[_CoreValues | None, int]:
+        """Policy iteration with an extra cost per step: the best bounds, and rounds.
+
+        Unless patient, sweeps are tried as soon as the extra costs change the policy's value.
+        """
         equation, sign = self.equation, self.equation.sign
         weight = np.ones(equation.size)
         solver: Factors | None = factorize(equation.matrix, self.label, policy)
+        if not patient and solver is not None and any(x.factor is None for x in solver.blocks):
+            patient, swept = True, self._by_converged_sweeps(policy)
+            if swept is not None and self._is_narrow(swept, self.tolerance):
+                return swept, 0
         extra, rounds, best = None, 0, None
         margin = _MARGIN_CHAIN if equation.is_chain else _MARGIN
         while rounds < _MAX_ROUNDS and solver is not None:
@@ -310,6 +324,10 @@ class _CoreSolver:
                 solver = solver.without_krylov(policy)
                 extra = extra if np.isfinite(extra) else None
                 continue
+            if not patient and not rounds & (rounds - 1) and self._is_slow(solver, policy, value):
+                patient, swept = True, self._by_converged_sweeps(policy)
+                if swept is not None and self._is_narrow(swept, self.tolerance):
+                    return swept, rounds
             late = rounds % (2 * _SWEPT_ROUNDS) == 0
             if late and not (solver.solve(weight) < weight / _EPS).all():
                 break  # episodes so long that systems have no correct digit
@@ -344,7 +362,13 @@ class _CoreSolver:
             if same and extra / 2 <= other <= (2 * extra if attained is None else np.inf):
                 break
             extra = other
-        return best, rounds, policy
+        return best, rounds
+
+    def _is_slow(self, solver: Factors, policy: Integers, value: Floats) -> bool:
+        """True if episodes are so long that their extra cost counts."""
+        costs = solver.solve(self.equation.cost[policy])
+        size = costs if self.relative else 1
+        return not bool((np.abs(value - costs) <= _LONG * self.tolerance * size).all())
 
     def _weight(self, value: Floats) -> Floats:
         """The extra cost of each node, up to a factor: one, or in proportion to its value."""
@@ -404,10 +428,17 @@ class _CoreSolver:
         return attained
 
     def _is_narrow(self, values: _CoreValues, tolerance: float) -> bool:
+        return self._width(values) <= tolerance
+
+    def _width(self, values: _CoreValues) -> float:
+        """The largest width of bounds, relative if the tolerance is."""
         sign = self.equation.sign
         width = sign * (values.outer - values.attained)
-        size = np.abs(values.attained if sign > 0 else values.outer) if self.relative else 1
-        return bool((width <= tolerance * size).all())
+        if self.relative:
+            size = np.abs(values.attained if sign > 0 else values.outer)
+            with np.errstate(all="ignore"):
+                width = np.where(width > 0, width / size, 0)
+        return float(np.where(np.isnan(width), np.inf, width).max(initial=0))
 
     def _by_refinement(self, policy: Integers) -> _CoreValues | None:
         """Bounds of a core with very long episodes, from values in two floats."""
@@ -422,6 +453,66 @@ class _CoreSolver:
         """The same where pivots with subtractions have no correct digit."""
         matrix, leaving = self.equation.matrix, self.equation.leaving
         return self._refined(policy, lambda rows: gth_solver(matrix[rows], leaving[rows]))
+
+    def _by_ordered_sweeps(self, policy: Integers) -> _CoreValues:
+        """Bounds by Gauss-Seidel sweeps, which always end with some."""
+        swept = self._swept(policy, required=True)
+        assert swept is not None
+        return swept
+
+    def _by_converged_sweeps(self, policy: Integers) -> _CoreValues | None:
+        """The same where sweeps converge and certify bounds; None otherwise."""
+        return self._swept(policy, required=False)
+
+    def _swept(self, policy: Integers, *, required: bool) -> _CoreValues | None:
+        equation, sign, accuracy = self.equation, self.equation.sign, 0.01 * self.tolerance
+        rows = CostRows(equation.matrix, equation.cost, equation.leaving, equation.owner)
+        sweeps = OrderedSweeps(rows, sign, self.unit, self.relative)
+        value, error = sweeps.converge(np.zeros(equation.size), accuracy)
+        for _ in range(_EVALUATIONS):
+            policy = self._made_proper(short_policy(sweeps, rows, value))
+            if error <= accuracy:
+                break
+            solver = factorize(equation.matrix, self.label, policy)
+            evaluated = None if solver is None else solver.solve(equation.cost[policy])
+            if evaluated is None or not (evaluated >= 0).all():  # also NaN
+                break
+            value, error = sweeps.converge(evaluated, accuracy)
+        if not required and not error <= self.tolerance:
+            return None
+        margins = 2 * error + self.tolerance / 64, self.tolerance / 4
+        outer = sweeps.bound(value, sign, margins)
+        if outer is None and not required:
+            return None
+        if outer is None:
+            outer = sweeps.monotone_bound(sign, sweeps.num_sweeps)
+        outer = outer * (1 + sign * self.outer_error)
+        best: _CoreValues | None = None
+        for penalty in (0.0, *_PENALTIES):
+            if penalty:
+                # Policies that wait for ever, as a minimum seems to be lower, cost their time.
+                size = float(value.max(initial=0)) if self.relative else 1.0
+                spent = rows._replace(cost=rows.cost + penalty * self.tolerance * max(size, TINY))
+                timed = OrderedSweeps(spent, sign, self.unit, self.relative)
+                policy = self._made_proper(timed.greedy(timed.converge(value, accuracy)[0]))
+            chain = OrderedSweeps(rows.only(policy), -sign, self.unit, self.relative)
+            start, error = chain.converge(value, accuracy)
+            margins = 2 * error + self.tolerance / 64, self.tolerance / 4
+            attained = chain.bound(start, -sign, margins)
+            if attained is None and not required and sign > 0:
+                return None
+            if attained is None:
+                attained = chain.monotone_bound(-sign, sweeps.num_sweeps)
+            attained = attained * (1 - sign * self.outer_error)
+            middle = np.clip(start, np.minimum(attained, outer), np.maximum(attained, outer))
+            rounds = sweeps.num_sweeps + chain.num_sweeps
+            swept = _CoreValues(attained, outer, middle, policy, rounds, "value iteration")
+            if best is None or self._width(swept) < self._width(best):
+                best = swept
+            if sign > 0 or self._is_narrow(best, self.tolerance):
+                break
+        assert best is not None
+        return best
 
     def _refined(
         self, policy: Integers, solver_of: Callable[[Integers], Solver | None]

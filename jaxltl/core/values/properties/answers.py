@@ -15,7 +15,7 @@ from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import bounds_text, brief, count, truncate, value_range
+from jaxltl.core.pretty_print import bounds_text, brief, count, is_vacuous, truncate, value_range
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
@@ -49,8 +49,12 @@ class PropertyStrategy(NamedTuple):
 def _facts(value: Answer) -> Iterator[str]:
     yield value.status.name
     yield count(len(value.states), "state")
-    yield f"value {value_range(value.value)}"
-    yield bounds_text(value.lower, value.upper)
+    unknown = is_vacuous(value.lower, value.upper)
+    if unknown.all():
+        yield f"value between {value_range(value.lower)} and {value_range(value.upper)}"
+    else:
+        yield f"value {value_range(np.where(unknown, np.nan, value.value))}"
+        yield bounds_text(value.lower, value.upper)
     if value.holds is not None:
         yield f"holds {truncate(str(value.holds))}"
     yield f"by {value.method}"

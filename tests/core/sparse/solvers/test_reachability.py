@@ -129,6 +129,7 @@ WAYS = [
     "contracted",
     "refined",
     "eliminated at last",
+    "by ordered sweeps",
 ]
 
 
@@ -149,6 +150,15 @@ def way(request, monkeypatch):
         monkeypatch.setattr(
             elimination, "_iterative_solution", lambda _, b: np.full(b.size, np.nan)
         )
+    if request.param == "by ordered sweeps":
+        monkeypatch.setattr(transient._CoreSolver, "_iterate", lambda *_: (None, 0))
+        for name in (
+            "_by_refinement",
+            "_by_converged_sweeps",
+            "_by_gth_refinement",
+            "_by_fractions",
+        ):
+            monkeypatch.setattr(transient._CoreSolver, name, lambda *_: None)
     if request.param == "refined":
         monkeypatch.setattr(transient._CoreSolver, "_certified", lambda *_: None)
     return request.param
