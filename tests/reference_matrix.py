@@ -78,12 +78,11 @@ def random_case(rng: np.random.Generator, num_states: int, *, is_chain: bool = F
 
 @dataclass(frozen=True)
 class Aims:
-    """The direction in which each player optimises: 1 or -1."""
+    """The direction in which each player optimises, 1 or -1, or 0 if there is no such player."""
 
     system: int
-    environment: int
-    nature: int
-    intervals: bool
+    environment: int = 0
+    nature: int = 0
 
 
 def vertices(case: Case, s: int, a: int, intervals: bool) -> list[np.ndarray]:
@@ -106,13 +105,14 @@ def options(case: Case, aims: Aims, policy: np.ndarray | None) -> list[tuple[lis
     """For each state, the rows ``[[(row, reward)]]`` by the choices of who maximises and minimises."""
     found = []
     for s in range(case.num_states):
-        owner = aims.system if case.system[s] else aims.environment
-        fixed = policy is not None and (case.system[s] or aims.environment == 0)
+        own = bool(case.system[s]) or aims.environment == 0
+        owner, fixed = (aims.system, policy is not None) if own else (aims.environment, False)
         actions = [policy[s]] if fixed else np.flatnonzero(case.available[s])
         rows = [
-            [(p, case.reward[s, a]) for p in vertices(case, s, a, aims.intervals)] for a in actions
+            [(p, case.reward[s, a]) for p in vertices(case, s, a, aims.nature != 0)]
+            for a in actions
         ]
-        same = aims.nature == owner or aims.nature == 0 or all(len(r) == 1 for r in rows)
+        same = aims.nature in (0, owner) or all(len(row) == 1 for row in rows)
         if same:
             flat = [x for row in rows for x in row]
             table = [[x] for x in flat] if owner > 0 else [flat]

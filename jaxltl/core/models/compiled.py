@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.models.construct.convert import product_rows, to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Array, Model, PyTree
+from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
 from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
@@ -36,6 +37,8 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
         return _named_reward(model, reward)
     if isinstance(model, Product) and isinstance(model.mdp, SparseMDP):
         model = product_rows(model.mdp, model) if is_traced(model) else to_sparse(model)
+    if hasattr(base_model(model), "nominal"):
+        raise ValueError(validation.unsupported_model(base_model(model)))
     if not isinstance(model, SparseMDP):
         return model, reward
     if reward is not None:

@@ -219,6 +219,11 @@ def product(
             "world is a product with a task already; give its model and the conjunction of both "
             'formulas: product(world.mdp, "(F a) & (G b)").'
         )
+    if isinstance(world.label, jax.core.Tracer):
+        raise ValueError(
+            "world has traced labels, from which no product is made; make it outside jit and vmap, "
+            "and pass the product in."
+        )
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")

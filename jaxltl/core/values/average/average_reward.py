@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.construct.convert import to_sparse
@@ -20,7 +19,7 @@ from jaxltl.core.models.game import Game, as_game, as_padded_game, is_determinis
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.operators import induced_chain
-from jaxltl.core.models.protocols import Array, Model, base_model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.solvers.average_reward import Range, average, within_range
 from jaxltl.core.types import Solution, status_code
@@ -35,7 +34,7 @@ from jaxltl.core.values.engine.state_quantities import (
 from jaxltl.core.values.engine.validated import validated
 
 
-@validated()
+@validated(host=True)
 def average_reward(
     model: Model,
     reward: Array | str,
@@ -154,8 +153,6 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
     if is_traced((game_model, reward)):
         raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")
     form, reward = compiled_form(game_model, reward)
-    if hasattr(base_model(form), "nominal"):
-        raise ValueError(validation.unsupported_model(base_model(form)))
     if isinstance(form.mdp, SparseMDP):
         host = form.mdp.host
         earned = pad_rows(form.mdp, choice_reward(form.mdp, reward))

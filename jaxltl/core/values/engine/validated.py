@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.models.one_player import refuse_game
+from jaxltl.core.models.refusals import refuse_game, refuse_traced
 from jaxltl.core.models.protocols import PyTree, base_model
 from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.types import Solution, Status
@@ -41,12 +41,13 @@ NUMBERS = ("reward", "initial")  # arrays, which may be lists
 
 
 def validated(
-    *, games: bool = False, **words: tuple[str, ...]
+    *, games: bool = False, host: bool = False, **words: tuple[str, ...]
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator of solvers that checks arguments by their names.
 
     Numbers in :data:`validation.RANGES`, words, Booleans, and arrays of numbers; `words` are those of
-    more arguments. A game is refused unless `games` says that the solver knows who moves.
+    more arguments. A game is refused unless `games` says that the solver knows who moves;
+    traced arrays are refused by solvers on the `host`.
     """
     # Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
     # argument out of range is replaced by the least valid number, so that the solver ends, and the
@@ -62,6 +63,8 @@ def validated(
             bound = signature.bind(*args, **kwargs)
             if not games:
                 refuse_game(solve.__name__, bound.arguments.items())
+            if host:
+                refuse_traced(solve.__name__, bound.arguments.items())
             arguments = dict(bound.arguments)
             options = {k: x for k, x in arguments.pop("options", {}).items() if x is not None}
             arguments.update(options)

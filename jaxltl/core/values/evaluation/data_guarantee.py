@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import on_host
 from jaxltl.core.statistics.confidence_sets import (
     Graph,
     LeastProbability,
@@ -84,7 +84,7 @@ class DataGuarantee:
         return describe_graph(self.graph)
 
 
-@of_one_player
+@on_host
 def learn_guarantee(
     model: RowModel,
     counts: TransitionCounts | ConfidenceSets | np.ndarray,
@@ -278,7 +278,7 @@ def _gain(
     return gain
 
 
-@of_one_player
+@on_host
 def guarantee_curve(
     model: RowModel,
     counts: TransitionCounts | np.ndarray,

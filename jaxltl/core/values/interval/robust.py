@@ -10,11 +10,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import on_host
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
@@ -68,7 +67,7 @@ def refuse_nature(nature: str | None) -> None:
         )
 
 
-@validated(games=True)
+@validated(games=True, host=True)
 def robust_reachability(
     model: Model,
     target: Array | str,
@@ -118,7 +117,7 @@ def robust_reachability(
     return robust_solution(world, sides, values, requested, relative=False)
 
 
-@validated(games=True)
+@validated(games=True, host=True)
 def robust_total_reward(
     model: Model,
     reward: Reward,
@@ -135,8 +134,7 @@ def robust_total_reward(
     target is not reached almost surely.
 
     Args:
-      model: the model; no games.
-      target, policy, objective, nature: as of :func:`robust_reachability`.
+      model, target, policy, objective, nature: as of :func:`robust_reachability`.
       reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`; at least 0. Rewards of
         transitions must not differ within a row unless the interval is a point.
       tolerance: width of the enclosure, relative to the value; default 1e-6.
@@ -163,7 +161,7 @@ def robust_total_reward(
     return robust_solution(world, sides, values, requested, relative=True)
 
 
-@validated(games=True)
+@validated(games=True, host=True)
 def robust_discounted_value(
     model: Model,
     reward: Reward,
@@ -211,7 +209,7 @@ def robust_discounted_value(
     return clipped(solution, discounted_span(structure, float(discount)))
 
 
-@of_one_player
+@on_host
 def robust_expectation(
     model: IntervalMDP, value: ArrayLike, *, objective: str = "max", nature: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -355,12 +353,6 @@ def sides_of(
 def world_of(model: Model) -> tuple[IntervalMDP, np.ndarray | None]:
     """The interval model, and in a game the states of the system."""
     world = model.mdp if isinstance(model, Game) else model
-    if is_traced(model):
-        raise ValueError(
-            f"model is a {type(world).__name__} with traced arrays, and values of games and of "
-            "intervals are found on the host: call this outside jit, vmap and grad; inside, use "
-            "solve_prepared of an IntervalMDP, or minimax_value of a game without intervals."
-        )
     if isinstance(world, SparseMDP) and isinstance(model, Game):
         world = make_interval(world, world.probability, world.probability)
     if not isinstance(world, IntervalMDP):

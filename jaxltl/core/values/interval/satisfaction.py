@@ -80,7 +80,7 @@ def robust_satisfaction(
     return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")
 
 
-@validated()
+@validated(host=True)
 def robust_product_satisfaction(
     model: Product,
     *,

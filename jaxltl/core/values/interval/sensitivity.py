@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import on_host
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
@@ -39,7 +39,7 @@ class Sensitivity(NamedTuple):
     upper: Floats
 
 
-@of_one_player
+@on_host
 def robust_sensitivity(
     model: IntervalMDP,
     solution: Solution,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.models.interval import IntervalMDP, require_interval
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import on_host
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.solvers.step_bounded import Steps
@@ -29,7 +29,7 @@ from jaxltl.core.values.engine.state_quantities import (
 )
 
 
-@of_one_player
+@on_host
 def robust_next_probability(
     model: IntervalMDP, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
@@ -65,7 +65,7 @@ def robust_next_probability(
     )
 
 
-@of_one_player
+@on_host
 def robust_bounded_reachability(
     model: IntervalMDP,
     target: Array | str,
@@ -111,7 +111,7 @@ def robust_bounded_reachability(
     )
 
 
-@of_one_player
+@on_host
 def robust_cumulative_reward(
     model: IntervalMDP,
     reward: Reward,
@@ -151,7 +151,7 @@ def robust_cumulative_reward(
     return _earned(model, earned, np.zeros(world.num_states), steps, objective, nature)
 
 
-@of_one_player
+@on_host
 def robust_instantaneous_reward(
     model: IntervalMDP,
     reward: Reward,

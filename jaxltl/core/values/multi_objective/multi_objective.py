@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-@validated()
+@validated(host=True)
 def achievable(
     model: Model,
     objectives: Sequence[Objective],
@@ -117,7 +117,7 @@ def _achievable(
     return Achievable(answer.holds, share, None, search.front(), Status.CONVERGED)
 
 
-@validated()
+@validated(host=True)
 def pareto(
     model: Model, objectives: Sequence[Objective], *, tolerance: float = 1e-4, max_points: int = 200
 ) -> Pareto:
@@ -176,7 +176,7 @@ def _require(model: Model, objectives: Sequence[Objective]) -> None:
             raise ValueError(f"objectives[{i}] is {validation.shorten(each)}; give an Objective.")
 
 
-@validated()
+@validated(host=True)
 def multi_objective(
     model: Model,
     objectives: Sequence[Objective],

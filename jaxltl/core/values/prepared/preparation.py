@@ -13,7 +13,7 @@ from jaxltl.core import struct
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import of_one_player
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, refuse_underflow

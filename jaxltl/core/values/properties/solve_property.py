@@ -98,7 +98,7 @@ class _Aim(NamedTuple):
         return {"objective": self.policy, "nature": nature}
 
 
-@validated()
+@validated(host=True)
 def solve_property(
     model: SparseMDP | IntervalMDP,
     prop: Property | str,

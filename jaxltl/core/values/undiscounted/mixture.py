@@ -219,7 +219,7 @@ def _mixed(policy: np.ndarray, sure: np.ndarray, share: float) -> np.ndarray:
     return mixed
 
 
-@validated()
+@validated(host=True)
 def practical_policy(
     model: Product,
     policy: Array,

@@ -38,6 +38,7 @@ from jaxltl.core.values.undiscounted.reachability import (
 )
 from jaxltl.core.values.undiscounted.satisfaction import (
     Reaching,
+    as_product,
     as_reachability,
     optimal_satisfaction,
     satisfaction_probability,
@@ -132,6 +133,7 @@ def optimal_actions(
             "optimal_actions(model) reads values, so it works on the host only: "
             "call it outside jit and vmap, and pass the mask in."
         )
+    model = as_product(model)
     goal = float(np.sqrt(np.finfo(model.dtype).eps) if tolerance is None else tolerance)
     problem = as_reachability(model, objective)
     if solution is None:

@@ -22,7 +22,7 @@ from jax import lax
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.attractor import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
-from jaxltl.core.models.one_player import of_one_player
+from jaxltl.core.models.refusals import of_one_player
 from jaxltl.core.models.ops.array_namespace import jax_array, jit, namespace, to_jax
 from jaxltl.core.models.ops.double_word import normalised_rows
 from jaxltl.core.models.ops.operators import (
@@ -39,7 +39,11 @@ from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error
 from jaxltl.core.values.engine.host_solution import complement
 from jaxltl.core.values.engine.linear import inverse
-from jaxltl.core.values.undiscounted.satisfaction import as_reachability, satisfaction_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    as_product,
+    as_reachability,
+    satisfaction_probability,
+)
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
@@ -117,7 +121,7 @@ def task_performance(
       (0.5, 0)
     """
     validation.choice("method", method, ("auto", "blocks", "general"))
-    require_policy(model, policy)
+    require_policy(as_product(model), policy)
     return _task_performance(model, policy, tolerance, method=method)
 
 

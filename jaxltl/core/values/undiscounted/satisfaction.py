@@ -24,8 +24,9 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.one_player import refuse_game
+from jaxltl.core.models.refusals import refuse_game, refuse_traced
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
@@ -75,7 +76,8 @@ def satisfaction_probability(
       model: the product.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``; for a sparse world ``float[R, Q]``, or its rows
         ``int32[S, Q]``.
-      nature: for products of interval models only, ``"min"`` (the default) or ``"max"``.
+      nature: for products of interval models only, ``"adversarial"`` (default), against the policy,
+        or ``"cooperative"``.
       method, tolerance: as in :func:`reachability_probability`.
 
     Returns:
@@ -98,11 +100,13 @@ def satisfaction_probability(
       >>> round(float(np.sum(model.initial * found.value)), 6)
       0.75
     """
-    model = _as_product(model)
+    model = as_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
     refuse_nature(nature)
     if is_sparse(model):
+        given = [("model", model), ("policy", policy), ("tolerance", tolerance)]
+        refuse_traced("satisfaction_probability", given)
         return product_satisfaction(model, policy=policy, tolerance=tolerance)
     task = model.automaton
     if task.has_final_states:
@@ -173,7 +177,7 @@ def optimal_satisfaction(
     model with adversarial nature is a stochastic parity game.
 
     Args:
-      model: a product; or with `task` a concrete model, an interval model or a game on one.
+      model: a product; or with `task` a concrete model, an interval model or a game on one of them.
       task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       nature: for interval models, ``"adversarial"`` (default) or ``"cooperative"``.
@@ -207,7 +211,10 @@ def optimal_satisfaction(
     if relative:
         tolerance = relative_width(model, tolerance)
     if task is not None:
+        refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
         refuse_iteration(max_steps, start)
+        if isinstance(model, Game) and isinstance(model.mdp, MDP | DenseMDP):
+            model = replace(model, mdp=to_sparse(model.mdp))
         if isinstance(model, IntervalMDP | Game):
             if label_on is not None:  # interval models read labels on exit
                 validation.choice("label_on", label_on, ("exit",))
@@ -226,7 +233,7 @@ def optimal_satisfaction(
     refuse_game("optimal_satisfaction", [("model", model)])
     if states is not None or label_on is not None:
         raise ValueError("states and label_on are for a model and a task, not for a product.")
-    model = _as_product(model)
+    model = as_product(model)
     by_rows = objective in ("max", "min") and is_sparse(model)
     if by_rows or isinstance(model.mdp, IntervalMDP):
         refuse_iteration(max_steps, start)
@@ -236,6 +243,7 @@ def optimal_satisfaction(
         )
     refuse_nature(nature)
     if by_rows:
+        refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
     run = _over_mesh if is_sharded(model) else _optimal
     return run(model, tolerance, max_steps, start, objective=objective)
@@ -362,7 +370,7 @@ def _one_hot(policy: Array, num_actions: int) -> Array:
     return table[..., None] == xp.arange(num_actions)
 
 
-def _as_product(model: object) -> Product:
+def as_product(model: object) -> Product:
     if not isinstance(model, Product):
         raise ValueError(
             f"{type(model).__name__} is no product of a world and a task; give "

@@ -37,6 +37,7 @@ from jaxltl.core.values.undiscounted.policy_gradient import transient_factors
 from jaxltl.core.values.undiscounted.reachability import on_actions, on_rows, rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import (
     Reaching,
+    as_product,
     as_reachability,
     satisfaction_probability,
 )
@@ -131,7 +132,7 @@ def satisfaction_steps(model: Product, policy: Array) -> Steps:
     """
     if is_traced((model, policy)):
         raise ValueError("satisfaction_steps works on the host; call it outside jit and vmap.")
-    return StepAnalysis(model).steps(policy)
+    return StepAnalysis(as_product(model)).steps(policy)
 
 
 @validated()
@@ -159,6 +160,7 @@ def quickest_policy(model: Product, actions: OptimalActions | None = None) -> Qu
     """
     if is_traced((model, actions)):
         raise ValueError("quickest_policy works on the host; call it outside jit and vmap.")
+    model = as_product(model)
     return StepAnalysis(model).quickest(optimal_actions(model) if actions is None else actions)
 
 
@@ -415,7 +417,7 @@ def steps_front(
       >>> [(round(v.probability[0], 6), round(v.steps[0], 6)) for v in front]
       [(1.0, 4.0), (0.5, 1.0)]
     """
-    front = _Front.of(model, quickest)
+    front = _Front.of(as_product(model), quickest)
     vertices = list(front.ends)
     lines = [front.ends]
     while lines and len(vertices) < max_points:

@@ -48,7 +48,7 @@ def _has_intervals(
     return True
 
 
-@validated()
+@validated(host=True)
 def next_probability(
     model: Model, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
@@ -91,7 +91,7 @@ def next_probability(
     )
 
 
-@validated()
+@validated(host=True)
 def bounded_reachability(
     model: Model,
     target: Array | str,
@@ -158,7 +158,7 @@ def bounded_avoidance(
     )
 
 
-@validated()
+@validated(host=True)
 def cumulative_reward(
     model: Model,
     reward: Array | str,
@@ -201,7 +201,7 @@ def cumulative_reward(
     return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
 
 
-@validated()
+@validated(host=True)
 def instantaneous_reward(
     model: Model,
     reward: Array | str,
@@ -246,7 +246,7 @@ def instantaneous_reward(
     return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
 
 
-@validated()
+@validated(host=True)
 def reward_bounded_reachability(
     model: Model,
     target: Array | str,

@@ -1,10 +1,12 @@
-"""The refusal of games by solvers for one player, which would answer as if the environment helped."""
+"""Refusals of models: of games where one player chooses, and of traced arrays on the host."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import ParamSpec, TypeVar
+
+import jax
 
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product
@@ -24,7 +26,7 @@ _REACHING = (
     f"winning_region(game, objective), or robust_reachability(game, target, policy=...), {_ROWS}"
 )
 _REWARD = f"robust_total_reward(game, reward, target), {_ROWS}"
-_FORMULA = f"winning_region(game, formula), or optimal_satisfaction(game, formula), {_ROWS}"
+_FORMULA = "winning_region(game, formula), or optimal_satisfaction(game, formula), without product"
 
 # What to ask of a game instead, for each solver; games have no counterpart of the others.
 _INSTEAD = {
@@ -66,12 +68,41 @@ def refuse_game(function: str, arguments: Iterable[tuple[str, object]]) -> None:
             )
 
 
+def refuse_traced(function: str, arguments: Iterable[tuple[str, object]]) -> None:
+    """Raises ValueError if an argument has traced arrays."""
+    for name, value in arguments:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(value)):
+            raise ValueError(
+                f"{function}: {name} has traced arrays, and this is computed on the host; call it "
+                "outside jit and vmap, on concrete arrays. Inside, there are solve_prepared and the "
+                "values of an MDP, a DenseMDP, and products of them."
+            )
+
+
 def of_one_player(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator of functions that refuse games, by :func:`refuse_game`."""
 
     @wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        refuse_game(function.__name__, [("model", x) for x in args[:1]] + list(kwargs.items()))
+        refuse_game(function.__name__, _named(args, kwargs))
         return function(*args, **kwargs)
 
     return wrapper
+
+
+def on_host(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of functions that refuse games, and traced arrays, by :func:`refuse_traced`."""
+
+    @wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        refuse_game(function.__name__, _named(args, kwargs))
+        refuse_traced(function.__name__, _named(args, kwargs))
+        return function(*args, **kwargs)
+
+    return wrapper
+
+
+def _named(args: tuple[object, ...], kwargs: dict[str, object]) -> list[tuple[str, object]]:
+    """Arguments of functions whose first one is the model, by name."""
+    places = ["model"] + [f"argument {i + 1}" for i in range(1, len(args))]
+    return [*zip(places, args, strict=False), *kwargs.items()]
