@@ -105,8 +105,8 @@ def satisfaction_probability(
         return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
     refuse_nature(nature)
     if is_sparse(model):
-        given = [("model", model), ("policy", policy), ("tolerance", tolerance)]
-        refuse_traced("satisfaction_probability", given)
+        arguments = [("model", model), ("policy", policy), ("tolerance", tolerance)]
+        refuse_traced("satisfaction_probability", arguments)
         return product_satisfaction(model, policy=policy, tolerance=tolerance)
     task = model.automaton
     if task.has_final_states:
