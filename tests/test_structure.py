@@ -27,6 +27,7 @@ MODULES = {
 LAYERS = (
     (
         "core.array_types",
+        "core.deferred",
         "core.files",
         "core.pretty_print",
         "core.status",

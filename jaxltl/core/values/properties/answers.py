@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans
+from jaxltl.core.deferred import deferred_field
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
@@ -44,6 +45,9 @@ class PropertyStrategy(NamedTuple):
     by: str = ""
     memory: Satisfaction | None = None
     nature: Array | None = None
+
+
+PropertyStrategy.row = deferred_field(0, "Chosen rows.")  # type: ignore[assignment,method-assign]
 
 
 def _facts(value: Answer) -> Iterator[str]:

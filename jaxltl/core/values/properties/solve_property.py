@@ -532,7 +532,9 @@ class _Query(NamedTuple):
         )
         size = f"product of {result.product.host.num_states} states"
         method = ", ".join(filter(None, (size, result.solution.method)))
-        strategy = PropertyStrategy(result.row, memory=result, nature=result.solution.nature)
+        strategy = PropertyStrategy(
+            result[4], memory=result, nature=result.solution.nature
+        )  # the row may be deferred
         return _Result(replace(result.solution, method=method), strategy)
 
     def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Result:

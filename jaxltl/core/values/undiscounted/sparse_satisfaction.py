@@ -13,6 +13,7 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.deferred import Deferred, deferred_field
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -26,6 +27,7 @@ from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, fastest_optimum
 from jaxltl.core.values.engine.host_solution import (
     Chain,
     complement_event,
@@ -33,6 +35,10 @@ from jaxltl.core.values.engine.host_solution import (
     induced_chain,
     solution_from_enclosure,
 )
+
+
+_TIE_WIDTH = 1e-11  # relative width of the optimum, for ties between actions
+_LOSS = 1e-9  # of the fastest policy, relative, that counts as a rounding error
 
 
 def _facts(value: Satisfaction) -> Iterator[str]:
@@ -50,7 +56,8 @@ class Satisfaction(NamedTuple):
       automaton: of the formula, over the letters that occur.
       letter: ``int[S]``, the letter of each state.
       product: the reachable product of the model and the automaton, N states.
-      row: ``int32[N]``, the policy's row of the model in each of them.
+      row: ``int32[N]``, the policy's row of the model in each of them. Of a sparse model with up to
+        10^5 states of the product it is the fastest optimal policy, computed when it is first read.
       value: ``float64[N]``, the probability in each of them.
       label_on: the label that a step of the policy reads, of the state entered or left.
 
@@ -72,6 +79,9 @@ class Satisfaction(NamedTuple):
     label_on: str = "entry"
 
 
+Satisfaction.row = deferred_field(4, "Rows of the policy in each state.")  # type: ignore[assignment,method-assign]
+
+
 def sparse_satisfaction(
     model: SparseMDP,
     task: Task,
@@ -90,12 +100,16 @@ def sparse_satisfaction(
     reader = _Reader(automaton, letter, label_on == "entry")
     product = _product(model, reader, states)
     solution, row = _best(product, reader, objective, tolerance)
+    chosen: Array = product.base_row[row]
+    if not product.host.is_chain and product.host.num_states <= QUICK_LIMIT:
+        problem = _problem(product, reader, objective)
+        chosen = Deferred(lambda: product.base_row[_fastest(product, problem, row)])
     return Satisfaction(
         at_states(solution, product.start),
         automaton,
         letter,
         product,
-        product.base_row[row],
+        chosen,
         np.asarray(solution.value),
         label_on,
     )
@@ -165,6 +179,26 @@ def _best(
     if problem.visiting is not None:
         row = np.where(problem.visiting.region, problem.visiting.row, row)
     return (complement_event(solution) if problem.complement and not relative else solution), row
+
+
+def _fastest(product: SparseProduct, problem: ReachabilityProblem, row: np.ndarray) -> np.ndarray:
+    """Rows of the fastest optimal policy; the given optimal rows if it is not certified."""
+    host, maximize = product.host, problem.maximize
+    tolerance = RelativeTolerance(_TIE_WIDTH)
+    optimum = reachability(host, problem.goal, maximize=maximize, tolerance=tolerance)
+    objective = "max" if maximize else "min"
+    fastest = fastest_optimum(host, problem.goal, objective, optimum).row
+    own = reachability(
+        host.chain(fastest), problem.goal, maximize=True, tolerance=RelativeTolerance(_LOSS / 4)
+    )
+    attains = (
+        own.lower >= optimum.upper * (1 - _LOSS)
+        if maximize
+        else own.upper <= optimum.lower * (1 + _LOSS)
+    )
+    if not attains.all():
+        return row
+    return fastest if problem.visiting is None else np.where(problem.visiting.region, row, fastest)
 
 
 class ReachabilityProblem(NamedTuple):

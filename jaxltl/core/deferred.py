@@ -1,0 +1,38 @@
+"""Arrays of results that are computed when they are first read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+
+class Deferred:
+    """An array that is computed once, when it is first read."""
+
+    def __init__(self, compute: Callable[[], np.ndarray]) -> None:
+        self._compute: Callable[[], np.ndarray] | None = compute
+        self._value: np.ndarray | None = None
+
+    def read(self) -> np.ndarray:
+        """The array."""
+        if self._compute is not None:
+            self._value, self._compute = np.asarray(self._compute()), None
+        assert self._value is not None
+        return self._value
+
+    def __array__(self, dtype: object = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self.read(), dtype)  # type: ignore[arg-type]
+
+    def __reduce__(self) -> tuple[object, tuple[np.ndarray]]:
+        return np.asarray, (self.read(),)
+
+
+def deferred_field(place: int, text: str) -> property:
+    """A field of a NamedTuple that may be :class:`Deferred`, read as an array."""
+
+    def read(self: tuple[object, ...]) -> object:
+        value = self[place]
+        return value.read() if isinstance(value, Deferred) else value
+
+    return property(read, doc=text)
