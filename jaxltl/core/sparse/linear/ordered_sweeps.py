@@ -177,6 +177,14 @@ class OrderedSweeps:
         share = self.unit * num_sweeps * len(self.blocks)
         return self._restored(np.maximum(value * (1 + direction * 1.01 * share), 0))
 
+    def tightened(self, bound: Floats | None, direction: int, num_sweeps: int) -> Floats:
+        """The tighter one of a bound and the one by some sweeps."""
+        swept = self.monotone_bound(direction, num_sweeps)
+        if bound is None:
+            return swept
+        tighter: Floats = (np.minimum if direction > 0 else np.maximum)(bound, swept)
+        return tighter
+
     def greedy(self, value: Floats) -> Integers:
         """The first optimal row of each state, as a row of the equation, ``int[M]``."""
         value = value[self.order]

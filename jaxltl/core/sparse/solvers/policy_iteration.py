@@ -484,8 +484,9 @@ class _CoreSolver:
         outer = sweeps.bound(value, sign, margins)
         if outer is None and not required:
             return None
-        if outer is None:
-            outer = sweeps.monotone_bound(sign, sweeps.num_sweeps)
+        if required:
+            outer = sweeps.tightened(outer, sign, sweeps.num_sweeps)
+        assert outer is not None
         outer = outer * (1 + sign * self.outer_error)
         best: _CoreValues | None = None
         for penalty in (0.0, *_PENALTIES):
@@ -501,8 +502,8 @@ class _CoreSolver:
             attained = chain.bound(start, -sign, margins)
             if attained is None and not required and sign > 0:
                 return None
-            if attained is None:
-                attained = chain.monotone_bound(-sign, sweeps.num_sweeps)
+            if attained is None or required:
+                attained = chain.tightened(attained, -sign, sweeps.num_sweeps)
             attained = attained * (1 - sign * self.outer_error)
             middle = np.clip(start, np.minimum(attained, outer), np.maximum(attained, outer))
             rounds = sweeps.num_sweeps + chain.num_sweeps

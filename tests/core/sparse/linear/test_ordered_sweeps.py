@@ -217,3 +217,12 @@ def test_bounds_of_rows_that_rarely_leave(rare):
                 direction * (Fraction(b) - x) >= 0 for b, x in zip(bound, exact, strict=True)
             )
     assert narrow >= 2
+
+
+@pytest.mark.slow
+def test_rewards_beyond_all_methods_have_the_bounds_of_the_sweeps():
+    """The longest time is above 1e40 steps, so that only the lower bound says something."""
+    host, start = robot(8, 35, 0.05)
+    done, dead = ends(host)
+    found = total_reward(host, np.ones(host.num_rows), done | dead, maximize=True)
+    assert found.lower[start] > 35 and found.lower[start] <= found.upper[start]
