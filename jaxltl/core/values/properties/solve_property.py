@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
+from jaxltl.core.deferred import Deferred
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
@@ -41,6 +42,7 @@ from jaxltl.core.values.properties.answers import (
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
 from jaxltl.core.values.properties.exact_thresholds import exact_values, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.undiscounted.reachability import (
     avoidance_probability,
     reachability_probability,
@@ -524,7 +526,14 @@ class _Query(NamedTuple):
             solution = reachability_probability(
                 self.model, target, stay=stay, tolerance=tolerance, **aim.directions
             )
-        return self.result(solution)
+        result = self.result(solution)
+        if complement or self.model.is_chain or not isinstance(self.model, SparseMDP):
+            return result
+        if self.model.num_states > QUICK_LIMIT:
+            return result
+        host, chosen = self.model.host, np.asarray(solution.policy)
+        row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
+        return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 
     def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
         result = optimal_satisfaction(

@@ -11,18 +11,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.shortest_path import Fastest, fastest_policy
-from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance
 
 QUICK_LIMIT = 100_000  # states up to which ties are broken by the expected time
 _TIE_ROUNDINGS = 4  # that a bound gives up for each step, for ties to attain it
 _TIED = 64  # roundings of a backup up to which rows are tied with the value
 _LARGEST_TIE = 1e-11  # of a value, relative, for ties despite its error
+_TIE_WIDTH = 1e-11  # relative width of an optimum, for ties between its actions
+_POLICY_LOSS = 1e-9  # of a fastest policy, relative, that counts as a rounding error
 _WIDTHS, _LOSS = 2, 1e-12  # the loss of a policy of tied rows: widths of the enclosure, or absolute
 
 
@@ -46,6 +48,29 @@ def fastest_optimum(
             return replace(enclosure, row=fastest.row, upper=bound)
     fastest = fastest_policy(mdp, conserving | free, decided, enclosure.row)
     return enclosure if fastest is None else replace(enclosure, row=fastest.row)
+
+
+def certified_fastest_rows(
+    mdp: HostMDP, target: Booleans, stay: Booleans | None, objective: str, row: Integers
+) -> Integers:
+    """Rows of the fastest policy that attains the optimum, solved finely; else the given rows."""
+    maximize = objective == "max"
+    optimum = solver.reachability(
+        mdp, target, maximize=maximize, stay=stay, tolerance=RelativeTolerance(_TIE_WIDTH)
+    )
+    fastest = fastest_optimum(mdp, target, objective, optimum).row
+    own = solver.reachability(
+        mdp.chain(fastest),
+        target,
+        maximize=True,
+        stay=stay,
+        tolerance=RelativeTolerance(_POLICY_LOSS / 4),
+    )
+    if maximize:
+        attains = own.lower >= optimum.upper * (1 - _POLICY_LOSS)
+    else:
+        attains = own.upper <= optimum.lower * (1 + _POLICY_LOSS)
+    return fastest if attains.all() else row
 
 
 def decided_states(target: Booleans, objective: str, enclosure: Enclosure) -> Booleans:

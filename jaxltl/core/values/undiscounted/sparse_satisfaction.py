@@ -27,7 +27,7 @@ from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
-from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, fastest_optimum
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.engine.host_solution import (
     Chain,
     complement_event,
@@ -35,10 +35,6 @@ from jaxltl.core.values.engine.host_solution import (
     induced_chain,
     solution_from_enclosure,
 )
-
-
-_TIE_WIDTH = 1e-11  # relative width of the optimum, for ties between actions
-_LOSS = 1e-9  # of the fastest policy, relative, that counts as a rounding error
 
 
 def _facts(value: Satisfaction) -> Iterator[str]:
@@ -182,22 +178,9 @@ def _best(
 
 
 def _fastest(product: SparseProduct, problem: ReachabilityProblem, row: np.ndarray) -> np.ndarray:
-    """Rows of the fastest optimal policy; the given optimal rows if it is not certified."""
-    host, maximize = product.host, problem.maximize
-    tolerance = RelativeTolerance(_TIE_WIDTH)
-    optimum = reachability(host, problem.goal, maximize=maximize, tolerance=tolerance)
-    objective = "max" if maximize else "min"
-    fastest = fastest_optimum(host, problem.goal, objective, optimum).row
-    own = reachability(
-        host.chain(fastest), problem.goal, maximize=True, tolerance=RelativeTolerance(_LOSS / 4)
-    )
-    attains = (
-        own.lower >= optimum.upper * (1 - _LOSS)
-        if maximize
-        else own.upper <= optimum.lower * (1 + _LOSS)
-    )
-    if not attains.all():
-        return row
+    """Rows of the fastest optimal policy, and of the accepting one in accepting components."""
+    objective = "max" if problem.maximize else "min"
+    fastest = certified_fastest_rows(product.host, problem.goal, None, objective, row)
     return fastest if problem.visiting is None else np.where(problem.visiting.region, row, fastest)
 
 

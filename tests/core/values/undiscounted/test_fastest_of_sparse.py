@@ -67,6 +67,11 @@ def test_policies_of_sparse_models_take_the_least_steps():
             answer = solve_property(sparse, 'Pmax=? [ (F "b") & (!"o" U "b") ]')
             require_fastest(answer.strategy.memory)
             assert (answer.strategy.row == answer.strategy.memory.row).all()
+            plain = solve_property(sparse, 'Pmax=? [ !"o" U "b" ]').strategy.row
+            found = jl.optimal_satisfaction(sparse, "!o U b", states=np.arange(sparse.num_states))
+            live = found.value > 0
+            steps = found.product.base_state
+            assert (found.row == plain[steps])[live & (found.value < 1)].all()
 
 
 def test_deferred_rows_are_arrays_and_can_be_pickled():
