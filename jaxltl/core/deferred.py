@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 
 class Deferred:
@@ -21,8 +22,8 @@ class Deferred:
         assert self._value is not None
         return self._value
 
-    def __array__(self, dtype: object = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self.read(), dtype)  # type: ignore[arg-type]
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
+        return self.read() if dtype is None else self.read().astype(dtype)
 
     def __reduce__(self) -> tuple[object, tuple[np.ndarray]]:
         return np.asarray, (self.read(),)

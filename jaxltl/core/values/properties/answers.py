@@ -47,7 +47,7 @@ class PropertyStrategy(NamedTuple):
     nature: Array | None = None
 
 
-PropertyStrategy.row = deferred_field(0, "Chosen rows.")  # type: ignore[assignment,method-assign]
+PropertyStrategy.row = deferred_field(0, "Chosen rows.")  # type: ignore[assignment]
 
 
 def _facts(value: Answer) -> Iterator[str]:

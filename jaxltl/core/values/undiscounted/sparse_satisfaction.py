@@ -75,7 +75,7 @@ class Satisfaction(NamedTuple):
     label_on: str = "entry"
 
 
-Satisfaction.row = deferred_field(4, "Rows of the policy in each state.")  # type: ignore[assignment,method-assign]
+Satisfaction.row = deferred_field(4, "Rows of the policy in each state.")  # type: ignore[assignment]
 
 
 def sparse_satisfaction(
