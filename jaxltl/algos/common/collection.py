@@ -96,7 +96,7 @@ def _probabilities(
     logits = evaluate(memory, observation).action
     if how.value[0]:
         return actions_of.probabilities(logits, allowed)
-    action = actions_of.chosen(None, actions, logits, allowed, sampled=False, squash=None)
+    action = actions_of.drawn(actions, logits, allowed, None)
     return jax.nn.one_hot(action, logits.shape[-1], dtype=logits.dtype)
 
 

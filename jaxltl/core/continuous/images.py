@@ -405,7 +405,7 @@ def _random_part(
     reach = np.abs(form.gains).sum(2)
     gain, varying = np.zeros(reach.shape), np.zeros(reach.shape)
     bounded = np.isfinite(form.gain_low) & np.isfinite(form.gain_high)
-    unknown: Booleans = ~bounded[:, :, noise.random].all(axis=(1, 2, 3))
+    unknown: Booleans = np.logical_not(bounded[:, :, noise.random].all(axis=(1, 2, 3)))
     for i, j in enumerate(noise_of):
         if j < 0:
             continue
