@@ -36,4 +36,5 @@ def deferred_field(place: int, text: str) -> property:
         value = self[place]
         return value.read() if isinstance(value, Deferred) else value
 
-    return property(read, doc=text)
+    read.__doc__ = text
+    return property(read)

@@ -311,12 +311,13 @@ def _solved(arena: _Arena, level: _Level) -> _Found:
 
 
 def _next_priority(arena: _Arena, level: _Level) -> int:
-    """The least priority from p on; of concrete arrays, of those that undecided states have.
+    """The least priority from p on; of many, the least one that undecided states have.
 
     An odd level relies on an even one around it, without undecided states of its priority or with.
+    Levels of few priorities are not skipped, so that strategies are those of a traced game.
     """
     count = arena.objective.num_priorities
-    if arena.graph.xp is not np:
+    if arena.graph.xp is not np or count <= _MAX_TRACED:
         return level.p
     p = int(arena.objective.priority[level.open_].min(initial=count))
     return p - 1 if p < count and p % 2 == 1 and level.p % 2 == 0 else p

@@ -316,13 +316,14 @@ class _Parser(TokenStream):
 
     # --- paths, from loosest to tightest ---
 
-    def path(self) -> _Path:
+    def path(self, inside: bool = False) -> _Path:
+        """A path; one `inside` parentheses is no side of Storm's conditional probability."""
         operands, sign = [self.conjunction()], self.token
         while self.accept("||"):
             operands.append(self.conjunction())
         paths = [x for x in operands if isinstance(x, Bounded) or not is_boolean(x)]
         self.require(
-            len(operands) == 1 or not paths,
+            inside or len(operands) == 1 or not paths,
             "one path: || of two paths is the conditional probability of the first given the second "
             "in Storm, which is not solved for; for the probability of at least one of them, write "
             "(PATH) | (PATH)",
@@ -418,7 +419,7 @@ class _Parser(TokenStream):
         place, known = self.place, dict(self.definitions)
         try:
             self.expect("(")
-            path = self.path()
+            path = self.path(inside=True)
             self.expect(")", " or an operator")
             self.require(self.token.text not in _AFTER_OPERAND, "a Boolean operator")
             return path

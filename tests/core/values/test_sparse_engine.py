@@ -246,7 +246,7 @@ def test_what_is_wrong_is_named():
     _, sparse, padded, goal = next(cases(1, 0))
     with pytest.raises(ValueError, match="at least 0"):
         total_reward(sparse, -np.ones(sparse.num_rows), goal)
-    with pytest.raises(ValueError, match="state 0, whose rows are 0"):
+    with pytest.raises(ValueError, match="is not a choice of state 0"):
         reachability_probability(
             sparse, goal, policy=np.full(sparse.num_states, sparse.num_rows - 1, np.int32)
         )

@@ -63,6 +63,12 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
     return combined(model, value, jnp.multiply, jnp.add)
 
 
+def _region(model: Model, region: Array) -> jax.Array:
+    if not hasattr(model, "state_shape"):
+        raise TypeError(_unknown(model))
+    return jnp.asarray(state_mask(model, "region", region))
+
+
 @singledispatch
 def exists_successor(model: Model, region: jax.Array) -> jax.Array:
     """Existential predecessors: choices with a possible successor in a region.
@@ -82,7 +88,7 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> exists_successor(fork, np.array([False, True, False])).tolist()  # one for each choice
       [True, False, True, False]
     """
-    region = jnp.asarray(state_mask(model, "region", region))
+    region = _region(model, region)
     return combined(model, region, kernels.positive_hits, jnp.logical_or)
 
 
@@ -105,7 +111,7 @@ def forall_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> forall_successor(fork, np.array([False, True, True])).tolist()  # one for each choice
       [True, False, True, True]
     """
-    region = jnp.asarray(state_mask(model, "region", region))
+    region = _region(model, region)
     return ~exists_successor(model, jnp.logical_not(region))
 
 

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.models.refusals import refuse_game, refuse_traced
-from jaxltl.core.models.protocols import PyTree, base_model
+from jaxltl.core.models.protocols import Array, PyTree, base_model
 from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
@@ -110,10 +110,12 @@ def _numbers(name: str, arguments: Mapping[str, PyTree]) -> PyTree:
         return value
     if isinstance(value, jax.Array | Rewards):
         return value
+    array: Array = np.empty(0, object)
     with contextlib.suppress(TypeError, ValueError):
         array = np.asarray(value)
-        if array.dtype.kind in "biuf":
-            return value if hasattr(value, "dtype") or not array.ndim else array
+    require_real(name, array)
+    if array.dtype.kind in "biuf":
+        return value if hasattr(value, "dtype") or not array.ndim else array
     raise ValueError(f"{name} is {validation.shorten(value)}; give an array of numbers.")
 
 

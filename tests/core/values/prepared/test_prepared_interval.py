@@ -274,7 +274,7 @@ def test_nature_gives_mass_in_order(width):
         ({"stay": STAY, "reward": np.ones(8)}, "leave stay out"),
         ({"nature": "up"}, "nature='up'"),
         ({"objective": "policy"}, "objective='policy'"),
-        ({"policy": np.zeros(5, np.int32)}, "the policy takes row 0 in state 1"),
+        ({"policy": np.zeros(5, np.int32)}, r"policy\[1\]=0 is not a choice of state 1"),
         ({"policy": np.ones(8)}, "rows, int"),
         ({"reward": -np.ones(8)}, "at least 0"),
     ],

@@ -94,7 +94,7 @@ def test_bounds_are_gone_on_from(model, sharded, text):
         ('Pmax=? [ F<=3 "win" ]', "bounds on steps or rewards are not solved for over a mesh"),
         ('R{"games"}max=? [ C<=3 ]', r"rewards \[ C<=3 \] are not solved for over a mesh"),
         ('LRAmax=? [ "win" ]', "averages in the long run are not solved for over a mesh"),
-        ('R{"coins"}max=? [ F "over" ]', "which reward 'coins'. The model has 'games'"),
+        ('R{"coins"}max=? [ F "over" ]', "there is no reward 'coins'; the model has 'games'"),
         ('P=? [ F "win" ]', r"ask for Pmax=\? or Pmin=\?"),
         ('Pmax=? [ F "gold" ]', "gold"),
         ('Pmaxmin=? [ F "win" ]', "no intervals"),
