@@ -32,6 +32,7 @@ _MIN_BLOCK = 256  # states of a block, so that the overhead of NumPy's calls is 
 _BLOCK_OVERHEAD = 6000  # transitions that take as long as that overhead
 _MAX_WORK, _MAX_SWEEPS = 1e10, 5000  # transitions read by a sequence of sweeps, and sweeps
 _RECENT, _TRIAL = 4, 120  # sweeps by which the rate is judged, and after which that may end them
+_CLOSE = 1e-14  # relative accuracy that values should have before they are settled
 _TIME_ACCURACY = 0.1  # relative error of expected times that decide between equal choices
 _SETTLED, _SETTLE_WORK = 60, 2e7  # sweeps, or transitions, after which values should be settled
 
@@ -60,6 +61,21 @@ def short_policy(sweeps: OrderedSweeps, rows: CostRows, value: Floats) -> Intege
     some = rows.only(optimal)._replace(cost=np.ones(optimal.size))
     times = OrderedSweeps(some, -1, sweeps.unit, relative=True)
     return optimal[times.greedy(times.converge(np.zeros(value.size), _TIME_ACCURACY)[0])]
+
+
+def start_from_above(rows: CostRows, unit: float, accuracy: float) -> Floats | None:
+    """Values ``float64[M]`` of a policy that leaves soon, if sweeps find them.
+
+    Sweeps of a minimum from zero may end at values that only policies seem to have that wait nearly
+    for ever; from these values they do not.
+    """
+    timed = OrderedSweeps(rows._replace(cost=np.ones(rows.cost.size)), -1, unit, relative=True)
+    times, error = timed.converge(np.zeros(rows.matrix.shape[1]), _TIME_ACCURACY)
+    if not error <= _TIME_ACCURACY:
+        return None
+    chain = OrderedSweeps(rows.only(timed.greedy(times)), 1, unit, relative=False)
+    value, error = chain.converge(np.zeros(times.size), accuracy)
+    return value if error <= accuracy else None
 
 
 class OrderedSweeps:
@@ -153,14 +169,19 @@ class OrderedSweeps:
         share = perturbation_bound(3 * self.unit, value.size)
         if share > MAX_SHARE or self.stuck or not np.isfinite(value).all():
             return None
-        value = value[self.order]
-        for margin in filter(np.isfinite, margins):
-            moved = (
-                value * (1 + direction * margin) if self.relative else value + direction * margin
-            )
-            moved = np.maximum(moved, 0)
-            if self._settle(moved, direction):
-                return self._restored(moved * (1 + direction * share))
+        for accuracy in (None, _CLOSE):
+            # Values settle fast only if they are as near to the optimum as rounding allows.
+            value = value if accuracy is None else self.converge(value, accuracy)[0]
+            start = value[self.order]
+            for margin in filter(np.isfinite, margins):
+                moved = (
+                    start * (1 + direction * margin)
+                    if self.relative
+                    else start + direction * margin
+                )
+                moved = np.maximum(moved, 0)
+                if self._settle(moved, direction):
+                    return self._restored(moved * (1 + direction * share))
         return None
 
     def monotone_bound(self, direction: int, num_sweeps: int) -> Floats:

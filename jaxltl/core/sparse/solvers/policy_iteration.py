@@ -35,7 +35,12 @@ from jaxltl.core.sparse.linear.extended_precision import (
     refined_optimum,
 )
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation, propagate_improvements
-from jaxltl.core.sparse.linear.ordered_sweeps import CostRows, OrderedSweeps, short_policy
+from jaxltl.core.sparse.linear.ordered_sweeps import (
+    CostRows,
+    OrderedSweeps,
+    short_policy,
+    start_from_above,
+)
 from jaxltl.core.sparse.linear.topological_order import (
     Edges,
     Levels,
@@ -468,7 +473,9 @@ class _CoreSolver:
         equation, sign, accuracy = self.equation, self.equation.sign, 0.01 * self.tolerance
         rows = CostRows(equation.matrix, equation.cost, equation.leaving, equation.owner)
         sweeps = OrderedSweeps(rows, sign, self.unit, self.relative)
-        value, error = sweeps.converge(np.zeros(equation.size), accuracy)
+        above = start_from_above(rows, self.unit, accuracy) if sign < 0 else None
+        start = np.zeros(equation.size) if above is None else above
+        value, error = sweeps.converge(start, accuracy)
         for _ in range(_EVALUATIONS):
             policy = self._made_proper(short_policy(sweeps, rows, value))
             if error <= accuracy:
