@@ -167,11 +167,14 @@ def optimal_satisfaction(
     policy is accepted almost surely (Baier and Katoen 2008, section 10.6.4); for other tasks as in
     :func:`satisfaction_probability`.
 
-    Of all optimal policies of a concrete padded model with up to 10^5 states, the result is the
+    Of all optimal policies of a concrete model with up to 10^5 states, the result is the
     **fastest**: it has the least expected number of steps, from every state, until the set or an
     accepting end component is reached (a set to be avoided: almost surely) or cannot be reached;
     inside the component, until its least priority is read next. This is a stochastic shortest path
-    (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action.
+    (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action. Of a
+    sparse model it is computed when it is first read, attains the optimum up to a share of 1e-9, and
+    inside components is any accepted policy. Not the fastest: policies of traced and sharded models,
+    of games and of interval models, and where no fastest policy is certified to be optimal.
 
     A model with a `task` is solved on the host, on the reachable part of its product; an interval
     model with adversarial nature is a stochastic parity game.
