@@ -59,20 +59,20 @@ def vertex_model(model: UncertainMDP) -> VertexModel | None:
             for x in (model.lower, model.upper)
         )
         alone = single[part.row]
-        found = np.empty((part.row.size, math.factorial(size), size))
+        extreme = np.empty((part.row.size, math.factorial(size), size))
         for k, turn in enumerate(itertools.permutations(range(size))):
-            found[:, k, turn] = exact_greedy(lower[:, turn], upper[:, turn])
-        found[alone] = mdp.probability[part.entry].T[alone][:, None]
+            extreme[:, k, turn] = exact_greedy(lower[:, turn], upper[:, turn])
+        extreme[alone] = mdp.probability[part.entry].T[alone][:, None]
         if part.used is not None:
-            found *= part.used.T[:, None]
+            extreme *= part.used.T[:, None]
         # Equal vertices of a row are next to each other in lexicographic order.
-        flat = found.reshape(-1, size)
-        row = np.repeat(part.row, found.shape[1])
+        flat = extreme.reshape(-1, size)
+        row = np.repeat(part.row, extreme.shape[1])
         order = np.lexsort((*flat.T, row))
         row, flat = row[order], flat[order]
         new = np.ones(row.size, bool)
         new[1:] = (row[1:] != row[:-1]) | (flat[1:] != flat[:-1]).any(1)
-        place = np.repeat(part.entry.T, found.shape[1], axis=0)
+        place = np.repeat(part.entry.T, extreme.shape[1], axis=0)
         rows.append(row[new])
         masses.append(flat[new])
         entries.append(place[new])
