@@ -3,46 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-Array: TypeAlias = Any  # a NumPy array or a JAX array
-
 
 class Deferred:
-    """An array that is computed once, when it is first read; `like` has its shape and dtype."""
+    """An array that is computed once, when it is first read."""
 
-    def __init__(self, compute: Callable[[], Array], like: Array = None) -> None:
-        self._compute: Callable[[], Array] | None = compute
-        self._value: Array = None
-        self.like = like
+    def __init__(self, compute: Callable[[], np.ndarray]) -> None:
+        self._compute: Callable[[], np.ndarray] | None = compute
+        self._value: np.ndarray | None = None
 
-    def read(self) -> Array:
+    def read(self) -> np.ndarray:
         """The array."""
-        compute = self._compute
-        if compute is not None:  # another thread may do the same
-            self._value = compute()
-            self._compute = None
+        if self._compute is not None:
+            self._value, self._compute = np.asarray(self._compute()), None
+        assert self._value is not None
         return self._value
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self.read(), dtype)
+        return self.read() if dtype is None else self.read().astype(dtype)
 
-    def __reduce__(self) -> tuple[object, tuple[Array]]:
-        return _same, (self.read(),)
-
-
-def _same(value: Array) -> Array:
-    return value
-
-
-def mapped(array: Array, function: Callable[[Array], Array]) -> Array:
-    """A function of an array, deferred if the array is."""
-    if not isinstance(array, Deferred):
-        return function(array)
-    return Deferred(lambda: function(array.read()), function(array.like))
+    def __reduce__(self) -> tuple[object, tuple[np.ndarray]]:
+        return np.asarray, (self.read(),)
 
 
 def deferred_field(place: int, text: str) -> property:
@@ -54,27 +38,3 @@ def deferred_field(place: int, text: str) -> property:
 
     read.__doc__ = text
     return property(read)
-
-
-class DeferredAttribute:
-    """A field of a frozen dataclass that may be :class:`Deferred`, read as an array."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: object | None, owner: type | None = None) -> Array:
-        if instance is None:
-            return self
-        value = stored(instance, self.name)
-        return value.read() if isinstance(value, Deferred) else value
-
-    def __set__(self, instance: object, value: object) -> None:
-        vars(instance)[self.name] = value
-
-
-def stored(instance: object, name: str) -> Array:
-    """The field of a dataclass without reading it, perhaps :class:`Deferred`."""
-    try:
-        return vars(instance)[name]
-    except KeyError:
-        raise AttributeError(f"{type(instance).__name__} has no {name}.") from None

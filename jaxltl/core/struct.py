@@ -13,17 +13,16 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial, wraps
 from types import MappingProxyType
-from typing import Any, TypeVar, cast, dataclass_transform
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
 from flax.struct import field
 
-from jaxltl.core.deferred import Deferred
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.status import Status
 from jaxltl.core.suggestions import unknown_keyword
 
-__all__ = ["Static", "dataclass", "field", "metrics", "register", "replace"]
+__all__ = ["Static", "dataclass", "field", "metrics", "register"]
 
 ClassT = TypeVar("ClassT")
 _CODES = {"status": Status}
@@ -88,7 +87,7 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
     Fields made by ``field(pytree_node=False)`` are static: part of the structure, compared by value.
     """
     result: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
-    result.replace = replace
+    result.replace = _replace
     result.__init__ = _suggesting(result.__init__, result)
     static = [f.name for f in dataclasses.fields(result) if not f.metadata.get("pytree_node", True)]
     arrays = [f.name for f in dataclasses.fields(result) if f.name not in static]
@@ -117,12 +116,9 @@ def _suggesting(init: Callable[..., None], cls: type) -> Callable[..., None]:
     return wrapper
 
 
-def replace(self: ClassT, **updates: Any) -> ClassT:
+def _replace(self: Any, **updates: Any) -> Any:
     """A copy with the given fields replaced."""
-    # `dataclasses.replace` would read the arrays that are computed when they are read.
-    deferred = {name: x for name, x in vars(self).items() if isinstance(x, Deferred)}
-    result: Any = dataclasses.replace(cast(Any, self), **(deferred | updates))
-    return cast(ClassT, result)
+    return dataclasses.replace(self, **updates)
 
 
 @dataclass

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
-from jaxltl.core.deferred import Deferred, DeferredAttribute, stored
 
 from jaxltl.core.pretty_print import (
     bounds_text,
@@ -64,8 +63,6 @@ class NotConverged(RuntimeError):
 
 def _facts(solution: Any) -> tuple[str, ...]:
     more = solution.status.shape
-    policy = stored(solution, "policy")
-    policy = policy.like if isinstance(policy, Deferred) else policy  # without computing it
     counts = enum_counts(solution.status, Status)
     steps = value_range(solution.num_steps)
     return (
@@ -75,7 +72,7 @@ def _facts(solution: Any) -> tuple[str, ...]:
         "1 step" if steps == "1" else f"{steps} steps",
         f"residual {value_range(solution.residual)}",
         f"by {solution.method}" if solution.method else "",
-        f"policy {array_text(policy)}" if is_array(policy) else "",
+        f"policy {array_text(solution.policy)}" if is_array(solution.policy) else "",
         f"nature {array_text(solution.nature)}" if is_array(solution.nature) else "",
     )
 
@@ -89,8 +86,7 @@ class Solution:
 
     Attributes:
       value: the quantity that the solver is named for.
-      policy: ``int32[S]`` if deterministic, ``float[S, A]`` if stochastic. The fastest optimal
-        policy of a sparse model is computed when it is first read.
+      policy: ``int32[S]`` if deterministic, ``float[S, A]`` if stochastic.
       lower, upper: certified bounds on the true value; infinite without a certificate.
       residual: violation of the value's equation (sup norm).
       num_steps: number of operator applications.
@@ -120,9 +116,6 @@ class Solution:
     status: jax.Array
     method: str = struct.field(pytree_node=False, default="")
     nature: jax.Array | None = None
-
-
-Solution.policy = DeferredAttribute("policy")  # type: ignore[assignment]
 
 
 def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:

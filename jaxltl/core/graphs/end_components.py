@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxltl.core.graphs.attractor import avoid, attract
-from jaxltl.core.graphs.graph import Graph, graph_of, on_graph, take
+from jaxltl.core.graphs.graph import (
+    Graph,
+    TracedGraph,
+    graph_of,
+    on_graph,
+    state_numbers,
+    take,
+)
 from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
 from jaxltl.core.models.ops.choices import choice_mask, state_mask
+from jaxltl.core.models.ops.operators import pushforward
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, Array
 from jaxltl.core.pretty_print import brief
@@ -84,6 +95,54 @@ def closed_components(graph: Graph, allowed: Array) -> EndComponents:
     """:func:`bottom_components` of a graph."""
     everywhere = graph.xp.ones(graph.state_shape, bool)
     return EndComponents(*graph.components(everywhere, allowed & graph.available, closed=True))
+
+
+def recurrent_states(graph: TracedGraph, region: jax.Array, moves: jax.Array) -> jax.Array:
+    """Recurrent states in a closed region of the chain that takes all `moves` ``bool[S, A]``."""
+
+    def least(number: jax.Array) -> jax.Array:
+        ahead = jnp.where(moves, graph.least(number), jnp.iinfo(jnp.int32).max)
+        return jnp.min(ahead, axis=-1)
+
+    def reached(states: jax.Array) -> jax.Array:
+        sent = (moves & states[..., None]).astype(graph.model.dtype)
+        return pushforward(graph.model, sent) > 0
+
+    return recurrent(region, least, reached)
+
+
+def recurrent(
+    region: jax.Array,
+    least: Callable[[jax.Array], jax.Array],
+    reached: Callable[[jax.Array], jax.Array],
+) -> jax.Array:
+    """Recurrent states in a region that is left to other classes at most, by sweeps in any order.
+
+    `least` is the least of ``int32[S]`` among the successors, `reached` the successors of a set.
+    """
+    # The first sweeps give the least number of a state that is reachable. If it is the same for all
+    # states that are reachable from the state with that number, all of them lead back to it, and
+    # its class is what it reaches.
+
+    def least_reachable(number: jax.Array) -> jax.Array:
+        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            number, _ = carry
+            new = jnp.where(region, jnp.minimum(number, least(number)), number)
+            return new, jnp.any(new != number)
+
+        result: jax.Array = lax.while_loop(lambda c: c[1], grow, (number, jnp.any(region)))[0]
+        return result
+
+    def spread(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        states, _ = carry
+        new = states | (region & reached(states))
+        return new, jnp.any(new != states)
+
+    number = state_numbers(region.shape)
+    lowest = least_reachable(number)
+    root = region & (lowest == number) & (-least_reachable(-lowest) == lowest)
+    result: jax.Array = lax.while_loop(lambda c: c[1], spread, (root, jnp.any(root)))[0]
+    return result
 
 
 class Accepting(NamedTuple):

@@ -35,7 +35,6 @@ from jaxltl.core.sparse.interval.strategy_iteration import (
     under_nature,
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.interval.vertices import swept_bounds, vertex_model
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as mdp_reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
@@ -160,41 +159,9 @@ def joint_optimum(
     low, high = best.lower, np.maximum(bound, best.lower)
     if not up:
         low, high = np.minimum(bound, best.upper), np.minimum(best.upper, highest)
-    values = RobustValues(
+    return RobustValues(
         best.value, low, high, row, rounds + best.rounds, best.residual, METHOD, chance
     )
-    if accuracy.accepts(low, high):
-        return values
-    return _with_longer_runs(problem, values, fixed_nature)
-
-
-def _with_longer_runs(
-    problem: PathProblem, values: RobustValues, fixed_nature: MDPSolver
-) -> RobustValues:
-    """Values with bounds by methods for runs that may last nearly for ever, where they are tighter."""
-    model = problem.model
-    vertices = vertex_model(model)
-    if vertices is not None:
-        cost = problem.cost[vertices.row]
-        best = fixed_nature(vertices.mdp, cost, problem.maximize)
-        if _width(best) >= _width(values):
-            return values.within(best.lower, best.upper, maximize=problem.maximize)
-        chance = vertices.distributions(best.row, values.probability)
-        rounds, row = values.rounds + best.rounds, vertices.row[best.row]
-        return RobustValues(
-            best.value, best.lower, best.upper, row, rounds, best.residual, METHOD, chance
-        )
-    swept = swept_bounds(
-        model, problem.interior, problem.known, problem.cost, maximize=problem.maximize
-    )
-    return values.within(*swept, maximize=problem.maximize)
-
-
-def _width(values: Enclosure) -> float:
-    """The largest width of bounds, relative to values above one."""
-    low, high = values.lower, values.upper
-    some = np.isfinite(low)
-    return float(((high[some] - low[some]) / np.maximum(low[some], 1)).max(initial=0))
 
 
 def _opposed(model: UncertainMDP, target: Booleans, query: Query) -> RobustValues | None:

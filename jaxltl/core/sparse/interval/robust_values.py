@@ -48,12 +48,6 @@ class RobustValues(Enclosure):
             upper=np.maximum(self.upper, other.upper),
         )
 
-    def within(self, lower: Floats, upper: Floats, *, maximize: bool) -> RobustValues:
-        """The same values with other bounds on the side that the policy does not attain."""
-        low = self.lower if maximize else np.minimum(np.maximum(self.lower, lower), self.upper)
-        high = np.maximum(np.minimum(self.upper, upper), self.lower) if maximize else self.upper
-        return replace(self, value=np.clip(self.value, low, high), lower=low, upper=high)
-
     def complement(self) -> RobustValues:
         """Probabilities of the complement, rounded outwards; 0 and 1 stay exact."""
         lower, upper = (

@@ -80,7 +80,9 @@ def expected_reward(model: Model, reward: jax.Array) -> jax.Array:
         return jnp.where(model.available, reward, 0)
     if reward.shape == transitions:
         weight = model.successor_probability
-        return jnp.sum(weight * jnp.where(weight > 0, reward, 0), axis=-1)
+        # A reward at probability 0 does not count, but the derivative in the probability does.
+        counts = (weight > 0) | jnp.isfinite(reward)
+        return jnp.sum(weight * jnp.where(counts, reward, 0), axis=-1)
     raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
 
 
@@ -366,7 +368,7 @@ def _optimal_value(
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
         value, image, n = _modified_policy_iteration(
-            model, reward, problem, max_steps, evaluation_sweeps
+            *lax.stop_gradient((model, reward, problem)), max_steps, evaluation_sweeps
         )
     else:
         value, image, n, _ = newton.solve(

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jax import lax
 
-from jaxltl.core import struct
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.compiled import flatten_policy, is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
@@ -76,7 +75,7 @@ def solution_from_enclosure(
 def complement_event(solution: Solution) -> Solution:
     """The solution of the complementary event, with bounds rounded outwards."""
     value, lower, upper = complement(solution.value, solution.lower, solution.upper)
-    return struct.replace(solution, value=value, lower=lower, upper=upper)
+    return replace(solution, value=value, lower=lower, upper=upper)
 
 
 def complement(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from numpy.typing import ArrayLike
 from jax import lax
 
+from jaxltl.core.graphs.end_components import recurrent
 from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core import validation
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -27,7 +28,7 @@ from jaxltl.core.values.prepared.block_iteration import (
     sweep,
 )
 from jaxltl.core.values.engine.host_solution import default_tolerance
-from jaxltl.core.values.engine.implicit_diff import LinearSystem, implicit
+from jaxltl.core.values.engine.implicit_diff import LinearSystem, attach_derivative, implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import RowSystem, row_system
 from jaxltl.core.values.engine.validated import SolverOptions, validated
@@ -239,6 +240,8 @@ class _Decided(NamedTuple):
     keep: jax.Array
     put: jax.Array
     infinite: jax.Array
+    states: jax.Array  # places of states; others are parts of rows
+    reached: jax.Array  # places from which the target, or what ends the reward, may be reached
 
 
 def _decided(prepared: Prepared, reward: _Maybe, weights: _PolicyRows) -> _Decided:
@@ -256,13 +259,73 @@ def _decided(prepared: Prepared, reward: _Maybe, weights: _PolicyRows) -> _Decid
     never = states & ~reached
     never = never.at[size:].set(jnp.asarray([False, False, True]))
     lost = meets(prepared.segments, support, never, prepared.cyclic)
+    none = jnp.zeros(size + 3, bool)
     if prepared.question == "probability":
-        return _Decided(
-            ~states | (reached & lost), states & reached & ~lost, jnp.zeros(size + 3, bool)
-        )
+        keep, put = ~states | (reached & lost), states & reached & ~lost
+        return _Decided(keep, put, none, states, reached)
     paying = jnp.zeros(size + 3, bool).at[size].set(True)
     earns = meets(prepared.segments, support, paying, prepared.cyclic)
-    return _Decided(~lost & earns, jnp.zeros(size + 3, bool), lost)
+    return _Decided(~lost & earns, none, lost, states, reached)
+
+
+class _Transient(NamedTuple):
+    """The linear system of a policy's rows in the transient places."""
+
+    rows: Chosen
+    keep: jax.Array  # ``bool[N]``
+
+    def image(self, weight: jax.Array, x: jax.Array) -> jax.Array:
+        """The rows with other weights ``float[C, W, B]``, 0 in the other places."""
+        one = jnp.asarray([1, 0, 0], x.dtype)
+        image = replace(self.rows, weight=weight).image(jnp.concatenate([x, one]))
+        return jnp.where(self.keep, image, 0)
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the system."""
+        return self._kept.solve(b)
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        return self._kept.transpose_solve(b)
+
+    @property
+    def _kept(self) -> Chosen:
+        count, _, block = self.rows.target.shape
+        keep = self.keep.reshape(count, 1, block)
+        return replace(self.rows, weight=jnp.where(keep, self.rows.weight, 0))
+
+
+def _transient(known: tuple[Chosen, _Decided], _: jax.Array, *, relative: bool) -> _Transient:
+    """The system of all places whose value changes continuously, also of decided ones."""
+    rows, decided = known
+    count, width, block = rows.target.shape
+    size = count * block
+    if relative:  # where rewards are finite, the target is reached almost surely
+        return _Transient(rows, ~decided.infinite[:size])
+    # The last three places are constants, which lead nowhere.
+    target, used = (
+        jnp.pad(jnp.moveaxis(x, 1, 2).reshape(size, width), ((0, 3), (0, 0)))
+        for x in (rows.target, rows.weight > 0)
+    )
+
+    def taken(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        # Parts of rows that are not taken lead nowhere, and so nothing leads to them.
+        live, _ = carry
+        new = live | jnp.any(used & live[target], axis=1)
+        return new, jnp.any(new != live)
+
+    start = decided.states.at[size:].set(True), jnp.bool_(True)
+    used &= lax.while_loop(lambda c: c[1], taken, start)[0][target]
+
+    def least(number: jax.Array) -> jax.Array:
+        return jnp.min(jnp.where(used, number[target], size + 3), axis=1)
+
+    def entered(region: jax.Array) -> jax.Array:
+        sent = used & region[:, None]
+        return jnp.zeros(size + 3, bool).at[target].max(sent)
+
+    closed = recurrent(~decided.reached, least, entered)
+    return _Transient(rows, (~decided.states | ~closed)[:size])
 
 
 class _Enclosed(NamedTuple):
@@ -359,20 +422,27 @@ def _attached(
     if not size:
         return jnp.zeros(0, dtype)
     system = _chosen_rows(prepared, None if enclosure is None else enclosure.rank)
-    one, put = jnp.asarray([1, 0, 0], dtype), jnp.zeros(size, dtype)
-    if decided is not None:
-        count, _, block = system.target.shape
-        keep, put = (x[:size].astype(dtype) for x in (decided.keep, decided.put))
-        system = replace(system, weight=system.weight * keep.reshape(count, 1, block))
+    if decided is not None and enclosure is not None:
+        known, value = lax.stop_gradient((system, decided)), lax.stop_gradient(enclosure.value)
+        run = partial(_transient, relative=prepared.question == "reward")
+        return attach_derivative(_policy_image, system.weight, value, known, run)
+    one = jnp.asarray([1, 0, 0], dtype)
 
     def operator(x: jax.Array) -> jax.Array:
-        return system.image(jnp.concatenate([x, one])) + put
+        return system.image(jnp.concatenate([x, one]))
 
     fixed: LinearSystem = lax.stop_gradient(system)
     if enclosure is None and prepared.cyclic and is_direct(prepared):
         fixed = _Eliminated.of(lax.stop_gradient(system), prepared.nodes)
-    value = fixed.solve(lax.stop_gradient(operator(put))) if enclosure is None else enclosure.value
+    if enclosure is None:
+        value = fixed.solve(lax.stop_gradient(operator(jnp.zeros(size, dtype))))
+    else:
+        value = enclosure.value
     return implicit(operator, value, fixed)
+
+
+def _policy_image(weight: jax.Array, x: jax.Array, system: _Transient) -> jax.Array:
+    return system.image(weight, x)
 
 
 def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
@@ -402,9 +472,11 @@ def _answer(
     value = value + lax.stop_gradient(jnp.clip(value, 0, highest) - value)
     lower, upper = enclosure.lower, jnp.minimum(enclosure.upper, highest)
     if decided is not None:
-        keep, put, infinite = (x[:size] for x in decided)
+        keep, put, infinite = (x[:size] for x in decided[:3])
         known = jnp.where(infinite, jnp.inf, put.astype(dtype))
-        value, lower, upper = (jnp.where(keep, x, known) for x in (value, lower, upper))
+        lower, upper = (jnp.where(keep, x, known) for x in (lower, upper))
+        change = value - lax.stop_gradient(value)  # 0, with the derivative of the value
+        value = jnp.where(keep, value, jnp.where(infinite, known, known + change))
     width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
     scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
     floor = 1e3 * SLACK * _rounding(prepared)[1]  # what rewards of zero are known to

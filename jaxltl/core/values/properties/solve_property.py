@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core import struct
-from jaxltl.core.deferred import mapped, stored
+from jaxltl.core.deferred import Deferred
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
@@ -43,6 +42,7 @@ from jaxltl.core.values.properties.answers import (
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
 from jaxltl.core.values.properties.exact_thresholds import exact_values, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.undiscounted.reachability import (
     avoidance_probability,
     reachability_probability,
@@ -288,7 +288,7 @@ def _with_values(result: _Result, exact: list[Fraction | float] | None) -> _Resu
     lower, upper = np.array([double_bounds(x) for x in exact]).T
     zero: Array = np.float64(0)
     converged: Array = np.int32(Status.CONVERGED)
-    solution = struct.replace(
+    solution = replace(
         result.solution,
         value=lower,
         lower=lower,
@@ -440,9 +440,8 @@ class _Query(NamedTuple):
         """A solution at all states, at those that are asked for."""
         method = {"steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
         nature = None if solution.nature is None else np.asarray(solution.nature)
-        row = mapped(stored(solution, "policy"), np.asarray)  # perhaps deferred
-        strategy = PropertyStrategy(row, by, nature=nature)
-        solution = struct.replace(solution, method=solution.method or method)
+        strategy = PropertyStrategy(np.asarray(solution.policy), by, nature=nature)
+        solution = replace(solution, method=solution.method or method)
         return _Result(at_states(solution, self.states), strategy)
 
     def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
@@ -527,7 +526,14 @@ class _Query(NamedTuple):
             solution = reachability_probability(
                 self.model, target, stay=stay, tolerance=tolerance, **aim.directions
             )
-        return self.result(solution)
+        result = self.result(solution)
+        if complement or self.model.is_chain or not isinstance(self.model, SparseMDP):
+            return result
+        if self.model.num_states > QUICK_LIMIT:
+            return result
+        host, chosen = self.model.host, np.asarray(solution.policy)
+        row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
+        return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 
     def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
         result = optimal_satisfaction(
@@ -538,7 +544,7 @@ class _Query(NamedTuple):
         strategy = PropertyStrategy(
             result[4], memory=result, nature=result.solution.nature
         )  # the row may be deferred
-        return _Result(struct.replace(result.solution, method=method), strategy)
+        return _Result(replace(result.solution, method=method), strategy)
 
     def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Result:
         complement, asked = path.operator == "R", aim

@@ -8,12 +8,10 @@ shortest path over them, and the probability of its policy is certified by itsel
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.deferred import Deferred
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
@@ -52,36 +50,16 @@ def fastest_optimum(
     return enclosure if fastest is None else replace(enclosure, row=fastest.row)
 
 
-class Event(NamedTuple):
-    """Reaching a target inside of states, or avoiding it, and the objective for its probability."""
-
-    target: Booleans
-    stay: Booleans | None
-    objective: str
-    avoided: bool = False
-
-
-def deferred_fastest_rows(mdp: HostMDP, event: Event, row: Integers) -> Deferred | Integers:
-    """Rows of the fastest optimal policy, computed when they are first read; of models that have
-    no other policy or more than `QUICK_LIMIT` states the given rows."""
-    if mdp.is_chain or mdp.num_states > QUICK_LIMIT:
-        return row
-    return Deferred(lambda: certified_fastest_rows(mdp, event, row), row)
-
-
-def certified_fastest_rows(mdp: HostMDP, event: Event, row: Integers) -> Integers:
+def certified_fastest_rows(
+    mdp: HostMDP, target: Booleans, stay: Booleans | None, objective: str, row: Integers
+) -> Integers:
     """Rows of the fastest policy that attains the optimum, solved finely; else the given rows."""
-    target, stay, objective, avoided = event
     maximize = objective == "max"
-    # One minus a probability near one has no relative accuracy.
-    solve, choose = (
-        (solver.avoidance, _fastest_avoiding) if avoided else (solver.reachability, fastest_optimum)
-    )
-    optimum = solve(
+    optimum = solver.reachability(
         mdp, target, maximize=maximize, stay=stay, tolerance=RelativeTolerance(_TIE_WIDTH)
     )
-    fastest = choose(mdp, target, objective, optimum).row
-    own = solve(
+    fastest = fastest_optimum(mdp, target, objective, optimum).row
+    own = solver.reachability(
         mdp.chain(fastest),
         target,
         maximize=True,
@@ -93,23 +71,6 @@ def certified_fastest_rows(mdp: HostMDP, event: Event, row: Integers) -> Integer
     else:
         attains = own.upper <= optimum.lower * (1 + _POLICY_LOSS)
     return fastest if attains.all() else row
-
-
-def _fastest_avoiding(
-    mdp: HostMDP, target: Booleans, objective: str, enclosure: Enclosure
-) -> Enclosure:
-    """The enclosure of an avoidance probability with the fastest policy of tied rows."""
-    undecided = enclosure.lower != enclosure.upper
-    # What the graph decides does so for the reachability problem.
-    toward = "min" if objective == "max" else "max"
-    lower, upper = (
-        np.where(undecided, x, 1 - y) for x, y in ((0.25, enclosure.upper), (0.75, enclosure.lower))
-    )
-    reaching = replace(enclosure, lower=lower, upper=upper)
-    rows = _tied(mdp, objective, enclosure) | _optimal_by_graph(mdp, toward, reaching)
-    rows[enclosure.row[undecided]] = True
-    fastest = fastest_policy(mdp, rows, decided_states(target, toward, reaching), enclosure.row)
-    return enclosure if fastest is None else replace(enclosure, row=fastest.row)
 
 
 def decided_states(target: Booleans, objective: str, enclosure: Enclosure) -> Booleans:

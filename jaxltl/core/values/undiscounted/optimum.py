@@ -64,19 +64,18 @@ def policy_reachability(
     target = jnp.asarray(target, bool)
     checked = valid_policy(model, policy)
     policy = checked.distribution
-    sets = policy_sets(TracedGraph(model), target, policy)
+    constant = lax.stop_gradient((model, policy))
+    sets = policy_sets(TracedGraph(constant[0]), target, constant[1])
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
-    weight = action_columns(model.num_actions, policy)
-    system = lax.stop_gradient(
-        System(sweep_operator(model), weight, undecided.ravel().astype(model.dtype))
-    )
+    weight = action_columns(model.num_actions, constant[1])
+    scale = undecided.ravel().astype(model.dtype)
+    system = System(sweep_operator(constant[0]), weight, scale)
     eliminable = method == "auto" and not is_sharded(model)
     if eliminable:  # Krylov steps stagnate in chains that take very long; then elimination follows
         max_steps = jnp.minimum(max_steps, most_products(model.num_states))
     linear = solver(system, method, max_steps=max_steps)
 
-    constant = lax.stop_gradient((model, policy))
     chain = ChainSystem(*constant, undecided)
     goal, rows = 2 * _half_width(model, tolerance), normalised_rows(*constant)
 
@@ -103,8 +102,8 @@ def policy_reachability(
         ),
     )
     inverse = None if linear.inverse is None else linear
-    system_of_policy = ChainSystem(model, policy, undecided)
-    value = with_derivative(value, system_of_policy, outside=one, inverse=inverse)
+    chain = ChainSystem(model, policy, undecided)
+    value = with_derivative(value, chain, target=target, one=one, inverse=inverse)
     solution = replace(lax.stop_gradient(solution), value=value, policy=policy)
     return refuse(solution, checked)
 
@@ -135,7 +134,8 @@ def optimal_reachability(
     if components is not None and not components.inside.any():
         components = None
     sets, components = to_jax((sets, components))
-    return _optimize(model, sets, components, (tolerance, max_steps, start), objective=objective)
+    options = tolerance, max_steps, start
+    return _optimize(model, target, sets, components, options, objective=objective)
 
 
 @jit("objective")
@@ -143,7 +143,7 @@ def _inside_jit(
     model: ActionModel, target: jax.Array, *options: PyTree, objective: str
 ) -> Solution:
     sets, components = sequential_vmap(partial(_qualitative, objective=objective), model, target)
-    return _optimize(model, sets, components, options, objective=objective)
+    return _optimize(model, target, sets, components, options, objective=objective)
 
 
 def _qualitative(
@@ -264,26 +264,33 @@ def _followed(search: _Search, lower: jax.Array, action: jax.Array) -> jax.Array
 
 @jit("objective")
 def _optimize(
-    model: PyTree, sets: Sets, components: EndComponents | None, options: PyTree, *, objective: str
+    model: PyTree,
+    target: jax.Array,
+    sets: Sets,
+    components: EndComponents | None,
+    options: PyTree,
+    *,
+    objective: str,
 ) -> Solution:
+    constant, options = lax.stop_gradient((model, options))
     tolerance, max_steps, start = options
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
-    small = is_small(sweep_operator(model), one.size) and max_steps is None and start is None
+    small = is_small(sweep_operator(constant), one.size) and max_steps is None and start is None
     # A user's model may lack the reduction that double words need.
     small = small and combined.dispatch(type(model)) is not combined.dispatch(object)
     if small:
         run = partial(_by_policy_iteration, objective=objective)
         requested = 2 * _half_width(model, tolerance)
-        solution, row_of = sequential_vmap(run, model, sets, components, requested)
+        solution = sequential_vmap(run, constant, sets, components, requested)
     else:
-        row_of = None
-        solution = _by_intervals(model, sets, components, options, objective=objective)
-    code = status_code(True, True, valid=is_representable(model))
+        solution = _by_intervals(constant, sets, components, options, objective=objective)
+    code = status_code(True, True, valid=is_representable(constant))
     solution = replace(solution, status=jnp.maximum(solution.status, code))
     solution = jax.tree.map(lax.stop_gradient, solution)
-    chain = ChainSystem(model, solution.policy, undecided, row_of)
-    result: Solution = replace(solution, value=with_derivative(solution.value, chain, outside=one))
+    chain = ChainSystem(model, solution.policy, undecided)
+    value = with_derivative(solution.value, chain, target=jnp.asarray(target, bool), one=one)
+    result: Solution = replace(solution, value=value)
     return result
 
 
@@ -294,8 +301,8 @@ def _by_policy_iteration(
     requested: Array,
     *,
     objective: str,
-) -> tuple[Solution, jax.Array]:
-    """An optimum as the total reward of entering the target, and the states whose rows count."""
+) -> Solution:
+    """An optimum as the total reward of entering the target."""
     rows, one = normalised_rows(model), sets.one.astype(model.dtype)
     leaving = model.available if components is None else model.available & ~components.inside
     sign, gain = 1 if objective == "max" else -1, rows.expectation(double_word(one))
@@ -304,11 +311,11 @@ def _by_policy_iteration(
         rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
     )
     finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
-    solution, leaves = solve_problem(problem, jnp.minimum(requested, finest), requested)
+    solution = solve_problem(problem, jnp.minimum(requested, finest), requested)
     value, lower, upper = (
         jnp.where(open_, x, one) for x in (solution.value, solution.lower, solution.upper)
     )
-    return replace(solution, value=value, lower=lower, upper=upper), leaves
+    return replace(solution, value=value, lower=lower, upper=upper)
 
 
 def _by_intervals(

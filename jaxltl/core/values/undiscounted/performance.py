@@ -38,6 +38,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error
 from jaxltl.core.values.engine.host_solution import complement
+from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
 from jaxltl.core.values.engine.linear import inverse
 from jaxltl.core.values.undiscounted.satisfaction import (
     as_product,
@@ -103,8 +104,7 @@ def task_performance(
     Returns:
       :class:`Performance`. If a policy hardly ever leaves a set, rounding may prevent a
       certificate: bounds 0 and 1, status PRECISION; use :func:`task_performances`. Differentiable
-      in the policy and in the world's probabilities, with the support held fixed: in forward mode,
-      and with ``method="general"`` in reverse mode too.
+      in the policy and in the world's probabilities.
 
     Raises:
       ValueError: the policy has the wrong shape or a row that is not a distribution over available
@@ -184,7 +184,8 @@ def _summarize(
         least, greatest = (
             f(jnp.where(starts, x, out)) for f, out in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
         )
-        return jnp.clip(jnp.sum(weight * x) + slack, least, greatest)
+        total = jnp.sum(weight * x) + slack
+        return total + lax.stop_gradient(jnp.clip(total, least, greatest) - total)
 
     return Performance(
         mean=mean(value, 0 * slack),
@@ -205,46 +206,85 @@ def _reach(
     """Reachability probabilities ``float[S, Q]``, and certified bounds."""
     # ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states,
     # exactly if the automaton's only cycles are self-loops.
-    sets = policy_sets(TracedGraph(model), target, policy)
+    fixed = lax.stop_gradient((model, policy))
+    sets = policy_sets(TracedGraph(fixed[0]), target, fixed[1])
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
-    solve = _block_solver(model, policy, undecided)
-    return m_matrix_error(normalised_rows(model, policy), solve, solve(one), one, undecided)[:3]
+    blocks = _blocks(*fixed, undecided)
+    value, lower, upper, _ = m_matrix_error(
+        normalised_rows(*fixed), blocks.solve, blocks.solve(one), one, undecided
+    )
+    chain = ChainSystem(model, policy, undecided)
+    value = with_derivative(value, chain, target=target, one=one, inverse=blocks)
+    return value, lower, upper
 
 
-def _block_solver(
-    model: Product, policy: jax.Array, undecided: jax.Array
-) -> Callable[[jax.Array], jax.Array]:
-    """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``."""
+class _Blocks(NamedTuple):
+    """The system ``x - P x`` on the undecided states, x elsewhere, for ``[S, Q]``."""
+
     # Block Jacobi with a block for each memory state. If the automaton's only cycles are
     # self-loops, it ends after as many sweeps as its longest path has states.
-    stays = model.next_memory == jnp.arange(model.num_memory)  # [S, Q]
-    inside = jnp.where(undecided.T[:, :, None], _within(model, policy, stays), 0)
-    inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
 
-    def outside(x: jax.Array) -> jax.Array:
+    model: Product
+    policy: jax.Array
+    undecided: jax.Array
+    inverses: jax.Array  # ``float[Q, S, S]``
+
+    def _outside(self, x: jax.Array) -> jax.Array:
+        """The part of ``P x`` that changes the memory."""
+        model, stays = self.model, _stays(self.model)
         if model.label_on == "exit":
-            return jnp.where(stays, 0, action_mean(policy, expectation(model, x)))
-        read = jnp.where(stays, 0, jnp.take_along_axis(x, model.next_memory, axis=1))
-        successors = jax.vmap(partial(expectation, model.mdp), in_axes=1, out_axes=1)(read)
-        return action_mean(policy, successors)
+            ahead = jnp.where(stays, 0, action_mean(self.policy, expectation(model, x)))
+        else:
+            read = jnp.where(stays, 0, jnp.take_along_axis(x, model.next_memory, axis=1))
+            ahead = jax.vmap(partial(expectation, model.mdp), in_axes=1, out_axes=1)(read)
+            ahead = action_mean(self.policy, ahead)
+        return jnp.where(self.undecided, ahead, 0)
 
-    def solve(b: jax.Array) -> jax.Array:
-        def sweep(carry: PyTree) -> PyTree:
-            x, _, n = carry
-            right = b + jnp.where(undecided, outside(x), 0)
-            new = jnp.einsum("qst,tq->sq", inverses, right, precision="highest")
-            return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution for a right-hand side."""
+        return _swept(b, self._outside, partial(_einsum, "qst,tq->sq", self.inverses))
 
-        def unfinished(carry: PyTree) -> jax.Array:
-            _, moved, n = carry
-            result: jax.Array = moved & (n < _MAX_SWEEPS)
-            return result
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        back = jax.linear_transpose(self._outside, b)
+        inside = partial(_einsum, "qst,sq->tq", self.inverses)
+        return _swept(b, lambda y: back(y)[0], inside)
 
-        start = (jnp.zeros_like(b), jnp.bool_(True), jnp.int32(0))
-        return lax.while_loop(unfinished, sweep, start)[0]
 
-    return solve
+_einsum = partial(jnp.einsum, precision="highest")
+
+
+def _swept(
+    b: jax.Array,
+    outside: Callable[[jax.Array], jax.Array],
+    inside: Callable[[jax.Array], jax.Array],
+) -> jax.Array:
+    """``x = inside(b + outside(x))``, by sweeps from 0."""
+
+    def sweep(carry: PyTree) -> PyTree:
+        x, _, n = carry
+        new = inside(b + outside(x))
+        return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
+
+    def unfinished(carry: PyTree) -> jax.Array:
+        _, moved, n = carry
+        result: jax.Array = moved & (n < _MAX_SWEEPS)
+        return result
+
+    start = (jnp.zeros_like(b), jnp.bool_(True), jnp.int32(0))
+    return lax.while_loop(unfinished, sweep, start)[0]
+
+
+def _stays(model: Product) -> jax.Array:
+    """``bool[S, Q]``, where the memory does not change."""
+    return model.next_memory == jnp.arange(model.num_memory)
+
+
+def _blocks(model: Product, policy: jax.Array, undecided: jax.Array) -> _Blocks:
+    inside = jnp.where(undecided.T[:, :, None], _within(model, policy, _stays(model)), 0)
+    inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
+    return _Blocks(model, policy, undecided, inverses)
 
 
 def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:

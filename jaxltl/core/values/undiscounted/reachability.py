@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Unpack, cast
 
 import jax
@@ -10,14 +9,13 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.graphs.graph import is_table
-from jaxltl.core import struct, validation
-from jaxltl.core.deferred import mapped
+from jaxltl.core import validation
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, jax_array
+from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.construct.convert import keep_with_model
 from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
@@ -39,11 +37,7 @@ from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_reachability
 from jaxltl.core.values.undiscounted import optimum
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT as QUICK_LIMIT
-from jaxltl.core.values.undiscounted.fastest import (
-    Event,
-    deferred_fastest_rows,
-    fastest_optimum,
-)
+from jaxltl.core.values.undiscounted.fastest import fastest_optimum
 
 _FINE_LIMIT = 4096  # states up to which bounds are as narrow as the dtype allows; it costs a round
 
@@ -91,11 +85,9 @@ def reachability_probability(
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph decides. An
       optimum's `policy` is ``int32[S]`` and attains its bound on the safe side (`lower` for a
-      maximum, `upper` for a minimum); of a concrete model with up to 10^5 states it is the fastest
-      such policy, see :func:`optimal_satisfaction`. Of a sparse model, or with `stay`, it is
-      computed when it is first read, and attains the optimum up to a share of 1e-9; if no fastest
-      policy is certified to, it is the solver's. Differentiable in the policy and in the probabilities, with the
-      support held fixed.
+      maximum, `upper` for a minimum); on a concrete padded model it is the fastest such policy, see
+      :func:`optimal_satisfaction`. Differentiable in the policy and in the probabilities, one-sided
+      where one of them is 0 (see "Derivatives" in the documentation of solutions).
 
     Raises:
       ValueError: a shape is wrong, the objective or method is unknown, or `stay` or a sparse model
@@ -196,25 +188,16 @@ def _on_host(
     enclosure = enclose(host, target, objective, fine, stay=stay, depth=depth)
     if policy is None and stay is None and not is_sparse(model):
         enclosure = fastest_optimum(host, np.asarray(target, bool).ravel(), objective, enclosure)
-    relative = isinstance(requested, RelativeTolerance)
-    solution = solution_from_enclosure(
-        model, sparse, enclosure, float(requested), relative=relative
+    return with_given_policy(
+        solution_from_enclosure(
+            model,
+            sparse,
+            enclosure,
+            float(requested),
+            relative=isinstance(requested, RelativeTolerance),
+        ),
+        policy,
     )
-    if policy is None and (stay is not None or is_sparse(model)):
-        states = np.asarray(target, bool).ravel()
-        inside = None if stay is None else np.asarray(stay, bool).ravel()
-        rows = deferred_fastest_rows(host, Event(states, inside, objective), enclosure.row)
-        return struct.replace(solution, policy=mapped(rows, partial(_in_model, model, sparse)))
-    return with_given_policy(solution, policy)
-
-
-def _in_model(model: Model, sparse: SparseMDP, row: Integers) -> Array:
-    """A policy of rows ``int[S]`` in the shape and the actions of a model."""
-    row = row.reshape(model.state_shape)
-    if is_sparse(model):
-        return row.astype(np.int32)
-    with jax.ensure_compile_time_eval():  # it may be read inside jit
-        return jax_array(np.asarray(sparse.action)[row].astype(np.int32))
 
 
 def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[float, float]:
@@ -241,10 +224,7 @@ def avoidance_probability(
     enclosure = solver.avoidance(
         model.host, target, maximize=objective == "max", stay=stay, tolerance=tolerance
     )
-    solution = solution_from_enclosure(model, model, enclosure, float(tolerance), relative=True)
-    event = Event(np.asarray(target, bool), stay, objective, avoided=True)
-    rows = deferred_fastest_rows(model.host, event, enclosure.row)
-    return struct.replace(solution, policy=mapped(rows, partial(_in_model, model, model)))
+    return solution_from_enclosure(model, model, enclosure, float(tolerance), relative=True)
 
 
 def rows_of_model(model: Model) -> SparseMDP:

@@ -83,7 +83,7 @@ def satisfaction_probability(
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the initial distribution
       is ``jnp.sum(model.initial * solution.value)``. Differentiable in the policy and in the
-      world's transition probabilities, with the support held fixed; not for products of sparse and
+      world's transition probabilities, one-sided where one is 0; not for products of sparse and
       of interval models, which are solved on the host.
 
     Raises:
@@ -167,14 +167,11 @@ def optimal_satisfaction(
     policy is accepted almost surely (Baier and Katoen 2008, section 10.6.4); for other tasks as in
     :func:`satisfaction_probability`.
 
-    Of all optimal policies of a concrete model with up to 10^5 states, the result is the
+    Of all optimal policies of a concrete padded model with up to 10^5 states, the result is the
     **fastest**: it has the least expected number of steps, from every state, until the set or an
     accepting end component is reached (a set to be avoided: almost surely) or cannot be reached;
     inside the component, until its least priority is read next. This is a stochastic shortest path
-    (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action. Of a
-    sparse model it is computed when it is first read, attains the optimum up to a share of 1e-9, and
-    inside components is any accepted policy. Not the fastest: policies of traced and sharded models,
-    of games and of interval models, and where no fastest policy is certified to be optimal.
+    (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action.
 
     A model with a `task` is solved on the host, on the reachable part of its product; an interval
     model with adversarial nature is a stochastic parity game.
@@ -193,7 +190,7 @@ def optimal_satisfaction(
     Returns:
       Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, rows
       for a sparse world. With a task, a :class:`Satisfaction`, a finite-memory policy of rows.
-      Differentiable in a product's transition probabilities, with the support and the optimal
+      Differentiable in a product's transition probabilities, with the optimal
       policy held fixed; not for sparse and interval models, which are solved on the host.
 
     Raises:
@@ -289,7 +286,10 @@ def _within(solution: Solution, bounds: tuple[jax.Array, jax.Array]) -> Solution
     """A solution with bounds no wider than given ones, despite rounding outwards."""
     lower = jnp.maximum(solution.lower, bounds[0])
     upper = jnp.minimum(solution.upper, bounds[1])
-    return replace(solution, value=jnp.clip(solution.value, lower, upper), lower=lower, upper=upper)
+    inside = jnp.clip(solution.value, lower, upper)
+    # The value with its derivative, which clipping halves at a bound.
+    value = solution.value + lax.stop_gradient(inside - solution.value)
+    return replace(solution, value=value, lower=lower, upper=upper)
 
 
 # One program for a model over a mesh, instead of one for each operation.

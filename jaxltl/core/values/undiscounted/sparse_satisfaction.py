@@ -13,8 +13,7 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
-from jaxltl.core import struct
-from jaxltl.core.deferred import deferred_field, mapped
+from jaxltl.core.deferred import Deferred, deferred_field
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -28,7 +27,7 @@ from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
-from jaxltl.core.values.undiscounted.fastest import Event, deferred_fastest_rows
+from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.engine.host_solution import (
     Chain,
     complement_event,
@@ -97,12 +96,16 @@ def sparse_satisfaction(
     reader = _Reader(automaton, letter, label_on == "entry")
     product = _product(model, reader, states)
     solution, row = _best(product, reader, objective, tolerance)
+    chosen: Array = product.base_row[row]
+    if not product.host.is_chain and product.host.num_states <= QUICK_LIMIT:
+        problem = _problem(product, reader, objective)
+        chosen = Deferred(lambda: product.base_row[_fastest(product, problem, row)])
     return Satisfaction(
         at_states(solution, product.start),
         automaton,
         letter,
         product,
-        mapped(row, product.base_row.__getitem__),
+        chosen,
         np.asarray(solution.value),
         label_on,
     )
@@ -150,8 +153,8 @@ def _best(
     objective: str,
     tolerance: jax.Array | float | None,
     depth: int = 0,
-) -> tuple[Solution, Array]:
-    """The optimal probability from all states of a product, and rows that attain it, deferred."""
+) -> tuple[Solution, np.ndarray]:
+    """The optimal probability from all states of a product, and the rows that attain it."""
     problem = _problem(product, reader, objective)
     whole = sparse_mdp_of_product(product)
     requested = default_tolerance(whole) if tolerance is None else as_width(tolerance)
@@ -168,14 +171,17 @@ def _best(
         float(requested),
         relative=relative,
     )
-    event = Event(problem.goal, None, "max" if maximize else "min", avoids)
-    row = deferred_fastest_rows(product.host, event, np.asarray(solution.policy))
+    row = np.asarray(solution.policy)
     if problem.visiting is not None:
-        region, visiting = problem.visiting
-        row = mapped(row, lambda row: np.where(region, visiting, row))
-    if problem.complement and not relative:
-        solution = complement_event(solution)
-    return struct.replace(solution, policy=row), row
+        row = np.where(problem.visiting.region, problem.visiting.row, row)
+    return (complement_event(solution) if problem.complement and not relative else solution), row
+
+
+def _fastest(product: SparseProduct, problem: ReachabilityProblem, row: np.ndarray) -> np.ndarray:
+    """Rows of the fastest optimal policy, and of the accepting one in accepting components."""
+    objective = "max" if problem.maximize else "min"
+    fastest = certified_fastest_rows(product.host, problem.goal, None, objective, row)
+    return fastest if problem.visiting is None else np.where(problem.visiting.region, row, fastest)
 
 
 class ReachabilityProblem(NamedTuple):
@@ -243,9 +249,9 @@ def product_satisfaction(
     parts["policy"] = (
         np.asarray(policy)
         if policy is not None
-        else mapped(row, lambda row: product.base_row[row].astype(np.int32).reshape(shape))
+        else product.base_row[row].astype(np.int32).reshape(shape)
     )
-    return struct.replace(solution, **parts)
+    return replace(solution, **parts)
 
 
 def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
@@ -315,4 +321,4 @@ def at_states(solution: Solution, states: np.ndarray) -> Solution:
         name: np.asarray(getattr(solution, name), np.float64)[states]
         for name in ("value", "lower", "upper")
     }
-    return struct.replace(solution, **taken)
+    return replace(solution, **taken)

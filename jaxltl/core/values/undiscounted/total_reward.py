@@ -77,7 +77,7 @@ def total_reward(
       optimum's `policy` attains its bound on the safe side: ``int32[S]``, rows of a sparse model,
       else actions. Inside ``jit`` bad rewards give the status ``NONFINITE``, a bad policy
       ``INVALID``. Inside ``jit`` and over a mesh differentiable in the reward, the probabilities
-      and the policy, with the support held fixed.
+      and the policy, where the value is finite.
 
     Raises:
       ValueError: a shape, the objective or a policy is wrong, a reward is negative, or inside

@@ -50,7 +50,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse
-from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
+from jaxltl.core.values.engine.implicit_diff import ChainSystem, implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import (
     System,
@@ -130,12 +130,14 @@ def total_reward_by_sweeps(
     reward = jnp.where(model.available & earns, reward, 0)
     checked = None if policy is None else valid_policy(model, policy)
     weight = None if checked is None else checked.distribution
-    enclosure, leaves, undecided, finite = sequential_vmap(
+    enclosure, finite = sequential_vmap(
         partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
     )
     chosen = enclosure.policy if weight is None else weight
-    chain = ChainSystem(model, chosen, undecided, leaves)
-    value, finite = with_derivative(enclosure.value, chain, reward=reward), finite & earns
+    # Where the value is finite, the target is reached almost surely, also where it is 0.
+    chain = ChainSystem(model, chosen, finite & ~target)
+    image, constant = partial(chain.image, reward=reward), lax.stop_gradient(chain)
+    value, finite = implicit(image, enclosure.value, constant), finite & earns
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (enclosure.lower, -jnp.inf), (enclosure.upper, jnp.inf))
@@ -156,15 +158,15 @@ def _enclosed(
     tolerance: jax.Array | float,
     *,
     objective: str,
-) -> tuple[Solution, jax.Array, jax.Array, jax.Array]:
-    """The enclosure, where actions are taken, and where the value is not 0, and finite."""
+) -> tuple[Solution, jax.Array]:
+    """The enclosure, and where the value is finite."""
     graph, rows = TracedGraph(model), dw.normalised_rows(model, policy)
     if policy is not None:
         problem = _of_policy(graph, rows, reward, target, policy)
     else:
         problem = (_largest if objective == "max" else _smallest)(graph, rows, reward, target)
     tolerance = jnp.asarray(tolerance, model.dtype)
-    return *solve_problem(problem, tolerance, tolerance), problem.undecided, problem.finite
+    return solve_problem(problem, tolerance, tolerance), problem.finite
 
 
 # --- qualitative preprocessing ----------------------------------------------------------------
@@ -468,13 +470,10 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     return _Search(at, known, share, bounds, shares, gap, safe, residual, *steps)
 
 
-def solve_problem(
-    problem: Problem, tolerance: jax.Array, requested: jax.Array
-) -> tuple[Solution, jax.Array]:
-    """The enclosure of a problem, of width `tolerance` if possible; converged if it is `asked`.
+def solve_problem(problem: Problem, tolerance: jax.Array, requested: jax.Array) -> Solution:
+    """The enclosure of a problem, of width `tolerance` if possible; converged if `requested`.
 
-    Values are 0 where they are infinite. The second result is the state with the action that gives
-    the value of each state, ``int32[S]``.
+    Values are 0 where they are infinite.
     """
     rows, model = problem.rows, problem.model
     dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
@@ -527,8 +526,7 @@ def solve_problem(
     exhausted = k.ended | (_wide(problem, k) <= inner)
     status = status_code(narrow, jnp.all(jnp.isfinite(value)), jnp.all(both) & exhausted)
     num_steps = jnp.maximum(k.num_steps, 0)
-    solution = Solution(value, policy, lower, upper, k.residual, num_steps, status)
-    return solution, k.safe.leaves
+    return Solution(value, policy, lower, upper, k.residual, num_steps, status)
 
 
 def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
