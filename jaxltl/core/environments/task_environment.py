@@ -499,7 +499,7 @@ def _observe(
 
 
 def memory_seen(tables: TaskTables, memory: jax.Array) -> jax.Array:
-    """What a :class:`TaskObservation` has of an automaton state."""
+    """The observation ``float[Q]`` of an automaton state, one-hot or its embedding."""
     if tables.embedding is None:
         return jax.nn.one_hot(memory, tables.delta.shape[-2])
     return jnp.asarray(tables.embedding)[memory]

@@ -576,7 +576,7 @@ class _Parser(TokenStream):
 
 
 def _instead_of(word: str) -> str:
-    """What is expected in place of a word that is neither a name nor an operator."""
+    """The syntax expected in place of an unknown word, for error messages."""
     if word in ("Y", "Z", "O", "H", "S", "B", "T"):
         return "an operator of the future, X F G U W R; those of the past, such as Y O H S, are not read"
     if set(word) <= set("XFGUWRM"):

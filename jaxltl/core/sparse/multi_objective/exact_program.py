@@ -50,7 +50,7 @@ class _TooLarge(Exception):
 
 
 class ExactAnswer(NamedTuple):
-    """Whether the thresholds can be met, and the largest value of a goal: None if infinite."""
+    """Achievability of the thresholds, and the largest value of a goal: None if infinite."""
 
     holds: bool
     value: Fraction | None
