@@ -224,6 +224,10 @@ def _sweeps(
 
 def graph_of(model: Model, *arguments: PyTree) -> Graph:
     """The graph of a model: the host's, unless the model or an argument is traced."""
+    if isinstance(model, Product) and isinstance(model.mdp, Game):
+        raise ValueError(
+            "the model is a Product around a Game; product(game, formula) is a Game on a Product."
+        )
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
         if not is_traced((model, arguments)):

@@ -82,7 +82,9 @@ def exact_constant(value: object) -> bool | int | Fraction:
     if isinstance(value, int | Fraction):
         return value
     if not isinstance(value, float):
-        raise ValueError(f"{value!r} is no rational number.")
+        raise ValueError(
+            f"{value!r} is not a rational number; give an integer, a decimal or a fraction."
+        )
     simple = Fraction(value).limit_denominator(_DENOMINATOR)
     return simple if float(simple) == value else Fraction(repr(value))
 

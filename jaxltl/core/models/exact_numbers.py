@@ -66,9 +66,9 @@ def exact_reward(
 ) -> list[Fraction]:
     """Expected rewards of choices; ValueError if some are not finite."""
     state, choice, transition = numbers.rewards.get(name or "", (None, None, None))
-    state = _doubles(reward.state) if state is None else state
-    choice = _doubles(reward.choice) if choice is None else choice
-    transition = _doubles(reward.transition) if transition is None else transition
+    state = _agreeing(state, reward.state)
+    choice = _agreeing(choice, reward.choice)
+    transition = _agreeing(transition, reward.transition)
     total = [ZERO] * model.num_rows if choice is None else list(choice)
     if state is not None:
         total = [x + state[s] for x, s in zip(total, model.host.state.tolist(), strict=True)]
@@ -82,14 +82,21 @@ def exact_reward(
 
 def exact_state_reward(numbers: Rationals, reward: Rewards, name: str | None) -> list[Fraction]:
     """Rewards of states."""
-    state = numbers.rewards.get(name or "", (None,))[0]
-    doubles = _doubles(reward.state) if state is None else state
-    assert doubles is not None
-    return list(doubles)
+    state = _agreeing(numbers.rewards.get(name or "", (None,))[0], reward.state)
+    assert state is not None
+    return list(state)
 
 
-def _doubles(values: object) -> Part:
-    return None if values is None else [Fraction(x) for x in np.asarray(values, float).tolist()]
+def _agreeing(written: Part, values: object) -> Part:
+    """The numbers of a source if they round to those of the model, which may have changed since."""
+    if values is None:
+        return None
+    doubles = np.asarray(values, float).tolist()
+    if written is not None and len(written) == len(doubles):
+        pairs_of = zip(written, doubles, strict=True)
+        if all(abs(float(x) - y) <= _CLOSE * abs(y) for x, y in pairs_of):
+            return written
+    return [Fraction(x) for x in doubles]
 
 
 def _written(values: object) -> Part:

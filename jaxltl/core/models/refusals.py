@@ -49,7 +49,7 @@ _INSTEAD = {
     "task_performance": _FORMULA,
 }
 _OTHERWISE = (
-    "what can be asked of a game is minimax_value, strategy_value, mean_payoff, winning_region, and "
+    "minimax_value, strategy_value, mean_payoff, winning_region, or "
     "robust_reachability, robust_total_reward, robust_discounted_value and optimal_satisfaction "
     f"with a formula, {_ROWS}"
 )

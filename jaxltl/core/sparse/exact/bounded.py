@@ -11,6 +11,9 @@ from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP, Values, Work
 from jaxltl.core.sparse.exact.total import least_total
 
 
+_LEVEL_WORK = 100  # products that take as long as the graph searches of a level
+
+
 def until_within(
     mdp: ExactMDP,
     target: Booleans,
@@ -24,6 +27,7 @@ def until_within(
     inner = ~target if stay is None else stay & ~target
     value: list[Fraction | float] = [Fraction(int(x)) for x in target]
     for _ in range(num_steps):
+        work.spend(ONE, len(mdp.rows))
         image = mdp.backup(free, value, maximize, work)
         value = [y if s else x for s, x, y in zip(inner, value, image, strict=True)]
     return value
@@ -40,6 +44,7 @@ def earned_within(
     """Optimal expected sums of the rewards of some steps and of a value after them."""
     value = list(final)
     for _ in range(num_steps):
+        work.spend(ONE, len(mdp.rows))
         value = mdp.backup(reward, value, maximize, work)
     return value
 
@@ -71,6 +76,7 @@ def until_at_cost(
     final[size] = ZERO
     levels: list[Values] = []
     for level in range(limit + 1):
+        work.spend(ONE, len(free) + _LEVEL_WORK)
         constant = [ZERO] * (len(free) + 1)
         for r, costs in enumerate(cost):
             for t, c in costs.items():

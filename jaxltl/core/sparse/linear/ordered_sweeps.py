@@ -32,6 +32,7 @@ _MIN_BLOCK = 256  # states of a block, so that the overhead of NumPy's calls is 
 _BLOCK_OVERHEAD = 6000  # transitions that take as long as that overhead
 _MAX_WORK, _MAX_SWEEPS = 1e10, 5000  # transitions read by a sequence of sweeps, and sweeps
 _RECENT, _TRIAL = 4, 120  # sweeps by which the rate is judged, and after which that may end them
+_UNDERFLOW = 1e-290  # products that underflow, in up to 10^30 expected steps
 _CLOSE = 1e-14  # relative accuracy that values should have before they are settled
 _TIME_ACCURACY = 0.1  # relative error of expected times that decide between equal choices
 _SETTLED, _SETTLE_WORK = 60, 2e7  # sweeps, or transitions, after which values should be settled
@@ -181,7 +182,8 @@ class OrderedSweeps:
                 )
                 moved = np.maximum(moved, 0)
                 if self._settle(moved, direction):
-                    return self._restored(moved * (1 + direction * share))
+                    moved = moved * (1 + direction * share) + direction * _UNDERFLOW
+                    return self._restored(np.maximum(moved, 0))
         return None
 
     def monotone_bound(self, direction: int, num_sweeps: int) -> Floats:
@@ -191,12 +193,13 @@ class OrderedSweeps:
             if self.stuck or ((self.leaving == 0) & (self.cost > 0)).any():
                 return np.full(value.size, np.inf)
             some = self.leaving > 0
-            value += (self.cost[some] / self.leaving[some]).max(initial=0) * (1 + self.unit)
+            value += (self.cost[some] / self.leaving[some]).max(initial=0) * (1 + 4 * self.unit)
         for _ in range(num_sweeps):
             self.sweep(value)
         # All terms are nonnegative, so that relative errors add up over the sums behind a value.
-        share = self.unit * num_sweeps * len(self.blocks)
-        return self._restored(np.maximum(value * (1 + direction * 1.01 * share), 0))
+        share = self.unit * (num_sweeps + 2) * len(self.blocks)
+        value = value * (1 + direction * 1.01 * share) + direction * _UNDERFLOW
+        return self._restored(np.maximum(value, 0))
 
     def tightened(self, bound: Floats | None, direction: int, num_sweeps: int) -> Floats:
         """The tighter one of a bound and the one by some sweeps."""

@@ -146,8 +146,8 @@ def robust_cumulative_reward(
     world = require_interval(model).nominal
     rewards = reward_structure(world, reward)
     count = validation.integer("num_steps", num_steps)
-    steps = _Steps(count, reward_span(rewards, count))
     earned = transition_reward(world, rewards)
+    steps = _Steps(count, reward_span(rewards, count))
     return _earned(model, earned, np.zeros(world.num_states), steps, objective, nature)
 
 

@@ -64,8 +64,8 @@ class Query(NamedTuple):
             else f" of objective {names} is infinite"
         )
         return (
-            f"the expected reward{which} under every policy: what is counted goes on for ever, or "
-            "a target is not reached almost surely."
+            f"the expected reward{which} under every policy: it is earned infinitely often, or a target "
+            "is not reached almost surely."
         )
 
     def infinite_reward(self) -> str | None:

@@ -106,8 +106,8 @@ def total_reward(
         return _by_sweeps(model, reward, target, policy, objective, tolerance)
     sparse = to_sparse(model)
     earned = _earned(model, sparse, reward)
-    if (earned < 0).any():
-        r = int(np.flatnonzero(earned < 0)[0])
+    if not (earned >= 0).all():  # or NaN
+        r = int(np.flatnonzero(~(earned >= 0))[0])
         raise _negative(sparse.host.state[r], earned[r])
     if target is not None:
         require_states("target", target, model.state_shape)

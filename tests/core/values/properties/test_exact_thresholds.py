@@ -1,10 +1,12 @@
 """Thresholds of small models are decided where they are the value, by an oracle in fractions."""
 
+import dataclasses
 import math
 import re
 import warnings
 from fractions import Fraction
 
+import jax
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ import jaxltl as jl
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic import parse_property, program_definitions
 from jaxltl.core.programs.build import build_model
+from jaxltl.core.sparse.exact.bounded import until_at_cost, until_within
+from jaxltl.core.sparse.exact.model import ExactMDP, TooLarge, Work
 from jaxltl.core.values.properties.solve_property import solve_property
 from tests import reference_thresholds as reference
 
@@ -278,3 +282,58 @@ def test_thresholds_of_text_files_are_those_of_their_fractions(seed, tmp_path):
     (tmp_path / "model.drn").write_text(drn(rows, cost))
     model = jl.read_model(tmp_path / "model.drn")
     require_verdicts(model, rows, cost, parse_property, RELATIONS[seed % 2])
+
+
+PROGRAM = """dtmc module m x : [0..2]; [] x=0 -> 1/2 : (x'=1) + 1/2 : (x'=2); [] x>0 -> true; endmodule
+rewards "r" x=0 : 1; endrewards rewards "t" [] x=0 : 1; endrewards"""
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1.0000005, 0.0])
+@pytest.mark.parametrize("name", ["r", "t"])
+def test_rewards_that_changed_since_are_those_of_the_model(tmp_path, factor, name):
+    """Of `replace`, after a threshold was decided, and of a program with another model's source."""
+    path = tmp_path / "x.prism"
+    path.write_text(PROGRAM)
+    model = jl.read_model(path)
+    ask = f'R{{"{name}"}}'
+    assert jl.solve_property(model, f"{ask}<=1 [ F x>0 ]").holds == [True]
+    part = jax.tree.map(lambda x: np.asarray(x) * factor, model.rewards[name])
+    changed = dataclasses.replace(model, rewards=model.rewards | {name: part})
+    returned = jax.jit(lambda x: x)
+    returned(model)
+    for other in (changed, returned(changed)):
+        value = Fraction(factor)
+        for relation, holds in (("<=", True), (">=", True), ("<", False), (">", False)):
+            found = jl.solve_property(other, f"{ask}{relation}{value} [ F x>0 ]")
+            assert found.holds == [holds], relation
+        found = jl.solve_property(other, f"{ask}=? [ F x>0 ]", tolerance=1e-11)
+        assert found.lower[0] <= value <= found.upper[0]
+
+
+def test_the_work_of_levels_without_values_is_bounded():
+    mdp = ExactMDP([0, 1, 2], [{0: Fraction(1)}, {1: Fraction(1)}])
+    target = np.array([False, True])
+    budget = [{0: 1}, {1: 1}], 50_000
+    with pytest.raises(TooLarge):
+        until_at_cost(mdp, target, ~target, budget, True, Work())
+    with pytest.raises(TooLarge):
+        until_within(mdp, target, None, 10**6, True, Work())
+
+
+def test_rewards_that_are_not_numbers_are_refused():
+    model = jl.make_sparse(
+        None,
+        [0, 1, 2],
+        [1, 1],
+        [1, 1],
+        label={"a": [1]},
+        rewards={"r": jl.models.Rewards(state=[1, 0])},
+    )
+    for bad in (np.nan, np.inf):
+        part = jl.models.Rewards(state=np.array([bad, 0]))
+        other = dataclasses.replace(model, rewards={"r": part})
+        for text in (
+            ("R=? [ C<=2 ]", "R=? [ S ]", 'R>=1 [ F "a" ]') if bad != bad else ("R=? [ C<=2 ]",)
+        ):
+            with pytest.raises(ValueError, match="reward"):
+                jl.solve_property(other, text)
