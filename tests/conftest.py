@@ -47,7 +47,7 @@ def _cache() -> Path | None:
     return place / f"jaxlib-{jaxlib.__version__}-{key}"
 
 
-def _limit_memory(most: int = 8 * 2**30, least: int = 4 * 2**30) -> None:
+def _limit_memory(most: int = 8 * 2**30, least: int = 6 * 2**30) -> None:
     """Bounds the data of this process and of those that it starts, on Linux.
 
     A test that fills the memory then fails with its name. Otherwise the kernel ends workers, also
