@@ -185,7 +185,7 @@ def _program(points, limits, questions, goal):
 
 
 def answer(model, limits, index=None):
-    """Whether thresholds can be met, as a margin, and the best value of one objective.
+    """Achievability of thresholds, as a margin, and the best value of one objective.
 
     The margin is positive if they can be met strictly, about zero on the boundary, negative if they
     cannot. None if a case is left out.

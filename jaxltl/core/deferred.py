@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 
 class Deferred:
-    """An array that is computed once, when it is first read."""
+    """An array that is computed once, when it is first read; it has an array's items and attributes."""
 
     def __init__(self, compute: Callable[[], np.ndarray]) -> None:
         self._compute: Callable[[], np.ndarray] | None = compute
@@ -21,6 +21,21 @@ class Deferred:
             self._value, self._compute = np.asarray(self._compute()), None
         assert self._value is not None
         return self._value
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value: object = getattr(self.read(), name)
+        return value
+
+    def __getitem__(self, place: int | slice | np.ndarray) -> object:
+        return self.read()[place]
+
+    def __len__(self) -> int:
+        return len(self.read())
+
+    def __iter__(self) -> Iterator[object]:
+        return iter(self.read())
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return self.read() if dtype is None else self.read().astype(dtype)

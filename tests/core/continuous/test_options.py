@@ -6,7 +6,7 @@ import numpy as np
 
 import jaxltl as jl
 from jaxltl import continuous
-from tests.core.values.test_options import RAW, WRONG
+from tests.core.values.test_options import WRONG, accepted_or_raw
 
 SMALL = {"cells": [30], "max_cells": 100}
 
@@ -50,18 +50,5 @@ def calls():
 
 
 def test_wrong_options_are_refused_by_name():
-    problems = []
-    for call, given, options in calls():
-        for name in options:
-            for wrong, value in (WRONG | {"infinite": float("inf"), "negative": -1}).items():
-                place = f"{call.__name__}({name}={wrong})"
-                try:
-                    call(**given | {name: value})
-                except ValueError as error:
-                    if RAW.search(str(error)):
-                        problems.append(f"{place}: {error}")
-                except Exception as error:
-                    problems.append(f"{place}: {type(error).__name__} {error}")
-                else:
-                    problems.append(f"{place}: accepted")
+    problems = accepted_or_raw(calls(), WRONG | {"infinite": float("inf"), "negative": -1})
     assert not problems, "\n".join(problems)

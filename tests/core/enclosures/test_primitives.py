@@ -113,7 +113,7 @@ def samples(low, high, count=9):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_lie_inside_or_nothing_is_known(name, dtype):
-    """Where a sample is NaN, the bounds are infinite on both sides."""
+    """Bounds are infinite on both sides at points with a sample that is NaN."""
     function, (low, high) = FUNCTIONS[name], boxes(dtype)
     parameters()
     if name not in ELEMENTARY:

@@ -29,7 +29,7 @@ DISCOUNT, STEPS, RELATIVE = 0.75, 3, 1e-8
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a subject's model, and the exact answer."""
+    """A question about a subject's model, and the exact answer."""
 
     ask: Callable[[Subject, Any], Any]
     exact: Callable[[Subject], np.ndarray]
@@ -400,7 +400,7 @@ def is_compiled(name: str, base: str) -> bool:
 
 
 def answered(subject: Subject, asked: Question, solve: Callable) -> bool:
-    """Whether the question is answered, rightly; False if it is refused by a ValueError."""
+    """True for a right answer, False for a refusal by a ValueError."""
     try:
         found = solve(partial(asked.ask, subject))(subject.model)
     except ValueError as error:

@@ -123,13 +123,13 @@ def calls(kind):
     ]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_wrong_options_are_refused_by_name(kind):
+def accepted_or_raw(cases, wrong):
+    """The options that take a wrong value, or refuse it without naming the argument."""
     problems = []
-    for solve, given, options in calls(kind):
+    for solve, given, options in cases:
         for name in options:
-            for wrong, value in WRONG.items():
-                place = f"{solve.__name__}({name}={wrong})"
+            for kind, value in wrong.items():
+                place = f"{solve.__name__}({name}={kind})"
                 try:
                     solve(**given | {name: value})
                 except ValueError as error:
@@ -139,6 +139,12 @@ def test_wrong_options_are_refused_by_name(kind):
                     problems.append(f"{place}: {type(error).__name__} {error}")
                 else:
                     problems.append(f"{place}: accepted")
+    return problems
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wrong_options_are_refused_by_name(kind):
+    problems = accepted_or_raw(calls(kind), WRONG)
     assert not problems, "\n".join(problems)
 
 

@@ -78,3 +78,18 @@ def test_deferred_rows_are_arrays_and_can_be_pickled():
     found = jl.optimal_satisfaction(to_sparse(random_world(0)), "!o U b")
     again = pickle.loads(pickle.dumps(found))
     assert isinstance(found.row, np.ndarray) and (again.row == found.row).all()
+
+
+def test_a_deferred_strategy_is_an_array_also_as_an_item():
+    model = jl.make_sparse(
+        [0, 2, 3, 4],
+        [0, 1, 2, 3, 4],
+        [1, 2, 1, 2],
+        [1, 1, 1, 1],
+        initial=[1, 0, 0],
+        label={"a": [1]},
+    )
+    strategy = jl.solve_property(model, 'Pmax=? [ F "a" ]').strategy
+    row, *_ = strategy
+    assert row[0] == strategy.row[0] == strategy[0][0] and len(row) == 3
+    assert row.shape == (3,) and list(row) == strategy._asdict()["row"].tolist()
