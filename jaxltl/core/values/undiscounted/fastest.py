@@ -26,6 +26,7 @@ _LARGEST_TIE = 1e-11  # of a value, relative, for ties despite its error
 _TIE_WIDTH = 1e-11  # relative width of an optimum, for ties between its actions
 _POLICY_LOSS = 1e-9  # of a fastest policy, relative, that counts as a rounding error
 _WIDTHS, _LOSS = 2, 1e-12  # the loss of a policy of tied rows: widths of the enclosure, or absolute
+_ROUNDING_LOSS = 1e-10  # absolute, the limit of a loss that is the rounding of each step
 
 
 def fastest_optimum(
@@ -148,7 +149,9 @@ def _attained(
     """A bound on the safe side that a policy attains; None if it loses more than rounding."""
     sign, side = (1, enclosure.lower) if objective == "max" else (-1, enclosure.upper)
     bound = _attained_in_time(mdp.chain(fastest.row), sign, enclosure, fastest.time)
-    limit = max(_WIDTHS * float((enclosure.upper - enclosure.lower).max()), _LOSS)
+    rounding = 3 * backup_unit(mdp) * float(fastest.time.max(initial=0))
+    width = float((enclosure.upper - enclosure.lower).max())
+    limit = max(_WIDTHS * width, _LOSS, min(rounding, _ROUNDING_LOSS))
     if bound is None or (sign * (enclosure.value - bound) > limit).any():
         return None
     return np.minimum(bound, side) if sign > 0 else np.maximum(bound, side)
