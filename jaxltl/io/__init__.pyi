@@ -10,11 +10,6 @@ from .hoa.hoa import (
     read_hoa_stream as read_hoa_stream,
     write_hoa as write_hoa,
 )
-from .hoa.game import (
-    HoaGame as HoaGame,
-    read_hoa_game as read_hoa_game,
-    write_hoa_game as write_hoa_game,
-)
 from .learned_reward import (
     LearnedReward as LearnedReward,
     load_reward as load_reward,
@@ -35,12 +30,6 @@ from .policies import (
     load_policy as load_policy,
     save_policy as save_policy,
     write_c_policy as write_c_policy,
-)
-from .pgsolver import (
-    ParityGame as ParityGame,
-    objective_of as objective_of,
-    read_pgsolver as read_pgsolver,
-    write_pgsolver as write_pgsolver,
 )
 from .prism.explicit import read_prism as read_prism, write_prism as write_prism
 from .prism.program import (

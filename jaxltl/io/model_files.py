@@ -5,15 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
-from jaxltl.io.files import decompressed, opened, suffix_of, write_bytes
+from jaxltl.io.files import decompressed, opened, suffix_of
 from jaxltl.io.drn.drn import read_drn, write_drn
-from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
-from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.prism.program import SUFFIXES, Constants, is_program, read_program_model
 from jaxltl.io.umb.umb import read_umb, write_umb
@@ -29,34 +26,14 @@ class Format:
     suffixes: tuple[str, ...]
     read: Callable[[str | os.PathLike[str]], SparseMDP | IntervalMDP | Game]
     write: Callable[..., None]  # of a path and a model of this kind
-    holds: Literal["models", "games", "all"]
-
-
-def _write_hoa(path: str | os.PathLike[str], game: Game) -> None:
-    text = write_hoa_game(game)
-    with write_bytes(path) as file:
-        file.write(text.encode())
+    holds_games: bool
 
 
 FORMATS = (
-    Format("UMB", (".umb",), read_umb, write_umb, "all"),
-    Format("PRISM's explicit files", (".tra", ".pexp"), read_prism, write_prism, "models"),
-    Format("DRN", (".drn",), read_drn, write_drn, "models"),
-    Format(
-        "PGSolver",
-        (".pg", ".gm", ".pgsolver"),
-        lambda path: read_pgsolver(path).game,
-        write_pgsolver,
-        "games",
-    ),
-    Format(
-        "extended HOA",
-        (".hoa", ".ehoa"),
-        lambda path: read_hoa_game(path).game,
-        _write_hoa,
-        "games",
-    ),
-    Format("numpy", (".npz",), read_npz, write_npz, "all"),
+    Format("UMB", (".umb",), read_umb, write_umb, True),
+    Format("PRISM's explicit files", (".tra", ".pexp"), read_prism, write_prism, False),
+    Format("DRN", (".drn",), read_drn, write_drn, False),
+    Format("numpy", (".npz",), read_npz, write_npz, True),
 )
 
 
@@ -70,9 +47,8 @@ def read_model(
     """Model of a file, with the format detected by suffix or contents.
 
     Formats: programs in the PRISM language (``.prism``, ``.pm``, ``.nm``, ``.sm``, ``.smg``), UMB
-    (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN (``.drn``),
-    parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in extended HOA (``.hoa``,
-    ``.ehoa``), and ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
+    (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN (``.drn``) and
+    ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
 
     Args:
       path: the file.
@@ -82,8 +58,7 @@ def read_model(
         two players.
 
     Returns:
-      A SparseMDP, a Game over one, or an IntervalMDP. :func:`~jaxltl.io.pgsolver.objective_of`
-      gives the objective of a parity game.
+      A SparseMDP, a Game over one, or an IntervalMDP.
 
     Raises:
       ValueError: with file and place, for unknown formats and missing or malformed files.
@@ -129,16 +104,10 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
         raise ValueError(f"{str(path)!r}: programs are read, not written; write {_known()}.")
     if form is None:
         raise ValueError(f"{str(path)!r}: the suffix names no format; known are {_known()}.")
-    is_game = isinstance(model, Game)
-    if is_game and form.holds == "models":
+    if isinstance(model, Game) and not form.holds_games:
         raise ValueError(
             f"{str(path)!r}: {form.name} holds no games; write "
-            f"{_listed(x for x in FORMATS if x.holds != 'models')}."
-        )
-    if not is_game and form.holds == "games":
-        raise ValueError(
-            f"{str(path)!r}: {form.name} holds games only, and this is no Game; write "
-            f"{_listed(x for x in FORMATS if x.holds != 'games')}."
+            f"{_listed((x for x in FORMATS if x.holds_games), ' or ')}."
         )
     form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
 
@@ -157,13 +126,7 @@ def _by_beginning(path: str | os.PathLike[str]) -> Format:
         start = decompressed(file).read(_BEGINNING)
     if start[257:262] == b"ustar":
         return _named("UMB")
-    words = start.split(maxsplit=1)
-    first = words[0] if words else b""
-    if first == b"parity":
-        return _named("PGSolver")
-    if first == b"HOA:":
-        return _named("extended HOA")
-    if first.startswith(b"@") or b"\n@type:" in start:
+    if start.lstrip().startswith(b"@") or b"\n@type:" in start:
         return _named("DRN")
     raise ValueError(
         f"{str(path)!r}: neither the suffix nor the contents name a known format; known are {_known()}."
@@ -174,9 +137,9 @@ def _named(name: str) -> Format:
     return next(x for x in FORMATS if x.name == name)
 
 
-def _listed(formats: Iterable[Format], separator: str = " or ") -> str:
+def _listed(formats: Iterable[Format], separator: str = ", ") -> str:
     return separator.join(f"{x.name} ({', '.join(x.suffixes)})" for x in formats)
 
 
 def _known() -> str:
-    return _listed(FORMATS, ", ")
+    return _listed(FORMATS)

@@ -15,8 +15,6 @@ from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.io.model_files import write_model
-from tests.io.test_hoa_game import ARBITER
-from tests.io.test_pgsolver import EXAMPLE
 from tests.test_cli import failure, run
 
 # Wait at 0, or go to 1, which is red, or by chance to 2, the goal; from 1 a way on to 2.
@@ -136,32 +134,3 @@ def test_a_game_is_for_synthesis(tmp_path, task):
     assert json.loads(result.stdout.splitlines()[-1])["outcome"] == "unrealizable"
     write_model(tmp_path / "m.umb", MODEL)
     assert "m.umb' is no game" in failure("check", task("m.umb", text))
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "outcome"),
-    [
-        ("g.hoa", ARBITER, "realizable"),
-        ("g.hoa", ARBITER.replace("Start: 0", "Start: 1"), "unrealizable"),
-        ("g.pg", EXAMPLE, "realizable"),
-        ("g.pg", EXAMPLE.replace("1 8 1", "1 9 1"), "unrealizable"),
-        ("g.pg", "parity 1; start 0; 0 2 0 0,1; 1 1 1 1;", "realizable"),
-    ],
-)
-def test_parity_games_bring_their_own_task(tmp_path, task, name, text, outcome):
-    (tmp_path / name).write_text(text)
-    path = task(name, GAME.replace("TASK", 'parity = "model"'))
-    result = run("synthesize", path, "--out", tmp_path / "out", "--json")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout.splitlines()[-1])
-    assert found["outcome"] == outcome
-    assert "independent check: confirmed" in result.stdout
-
-
-def test_mistakes_about_parity(tmp_path, task):
-    (tmp_path / "g.pg").write_text(EXAMPLE)
-    message = failure("check", task("g.pg", GAME.replace("TASK", 'parity = "model"\nsafe = "a"')))
-    assert 'has parity = "model", the condition in the file of a parity game' in message
-    write_model(tmp_path / "m.umb", make_game(MODEL, [True, False, True]))
-    message = failure("check", task("m.umb", GAME.replace("TASK", 'parity = "model"')))
-    assert "this game has no condition of its own" in message

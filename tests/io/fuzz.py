@@ -23,11 +23,9 @@ from jaxltl.core.models.game import make_game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.drn.parametric import read_parametric
-from jaxltl.io.hoa.game import read_hoa_game
 from jaxltl.io.log import read_log
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import read_npz, write_npz
-from jaxltl.io.pgsolver import read_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.reward_machine import read_reward_machine
 from jaxltl.io.umb.umb import read_umb, write_umb
@@ -35,9 +33,7 @@ from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
 from tests.io.same import full_interval, full_model
 from tests.io.test_drn import MDP as DRN
-from tests.io.test_hoa_game import ARBITER
 from tests.io.test_parametric import CHAIN as PARAMETRIC
-from tests.io.test_pgsolver import EXAMPLE
 from tests.io.test_program import PROGRAMS
 from tests.io.test_reward_machine import OFFICE
 
@@ -428,8 +424,6 @@ READERS = {
     "drn": Reader(read_drn, ".drn", lambda folder: [DRN.encode(), *_drn(folder)]),
     "parametric": Reader(read_parametric, ".drn", _texts(PARAMETRIC)),
     "pexp": Reader(read_prism, ".pexp", _written(write_prism, "sample.pexp")),
-    "hoa_game": Reader(read_hoa_game, ".hoa", _texts(ARBITER)),
     "reward_machine": Reader(read_reward_machine, ".txt", _texts(OFFICE)),
     "log": Reader(read_log, ".csv", lambda folder: [_LOG, gzip.compress(_LOG)]),
-    "pgsolver": Reader(read_pgsolver, ".pg", _texts(EXAMPLE, "0 1 0 1;\n1 0 1 0,1;\n")),
 }

@@ -280,8 +280,6 @@ def test_padded_arrays(tmp_path):
 def test_what_cannot_be_written_is_named(tmp_path):
     with pytest.raises(ValueError, match="Storm reads no intervals in explicit files"):
         write_prism(tmp_path / "m.tra", the_model(), dialect="storm")
-    with pytest.raises(ValueError, match="PGSolver holds games only"):
-        write_model(tmp_path / "m.pg", the_model())
     assert not list(tmp_path.iterdir())
 
 

@@ -11,7 +11,6 @@ from jaxltl.core.models.mdp import from_dense, make_mdp
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.io.model_files import read_model, write_model
 from jaxltl.io.npz import read_npz, write_npz
-from jaxltl.io.pgsolver import objective_of
 from tests.io.same import assert_same, full_model
 
 WHOLE = (".umb", ".umb.xz", ".npz", ".tra", ".tra.gz", ".pexp", ".pexp.xz")
@@ -49,22 +48,6 @@ def test_games_and_other_models(tmp_path, suffix):
     assert found.successor.tolist() == [0, 1, 0, 1] and found.propositions == ("a",)
 
 
-@pytest.mark.parametrize("suffix", [".pg", ".gm.gz", ".pgsolver", ".hoa", ".ehoa"])
-def test_parity_games(tmp_path, suffix):
-    text = 'parity 3;\nstart 0;\n0 1 0 1,2 "a b";\n1 2 1 0;\n2 3 1 2;\n'
-    (tmp_path / "game.pg").write_text(text)
-    game = read_model(tmp_path / "game.pg")
-    assert isinstance(game, Game) and game.system.tolist() == [True, False, False]
-    assert objective_of(game).priority.shape == (3,)
-    write_model(tmp_path / f"again{suffix}", game)
-    again = read_model(tmp_path / f"again{suffix}")
-    assert isinstance(again, Game)
-    if "hoa" not in suffix:
-        assert again.mdp.successor.tolist() == game.mdp.successor.tolist()
-    write_model(tmp_path / "game.umb", game)  # its priorities are variables
-    assert objective_of(read_model(tmp_path / "game.umb")) is not None
-
-
 def test_a_file_is_known_by_how_it_begins(tmp_path):
     model = held_by_all(1)
     for suffix in (".umb", ".umb.xz", ".npz", ".drn", ".drn.xz"):
@@ -72,15 +55,13 @@ def test_a_file_is_known_by_how_it_begins(tmp_path):
         other = tmp_path / "model"
         other.write_bytes((tmp_path / f"m{suffix}").read_bytes())
         assert_same(read_model(other), model, valuation="drn" not in suffix)
-    other.write_text("parity 1;\n0 1 0 0;\n")
-    assert read_model(other).num_states == 1
     for content in (b"", b"nonsense", b"1 1\n0 0 1\n"):
         other.write_bytes(content)
         with pytest.raises(
             ValueError,
             match=(
                 r"model': neither the suffix nor the contents name a known format; .*UMB \(\.umb\), PRISM's explicit "
-                r"files \(\.tra, \.pexp\), DRN \(\.drn\), PGSolver .*numpy \(\.npz\)"
+                r"files \(\.tra, \.pexp\), DRN \(\.drn\), numpy \(\.npz\)"
             ),
         ):
             read_model(other)
@@ -90,10 +71,8 @@ def test_what_a_format_cannot_hold(tmp_path):
     model = held_by_all(0)
     game = make_game(model, np.ones(model.num_states, bool))
     for suffix, given, message in (
-        (".drn", game, r"DRN holds no games; write UMB \(\.umb\) or PGSolver .* or numpy"),
+        (".drn", game, r"DRN holds no games; write UMB \(\.umb\) or numpy"),
         (".tra", game, r"PRISM's explicit files holds no games"),
-        (".pg", model, r"PGSolver holds games only, and this is no Game; write UMB"),
-        (".pg", game, r"leads to several states; the format has no random moves"),
         (".xyz", model, r"the suffix names no format; known are UMB"),
         ("", model, r"the suffix names no format"),
         (".umb", 3, r"int has no transitions"),
@@ -104,7 +83,7 @@ def test_what_a_format_cannot_hold(tmp_path):
         with pytest.raises(ValueError, match=message):
             write_model(tmp_path / f"m{suffix}", given)
     assert not list(tmp_path.iterdir())
-    for name in ("a.umb", "a.tra", "a.pexp", "a.drn", "a.pg", "a.hoa", "a.npz", "a"):
+    for name in ("a.umb", "a.tra", "a.pexp", "a.drn", "a.npz", "a"):
         with pytest.raises(ValueError, match=r"none.a"):
             read_model(tmp_path / "none" / name)
 

@@ -62,7 +62,7 @@ class GameTable(TomlTable):
     )
     system_stays: TomlKey[bool | None, "True if the system may stay; default true.", "false"] = None
     environment_stays: TomlKey[bool | None, "True if the other may stay; default false."] = None
-    model: TomlKey[Text | None, "Model file of a game; default none.", '"game.pg"'] = None
+    model: TomlKey[Text | None, "Model file of a game; default none.", '"game.umb"'] = None
     constants: TomlKey[
         Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
     ] = None
@@ -92,9 +92,6 @@ class TaskTable(TomlTable):
     safe: TomlKey[Text | None, "Formula that must hold always; default none.", '"!collision"'] = (
         None
     )
-    parity: TomlKey[Literal["model"] | None, "Condition of a parity game's file; default none."] = (
-        None
-    )
     chance: TomlKey[
         Literal["random", "adversarial"], "Random moves: by probability, or by the environment."
     ] = "random"
@@ -107,15 +104,9 @@ class TaskTable(TomlTable):
                 "assumptions and safe where needed."
             )
         self.require(
-            self.parity is None or (self.formula is None and not lists),
-            'has parity = "model", the condition in the file of a parity game, and another '
-            "one; keep one of them.",
-        )
-        self.require(
-            any(x is not None for x in (self.formula, self.guarantees, self.safe, self.parity)),
+            any(x is not None for x in (self.formula, self.guarantees, self.safe)),
             'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], '
-            'each to hold infinitely often, or safe = "...", to hold always, or parity = '
-            '"model", of a parity game from a file.',
+            'each to hold infinitely often, or safe = "...", to hold always.',
         )
         self.require(
             self.assumptions is None or self.guarantees is not None,
@@ -157,7 +148,6 @@ class World:
     wall: str = "#"
     # int[C, 2], row and column of each other cell from 0; None without a map
     places: np.ndarray | None = None
-    objective: Parity | None = None  # the parity condition of the game's own file, or None
 
     def position(self, state: int) -> Record:
         """Both robots' rows and columns from 1, or the state's number from 0."""
@@ -212,7 +202,7 @@ def _from_model(path: Path, table: GameTable) -> World:
     mdp = initial_where(loaded.mdp, table.initial, path)
     with errors_in(f"{str(path)!r}: "):
         game = make_game(mdp, loaded.more["system"])
-    return World(game, loaded.actions, objective=loaded.objective)
+    return World(game, loaded.actions)
 
 
 def _cell(cell: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
@@ -230,13 +220,6 @@ def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
     with errors_in(f"{file.path}: [task] "):
         if task.formula is not None:
             return task_game(game, task.formula)
-        if task.parity is not None:
-            if world.objective is None:
-                raise ValueError(
-                    'parity = "model" takes the file of a parity game (PGSolver, '
-                    "extended HOA); this game has no condition of its own."
-                )
-            return game, world.objective
         safe = task.safe or "true"
         if task.guarantees is None:
             return game, safety(game, safe)
@@ -252,8 +235,6 @@ def task_text(task: TaskTable) -> str:
     """
     if task.formula is not None:
         return task.formula
-    if task.parity is not None:
-        return "the parity condition of the model's file"
 
     def recurrence(formulas: list[str]) -> str:
         return " & ".join(f"G F ({x})" for x in formulas)

@@ -10,12 +10,10 @@ import numpy as np
 
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_bytes
-from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.construct.padded import row_actions, to_padded
 from jaxltl.core.models import MDP, Game, IntervalMDP, SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
-from jaxltl.io.pgsolver import objective_of
 
 _MAX_NAMES = 100  # each is a column of the padded model
 
@@ -27,7 +25,6 @@ class ReadModel:
     mdp: MDP  # the model
     actions: tuple[str, ...]  # A names
     more: dict[str, np.ndarray]  # other arrays by name; "system" of a game
-    objective: Parity | None = None  # the parity objective of a parity game's file, or None
 
 
 def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = None) -> ReadModel:
@@ -52,7 +49,6 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
     del raw
     model = read_model(path, constants=constants)
     arrays_of_game: dict[str, np.ndarray] = {}
-    objective = None
     if isinstance(model, IntervalMDP):
         raise ValueError(
             f"{name!r} holds a model whose probabilities are intervals; jaxltl solve answers "
@@ -65,12 +61,10 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
                 "jaxltl synthesize."
             )
         arrays_of_game["system"] = np.asarray(model.system)
-        if "priority" in model.mdp.valuation:
-            objective = objective_of(model)
         model = model.mdp
     with errors_in(f"{name!r}: "):
         mdp, names, _ = padded(model)
-    return ReadModel(mdp, names, arrays_of_game, objective)
+    return ReadModel(mdp, names, arrays_of_game)
 
 
 def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:

@@ -34,7 +34,6 @@ _INSTEAD = {
     "policy_value": _STRATEGY,
     "soft_value": _DISCOUNTED,
     "boltzmann_value": _DISCOUNTED,
-    "boltzmann_fixed_points": _DISCOUNTED,
     "occupancy_measure": _STRATEGY,
     "average_reward": "mean_payoff(game, reward), of a deterministic game",
     "total_reward": _REWARD,

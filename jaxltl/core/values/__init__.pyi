@@ -7,7 +7,6 @@ from .discounted.occupancy import (
     occupancy_measure as occupancy_measure,
 )
 from .discounted.soft import (
-    boltzmann_fixed_points as boltzmann_fixed_points,
     boltzmann_value as boltzmann_value,
     soft_value as soft_value,
 )

@@ -1,1 +1,1 @@
-"""The Hanoi Omega-Automata (HOA) format and its extension to synthesis games."""
+"""The Hanoi Omega-Automata (HOA) format."""

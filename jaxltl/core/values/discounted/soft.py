@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial, reduce
-from operator import itemgetter
+from functools import reduce
 from typing import NamedTuple, Unpack
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,13 +20,12 @@ from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
 from jaxltl.core.models.protocols import Array, Model, PyTree
-from jaxltl.core.types import Solution, Status, require_shape, status_code
+from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
     expected_reward,
     gains,
     judge,
-    optimal_value,
     parameters,
     reward_size,
     solution_of,
@@ -261,8 +258,8 @@ def boltzmann_value(
     """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
 
     ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator contracts only
-    while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can have several fixed points (see
-    :func:`boltzmann_fixed_points`): damped steps of one half are polished by Newton's method, the
+    while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can have several fixed points, one
+    for each region of `initial`: damped steps of one half are polished by Newton's method, the
     enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached.
 
     Args:
@@ -407,64 +404,3 @@ def softmax_mean(over: Layout, q: Quantity, parameters: _Criterion) -> tuple[jax
     return value, jax.tree.map(
         lambda p, x, v: p * (1 + x - v), policy, finite, over.broadcast(value, finite)
     )
-
-
-@validated()
-def boltzmann_fixed_points(
-    model: Model,
-    reward: jax.Array,
-    discount: jax.Array | float,
-    key: chex.PRNGKey,
-    *,
-    num_starts: int = 64,
-    tolerance: float = 1e-6,
-) -> list[Solution]:
-    """Distinct fixed points of the Boltzmann operator, searched from many starts.
-
-    Damped and Newton iterations from zero, from the optimal and the worst value, and from random
-    values between them. Not a proof that there are no others.
-
-    Args:
-      model, reward, discount: as in :func:`boltzmann_value`.
-      key: random key.
-      num_starts: starts for each of the two methods.
-      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a
-        tenth of it times ``1 - discount``.
-
-    Returns:
-      Solutions with status ``CONVERGED`` or ``UNCERTIFIED``, ordered by the sum of their values.
-      Not differentiable; :func:`boltzmann_value` with one of these as `initial` is.
-
-    Raises:
-      ValueError: the reward has the wrong shape.
-
-    Example:
-      >>> from jaxltl import make_mdp
-      >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
-      >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
-      >>> found = boltzmann_fixed_points(
-      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=0.1)
-      >>> [round(one.value[0].item(), 1) for one in found]
-      [0.3, 2.5, 20.0]
-    """
-    best = optimal_value(model, reward, discount).value
-    worst = -optimal_value(model, -jnp.asarray(reward), discount).value
-    weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
-    weight = weight.at[0].set(0).at[-1].set(1)
-    starts = worst + weight * (best - worst)
-    # For a contraction by the discount this residual bounds the error by the tolerance.
-    residual = tolerance * (1 - discount) / 10
-    fixed_points: list[Solution] = []
-
-    def run(method: str, v: jax.Array) -> Solution:
-        return boltzmann_value(
-            model, reward, discount, initial=v, method=method, tolerance=residual
-        )
-
-    for method in ("damped", "newton"):
-        batch = jax.vmap(partial(run, method))(starts)
-        for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
-            one = jax.tree.map(itemgetter(i), batch)
-            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in fixed_points):
-                fixed_points.append(one)
-    return sorted(fixed_points, key=lambda f: float(f.value.sum()))

@@ -231,17 +231,6 @@ def backup(model, reward, discount, value):
     return reference.soft_maximum(q, model.available, "boltzmann")
 
 
-def test_three_fixed_points_are_found():
-    found = jl.values.boltzmann_fixed_points(LOOP_OR_END, LOOP_REWARD, 0.99, jax.random.key(0))
-    np.testing.assert_allclose([f.value[0] for f in found], [0.3345, 2.4703, 20.0], atol=1e-3)
-    for solution in found:
-        jl.check(solution, certified=False)
-        v = float(solution.value[0])
-        loop = 1 / (1 + np.exp(-(0.2 + 0.99 * v)))
-        assert abs(loop * (0.2 + 0.99 * v) - v) < 1e-9
-        assert np.isinf(solution.upper).all(), "no single enclosure holds"
-
-
 def test_the_answer_depends_on_the_start_where_there_are_several():
     low = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99)
     high = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99, initial=jnp.array([15.0, 0.0]))
