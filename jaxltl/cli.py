@@ -105,7 +105,7 @@ def learn(
     # First, so that matplotlib is imported in the background.
     with artist(apart=apart) as begin, processes.process_group(devices, launch, say) as group:
         console = run_job.Console(begin, say, group)
-        finished = run_job.learn(task_file, run_job.Options(out, seed, seeds, again), console)
+        finished = run_job.learn(task_file, run_job.RunOptions(out, seed, seeds, again), console)
     if finished is None:
         return
     done = finished.before
@@ -304,7 +304,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     return plot.to_bytes(plot.automaton(result), "svg").decode()
 
 
-class _Reading(TypedDict):
+class _ProgramOptions(TypedDict):
     """Options of :func:`solve` for programs and for the width of bounds."""
 
     constants: str | None
@@ -356,7 +356,7 @@ def solve(
     as_json: bool,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
-    **reading: Unpack[_Reading],
+    **reading: Unpack[_ProgramOptions],
 ) -> None:
     """Solve properties of a model, or of a program in the PRISM language, with certified bounds.
 
@@ -491,11 +491,13 @@ def certify(
     from jaxltl.app import certify as app
 
     objective: Literal["max", "min"] = "min" if options.pop("smallest") else "max"
-    query = app.Query(formula, options.pop("confidence"), options.pop("method"), objective)
+    query = app.CertificateQuery(
+        formula, options.pop("confidence"), options.pop("method"), objective
+    )
     graph = app.graph_of_options(
         options.pop("graph"), options.pop("least_probability"), query.confidence
     )
-    source = app.Source(graph=graph, **options)
+    source = app.LogSource(graph=graph, **options)
     result = app.certify_and_write(log, query, source, policy, curve)
     if as_json:
         _print_json(result)

@@ -121,7 +121,7 @@ def problem_and_state() -> tuple[Any, Any, Any]:
 
 def run(directory: Path, place: Any) -> None:
     """Steps of the lanes, saved after every 50, and what comes out, printed by the first."""
-    from jaxltl.algos.common.chunks import Options, run_in_chunks
+    from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
     from jaxltl.core.models.mesh.lanes import on_host
 
     step, states, goal = problem_and_state()
@@ -134,7 +134,7 @@ def run(directory: Path, place: Any) -> None:
         goal,
         0.01,
         num_steps=STEPS,
-        options=Options(
+        options=ChunkOptions(
             lanes=True,
             chunk=50,
             checkpoint=path,

@@ -52,3 +52,24 @@ def test_names_are_nouns_of_the_field():
             if name in NOT_NAMES:
                 wrong.append(f"{path}:{node.lineno}: {name}")
     assert not wrong
+
+
+# The learners' protocol has these names in each learner, and task files these tables of each kind.
+SHARED_CLASSES = {"Problem", "Hparams", "State", "Metrics"} | {
+    "DemonstrationsTable",
+    "LearnerTable",
+    "TaskTable",
+    "TestTable",
+    "WorldTable",
+    "Policy",  # the protocol of policies, and a solver's state
+}
+
+
+def test_a_class_name_has_one_meaning():
+    places = {}
+    for path, text in size.sources(PACKAGE).items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name.lstrip("_"), []).append(f"{path}:{node.lineno}")
+    twice = {name: at for name, at in places.items() if len(at) > 1}
+    assert not {name: at for name, at in twice.items() if name not in SHARED_CLASSES}

@@ -14,7 +14,7 @@ from jaxltl.reproduce import cce
 
 
 def measured(*methods):
-    plan = cce.Plan(
+    plan = cce.CceExperimentPlan(
         networks=("2-2-1",),
         tasks=(4,),
         methods=methods,

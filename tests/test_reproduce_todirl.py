@@ -9,7 +9,7 @@ from jaxltl.reproduce import todirl
 
 
 def check(methods):
-    plan = todirl.Plan(
+    plan = todirl.TodirlExperimentPlan(
         methods=methods,
         demonstrations=(6,),
         curves=6,

@@ -296,7 +296,7 @@ class Budget:
 
 
 @struct.dataclass
-class Best:
+class BestPoint:
     """The best point so far: `parameters`, ``float[D]``, and its `value`; NaN before there is one.
 
     >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
@@ -314,13 +314,13 @@ class State(RunState):
     Attributes:
       parameters: ``float[D]``, the point that the next step evaluates.
       inside: ``float[D]``, the last point at which the functions gave a model.
-      best: the best of all points, :class:`Best`.
+      best: the best of all points, :class:`BestPoint`.
       optimizer: optax's state.
     """
 
     parameters: jax.Array
     inside: jax.Array
-    best: Best
+    best: BestPoint
     optimizer: optax.OptState
 
 
@@ -380,7 +380,7 @@ def start_at(parameters: jax.Array, key: Key, problem: Problem, hparams: Hparams
         step=jnp.int32(0),
         parameters=point,
         inside=problem.inside,
-        best=Best(jnp.full_like(point, jnp.nan), jnp.full((), jnp.nan, point.dtype)),
+        best=BestPoint(jnp.full_like(point, jnp.nan), jnp.full((), jnp.nan, point.dtype)),
         optimizer=optimizers.start(first, point),
     )
 
@@ -403,7 +403,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     )
     moved = jnp.clip(x + updates * size, problem.low, problem.high)
     better = good & ~(problem.sign * (value - state.best.value) <= 0)  # also if the best is NaN
-    best = trees.choose(better, Best(x, value), state.best)
+    best = trees.choose(better, BestPoint(x, value), state.best)
     after = State(
         key=state.key,
         step=state.step + 1,

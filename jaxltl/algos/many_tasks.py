@@ -128,7 +128,7 @@ class SequenceNetwork(nn.Module):
 
 
 @struct.dataclass
-class Plan:
+class SequencePlan:
     """For each automaton state the sequences that lead to acceptance, shortest first.
 
     `reach` and `avoid` are ``bool[Q, M, D, E]``, and `length` ``int32[Q, M]``, 0 for padding.
@@ -146,8 +146,8 @@ def make_plan(
     *,
     depth: int,
     max_sequences: int = 16,
-) -> Plan:
-    """The :class:`Plan` of a `task`: a formula, its text, or an automaton; made on the host.
+) -> SequencePlan:
+    """The :class:`SequencePlan` of a `task`: a formula, its text, or an automaton; made on the host.
 
     `events`, ``bool[E, P]``, are the labels that occur, as in training, with columns `propositions`;
     `depth` is D, as in training, and `max_sequences` is M, the number of sequences for each state. Not
@@ -160,10 +160,10 @@ def make_plan(
         depth=depth,
         max_sequences=max_sequences,
     )
-    return Plan(table.reach, table.avoid, table.length)
+    return SequencePlan(table.reach, table.avoid, table.length)
 
 
-def stack_plans(plans: Sequence[Plan]) -> Plan:
+def stack_plans(plans: Sequence[SequencePlan]) -> SequencePlan:
     """The `plans` of several tasks, padded to one shape, with a leading axis; ``vmap`` over it.
 
     Raises:
@@ -171,7 +171,7 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     """
     plans = validation.sequence("plans", plans)
     for plan in plans:
-        validation.instance("plans", plan, Plan, "a list of those of make_plan")
+        validation.instance("plans", plan, SequencePlan, "a list of those of make_plan")
     shapes = [np.shape(plan.reach) for plan in plans]
     if not shapes or len({shape[2:] for shape in shapes}) > 1:
         raise ValueError(
@@ -191,7 +191,7 @@ _FORGETS = 1 / 16  # weight of the newest value in the mean of those of a follow
 
 
 @brief
-class Choice(NamedTuple):
+class SequenceChoice(NamedTuple):
     """The sequence that an agent follows: automaton `state`, index `sequence`, and recent `worth`.
 
     >>> Choice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
@@ -205,7 +205,7 @@ class Choice(NamedTuple):
 
 def sequence_agent(
     network: Callable[..., PyTree],
-    plan: Plan,
+    plan: SequencePlan,
     *,
     actions: Finite | Box | None = None,
     squash: str = "clip",
@@ -232,19 +232,19 @@ def sequence_agent(
     Raises:
       ValueError: not a plan or a function, or at the first step Gaussian actions without `actions`.
     """
-    validation.instance("plan", plan, Plan, "one of make_plan")
+    validation.instance("plan", plan, SequencePlan, "one of make_plan")
     if actions is not None:
         validation.instance(
             "actions", actions, Finite | Box, "the environment's, environment.actions"
         )
     squash = validation.choice("squash", squash, action_distributions.SQUASHES)
     how = struct.Static((squash, validation.boolean("sampled", sampled)))
-    begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
+    begin = SequenceChoice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, (how, actions, as_partial(network, "network"), plan)), begin)
 
 
 def sequence_policy(
-    network: Callable[..., PyTree], plan: Plan, observation: PyTree, memory: Numeric
+    network: Callable[..., PyTree], plan: SequencePlan, observation: PyTree, memory: Numeric
 ) -> jax.Array:
     """The action probabilities ``float[A]`` of an agent that selects its sequence anew at every step.
 
@@ -259,7 +259,7 @@ def sequence_policy(
     >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
     (2,)
     """
-    validation.instance("plan", plan, Plan, "one of make_plan")
+    validation.instance("plan", plan, SequencePlan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
         memory = validation.integer("memory", memory)
     actions, values = _evaluate(
@@ -296,7 +296,7 @@ def _actions_of(parameters: PyTree) -> Finite:
 
 
 def _evaluate(
-    network: Callable[..., PyTree], plan: Plan, seen: PyTree, state: jax.Array
+    network: Callable[..., PyTree], plan: SequencePlan, seen: PyTree, state: jax.Array
 ) -> tuple[PyTree, jax.Array]:
     """Action parameters and values of each sequence of an automaton state."""
     rows = sequence_task.Sequence(
@@ -320,7 +320,7 @@ def _evaluate(
 
 
 def _act(
-    agent: tuple[struct.Static, Finite | Box | None, Callable[..., PyTree], Plan],
+    agent: tuple[struct.Static, Finite | Box | None, Callable[..., PyTree], SequencePlan],
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
@@ -335,7 +335,7 @@ def _act(
             TaskObservation,
             "that of an environment of task_environment, with the formula of the plan",
         )
-    validation.instance("memory", memory, Choice, "the agent's own, agent.memory")
+    validation.instance("memory", memory, SequenceChoice, "the agent's own, agent.memory")
     require_key(key)
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, values = _evaluate(network, plan, seen, state)
@@ -355,7 +355,7 @@ def _act(
         sampled=sampled,
         squash=squash,
     )
-    return action, Choice(state, taken, worth)
+    return action, SequenceChoice(state, taken, worth)
 
 
 @brief

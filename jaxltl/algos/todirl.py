@@ -300,7 +300,7 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
 
 
 @struct.dataclass
-class Objective:
+class TodirlObjective:
     """Terms of the loss, and the soft values.
 
     Attributes:
@@ -321,10 +321,10 @@ class Objective:
 
 def objective(
     parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
-) -> tuple[jax.Array, Objective]:
+) -> tuple[jax.Array, TodirlObjective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
-    The loss ``float[]``, in nats, and :class:`Objective`, for `parameters`, `problem`, `hparams` and
+    The loss ``float[]``, in nats, and :class:`TodirlObjective`, for `parameters`, `problem`, `hparams` and
     `initial` as in :func:`solve`; with ``hparams.mu`` minus mu times the satisfaction probability in
     each world, as in (2.6). Differentiable in the parameters by one transposed linear solve (implicit
     function theorem), instead of one system (3.6) for each parameter.
@@ -365,7 +365,7 @@ def objective(
     neg = -weight @ demonstrated
     loss = neg + hparams.l2 / 2 * sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
     score = lax.stop_gradient(-(weight @ other) / other_pairs)
-    parts = Objective(
+    parts = TodirlObjective(
         neg_log_likelihood=neg,
         per_pair=neg / pairs,
         held_out=score,
@@ -459,7 +459,7 @@ def _draw(network: nn.Module, key: Key, inputs: tuple[jax.Array, ...]) -> PyTree
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
 
-    def loss_of(parameters: PyTree) -> tuple[jax.Array, Objective]:
+    def loss_of(parameters: PyTree) -> tuple[jax.Array, TodirlObjective]:
         return objective(parameters, problem, hparams, state.value)
 
     loss, parts, norm, parameters, optimizer = optimizers.descend(loss_of, state, hparams)

@@ -46,7 +46,7 @@ PICTURES = (".svg", ".png", ".pdf")
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CountEvidence:
     """A model and its transition counts."""
 
     model: SparseMDP  # its probabilities are frequencies, or those of a given model
@@ -57,7 +57,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Query:
+class CertificateQuery:
     """A question: the formula, and the confidence of the answer."""
 
     formula: str  # of linear temporal logic
@@ -67,7 +67,7 @@ class Query:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class LogSource:
     """Labels, model and assumptions that accompany a log."""
 
     labels: Path | None = None  # table of labels, or None
@@ -79,7 +79,7 @@ class Source:
     graph: Graph | None = None
 
 
-def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
+def read_evidence(log: Path, source: LogSource, option: str = "--{} ") -> CountEvidence:
     """Transition counts of a log and their model; `option` formats option names in errors."""
     from jaxltl.io.log import read_labels, read_log
 
@@ -146,21 +146,21 @@ def _some(counts: TransitionCounts) -> str:
     return names + (f" and {more} more" if more > 0 else "")
 
 
-def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
+def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> CountEvidence:
     states = model.valuation.get("state")
     names = range(model.num_states) if states is None else states
     rank = np.arange(model.num_rows) - model.host.row_start[model.host.state]
     number = rank if model.action is None else np.asarray(model.action)
     actions = [model.action_names[a] if model.action_names else str(a) for a in number]
-    return Evidence(model, counts, tuple(map(str, names)), tuple(actions), graph)
+    return CountEvidence(model, counts, tuple(map(str, names)), tuple(actions), graph)
 
 
-def certify(evidence: Evidence, query: Query) -> DataGuarantee:
+def certify(evidence: CountEvidence, query: CertificateQuery) -> DataGuarantee:
     """Guarantee of a log and a query, see :func:`jaxltl.learn_guarantee`."""
     return learn_guarantee(evidence.model, evidence.counts, **_options(evidence, query))
 
 
-def _options(evidence: Evidence, query: Query) -> Record:
+def _options(evidence: CountEvidence, query: CertificateQuery) -> Record:
     return {
         "task": query.formula,
         "confidence": query.confidence,
@@ -170,7 +170,7 @@ def _options(evidence: Evidence, query: Query) -> Record:
     }
 
 
-def text(evidence: Evidence, result: Record) -> str:
+def text(evidence: CountEvidence, result: Record) -> str:
     """The :func:`entry` of a guarantee as text."""
     return render(
         "jaxltl.app.reports",
@@ -182,7 +182,9 @@ def text(evidence: Evidence, result: Record) -> str:
     ).rstrip("\n")
 
 
-def entry(evidence: Evidence, query: Query, guarantee: DataGuarantee, seconds: float) -> Record:
+def entry(
+    evidence: CountEvidence, query: CertificateQuery, guarantee: DataGuarantee, seconds: float
+) -> Record:
     """Guarantee from a log, as a JSON object."""
     return {
         "formula": query.formula,
@@ -202,7 +204,7 @@ def entry(evidence: Evidence, query: Query, guarantee: DataGuarantee, seconds: f
     }
 
 
-def sample_next(evidence: Evidence, guarantee: DataGuarantee) -> list[Record]:
+def sample_next(evidence: CountEvidence, guarantee: DataGuarantee) -> list[Record]:
     """Choices of which more samples improve the guarantee most, in decreasing order."""
     return [
         {
@@ -216,7 +218,7 @@ def sample_next(evidence: Evidence, guarantee: DataGuarantee) -> list[Record]:
     ]
 
 
-def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
+def curve(evidence: CountEvidence, query: CertificateQuery) -> tuple[list[int], list[float]]:
     """The guarantee by number of samples, for one random order of the log."""
     total = int(evidence.counts.sum())
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
@@ -232,7 +234,7 @@ def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
 class Logged:
     """The log from which a world was estimated."""
 
-    evidence: Evidence  # the world with its frequencies, and the counts
+    evidence: CountEvidence  # the world with its frequencies, and the counts
     column: np.ndarray  # int[R], the action of each choice in the padded world
     confidence: float  # confidence, method: of the confidence sets
     method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
@@ -252,7 +254,7 @@ def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], 
     assert table.transitions is not None and confidence is not None
     evidence = read_evidence(
         folder / table.transitions,
-        Source(
+        LogSource(
             labels=None if table.labels is None else folder / table.labels,
             initial=[initial] if isinstance(initial, str) else initial,
             terminal=table.terminal or (),
@@ -273,7 +275,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
     ``optimistic`` an upper bound for all policies.
     """
     evidence = logged.evidence
-    best = certify(evidence, Query(formula, logged.confidence, logged.method, "max"))
+    best = certify(evidence, CertificateQuery(formula, logged.confidence, logged.method, "max"))
     against = product(best.model, model.automaton, label_on=model.label_on)
     weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
     worst = satisfaction_probability(against, weights, nature="adversarial")
@@ -298,7 +300,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
 
 
 def certify_and_write(
-    log: Path, query: Query, source: Source, policy: Path | None, picture: Path | None
+    log: Path, query: CertificateQuery, source: LogSource, policy: Path | None, picture: Path | None
 ) -> Record:
     """Runs the command, output files opened first, and returns the result."""
     from jaxltl.core.files import atomic_write

@@ -249,7 +249,7 @@ def _error_line(name: str, problem: BaseException) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
+class LearnerSetup:
     """A learner with its problem and hyperparameters."""
 
     algorithm: Algorithm  # its module
@@ -262,7 +262,7 @@ class Method:
     description: str  # of the policy
 
 
-def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     """The learner of a task file."""
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
     method = make(task, environment, num_steps)
@@ -300,13 +300,13 @@ def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, b
     )
 
 
-def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     spec = _settings(task)
     parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
     network = dataclasses.replace(default_network(environment.actions), **parts)
     problem = ppo.make_problem(environment, network=network)
     hparams = settings(ppo.Hparams, spec)
-    return Method(
+    return LearnerSetup(
         ppo,
         problem,
         hparams,
@@ -318,7 +318,7 @@ def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Met
     )
 
 
-def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     table, actions = task.settings, environment.actions
     assert isinstance(table, CceTable)
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
@@ -337,7 +337,7 @@ def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Met
     first = diagonal_gaussian(jnp.zeros(network.num_parameters, jnp.float32), table.deviation)
     problem = cce.make_problem(score, first, limit=table.limit)
     hparams = settings(cce.Hparams, _settings(task))
-    return Method(
+    return LearnerSetup(
         cce,
         problem,
         hparams,
@@ -349,7 +349,7 @@ def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Met
     )
 
 
-def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Method:
+def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     table = task.settings
     assert isinstance(table, CpoTable) and table.limit is not None
     if not isinstance(environment.actions, Box):
@@ -362,7 +362,7 @@ def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Met
         environment = dataclasses.replace(environment, step=step, outcomes=None)
     problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
     hparams = settings(trust_region.Hparams, _settings(task))
-    return Method(
+    return LearnerSetup(
         trust_region,
         problem,
         hparams,

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from jaxltl.app.files.worlds import World
+from jaxltl.app.files.worlds import MappedModel
 from jaxltl.app.wording import enclosure, Record
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -71,7 +71,7 @@ class Guarantee:
 
 def ask(
     model: Product,
-    world: World,
+    world: MappedModel,
     demonstrations: Trajectories,
     best: Solution,
     requested: str | float,
@@ -104,7 +104,7 @@ def ask(
     return Guarantee(requested, over, best, actions, lost, cost, used=used)
 
 
-def require_possible(model: Product, world: World, best: Solution) -> None:
+def require_possible(model: Product, world: MappedModel, best: Solution) -> None:
     """Raises ValueError if no policy satisfies the formula from any initial state."""
     starts = np.argwhere(np.asarray(model.initial) > 0)
     if (np.asarray(best.upper)[tuple(starts.T)] > 0).any():
@@ -194,7 +194,7 @@ def guarantee_entry(
     guarantee: Guarantee,
     attempt: Attempt | None,
     model: Product,
-    world: World,
+    world: MappedModel,
     demonstrations: Trajectories,
     solution: Solution,
 ) -> Record:
@@ -260,7 +260,7 @@ Learned = TypeVar("Learned")
 
 
 @dataclass(frozen=True)
-class Search(Generic[Learned]):
+class GuaranteeSearch(Generic[Learned]):
     """Search for the most likely policy with at least a given certified probability."""
 
     model: Product  # the product

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl
-from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks
+from jaxltl.algos.common.chunks import Chunks, ChunkOptions, run_in_chunks
 from jaxltl.app.files.task import FormulaFile
 from jaxltl.app.protocols import Algorithm, Training
 from jaxltl.app.reports.drawing import Picture, drawing
@@ -40,7 +40,7 @@ def run_seeds(
     training: Training,
     *,
     num_steps: int,
-    options: Options | None = None,
+    options: ChunkOptions | None = None,
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs a learner from N seeds in parallel; returns chunks and metrics ``[T, N]`` by name."""
     mesh = training.mesh if training.num_seeds > 1 else None
@@ -57,7 +57,7 @@ def run_seeds(
         hparams,
         num_steps=num_steps,
         options=dataclasses.replace(
-            options or Options(),
+            options or ChunkOptions(),
             lanes=True,
             report=report and (lambda step, metrics: report(step, vars(metrics))),
             checkpoint=training.checkpoint,

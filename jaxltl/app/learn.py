@@ -15,16 +15,16 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos import mlirl
-from jaxltl.algos.common.chunks import Options
-from jaxltl.algos.mlirl.constrained import Point, constrained_points
+from jaxltl.algos.common.chunks import ChunkOptions
+from jaxltl.algos.mlirl.constrained import ConstrainedPoint, constrained_points
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
 from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.files.worlds import World, load_world
+from jaxltl.app.files.worlds import MappedModel, load_world
 from jaxltl.app.guarantee import (
     Attempt,
     Guarantee,
     ask,
-    Search,
+    GuaranteeSearch,
     check_formula,
     guarantee_entry,
     require_possible,
@@ -68,7 +68,7 @@ _GAP = 1e-6  # of probabilities that are compared
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedPolicies:
     """Weights and policies of N seeds."""
 
     policy: np.ndarray  # float[N, S, Q, A], policies of the product
@@ -83,7 +83,7 @@ class Learned:
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
 
 
-def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
+def _problem(setup: MlirlSetup, allowed: np.ndarray | None) -> mlirl.Problem:
     """The learning problem of inverse RL, with some of the actions or all."""
     table, model, features = setup.task.learner, setup.model, setup.features
     start = table.start
@@ -103,15 +103,15 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
 
 
 def _train(
-    setup: Setup,
+    setup: MlirlSetup,
     problem: mlirl.Problem,
     hparams: mlirl.Hparams,
     training: Training,
     num_steps: int | None = None,
-) -> Learned:
+) -> LearnedPolicies:
     """Reward weights and policies of N seeds."""
     table, model = setup.task.learner, setup.model
-    options = Options(until=Partial(_ends, table.tolerance), keep="before")
+    options = ChunkOptions(until=Partial(_ends, table.tolerance), keep="before")
     steps = num_steps or table.steps
     chunks, history = run_seeds(mlirl, problem, hparams, training, num_steps=steps, options=options)
     states = jax.device_get(dataclasses.replace(chunks.state, key=None))
@@ -122,7 +122,7 @@ def _train(
     if table.in_world:
         policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
     gradient_norm = history["gradient_norm"][-1]
-    return Learned(
+    return LearnedPolicies(
         policy=np.asarray(policy),
         weights=weights,
         names=setup.features.names,
@@ -147,7 +147,9 @@ def _ends(
     return (metrics.gradient_norm <= tolerance) | jnp.all(jnp.stack(jax.tree.leaves(same)))
 
 
-def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Attempt | None]:
+def _with_guarantee(
+    setup: MlirlSetup, training: Training
+) -> tuple[LearnedPolicies, int, Attempt | None]:
     """Learning under the guarantee: all seeds, the kept one, and how a probability is attained."""
     guarantee, problem = setup.guarantee, setup.problem
     hparams = settings(mlirl.Hparams, setup.task.learner.specified())
@@ -164,7 +166,7 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
         steps = min(steps, max(2 * least, _STATE_STEPS // setup.model.num_states))
     learned = _train(setup, problem, hparams, training, steps)
     free = one_seed(learned, _least_loss(learned))
-    search = Search(
+    search = GuaranteeSearch(
         setup.model,
         guarantee,
         np.asarray(problem.counts),
@@ -185,14 +187,14 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
 
 
 def _constrained(
-    setup: Setup, free: Learned, hparams: mlirl.Hparams, seed: int
-) -> list[tuple[Learned, float]]:
+    setup: MlirlSetup, free: LearnedPolicies, hparams: mlirl.Hparams, seed: int
+) -> list[tuple[LearnedPolicies, float]]:
     """The most likely results at and below the required probability, and their weights mu."""
     guarantee, problem = setup.guarantee, setup.problem
     required, soft = float(guarantee.requested), FullSupport(setup.model, guarantee.over)
     value = jnp.zeros(setup.model.state_shape, setup.model.dtype)
 
-    def evaluate(parameters: np.ndarray) -> Point:
+    def evaluate(parameters: np.ndarray) -> ConstrainedPoint:
         nonlocal value
         (loss, policy), pull, new = _likelihood_and_policy(
             jnp.asarray(parameters, value.dtype), problem, hparams, value
@@ -200,7 +202,7 @@ def _constrained(
         # Without a certificate: only the policies that are found get one.
         probability, slope = soft.probability(np.asarray(policy))
         each = np.asarray(_derivatives(pull, jnp.asarray(slope, value.dtype)))
-        point = Point(parameters, float(loss), probability, each[0], each[1], new)
+        point = ConstrainedPoint(parameters, float(loss), probability, each[0], each[1], new)
         value = new if point.is_finite else value
         return point
 
@@ -215,7 +217,7 @@ def _constrained(
     lost = float(np.asarray(problem.counts)[~allowed].sum())
     top = max(required, max((point.probability for point in points), default=0))
 
-    def mixed_loss(point: Point) -> float:
+    def mixed_loss(point: ConstrainedPoint) -> float:
         share = max(top + _GAP - point.probability, _GAP)
         return point.loss if enough else point.loss + lost * np.log(share)
 
@@ -259,7 +261,7 @@ def _derivatives(pull: Callable, slope: jax.Array) -> jax.Array:
     return lax.map(lambda x: pull(x)[0], each)
 
 
-def _least_loss(learned: Learned) -> int:
+def _least_loss(learned: LearnedPolicies) -> int:
     """The seed of least loss, among those that converged if there are any."""
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     return int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
@@ -298,9 +300,9 @@ def _solved(
 
 
 @dataclass(frozen=True)
-class Setup:
+class MlirlSetup:
     task: MlirlFile
-    world: World
+    world: MappedModel
     model: Product
     demonstrations: Trajectories
     dropped: int
@@ -345,9 +347,9 @@ class Setup:
 
 
 @dataclass
-class Outcome:
-    setup: Setup  # setup, learned: the task, and the results of learning
-    learned: Learned
+class MlirlOutcome:
+    setup: MlirlSetup  # setup, learned: the task, and the results of learning
+    learned: LearnedPolicies
     chosen: int  # index of the kept seed, that of least loss
     solution: Solution  # satisfaction probability of the kept policy, with bounds
     attempt: Attempt | None  # how an asked probability was attained, if any
@@ -360,7 +362,7 @@ class Outcome:
     seed: int  # the first seed
 
 
-def prepare(task: MlirlFile, seed: int) -> Setup:
+def prepare(task: MlirlFile, seed: int) -> MlirlSetup:
     """The learning problem of a task file: product, demonstrations, guarantee and features."""
     world = load_world(task.path, task.world)
     with errors_in(f"{task.path}: [task] "):
@@ -381,13 +383,13 @@ def prepare(task: MlirlFile, seed: int) -> Setup:
         bound = step_bound(
             model, actions, guarantee.requested, task.over, task.steps, task.steps_factor
         )
-    setup = Setup(task, world, model, demonstrations, dropped, guarantee, bound, trivial)
+    setup = MlirlSetup(task, world, model, demonstrations, dropped, guarantee, bound, trivial)
     with errors_in(f"{task.path}: [learner] "):
         _ = setup.problem  # raises its errors before learning
     return setup
 
 
-def describe(setup: Setup) -> str:
+def describe(setup: MlirlSetup) -> str:
     """Sizes of the problem in one line."""
     lengths = np.asarray(setup.demonstrations.length)
     logged = setup.world.logged
@@ -398,7 +400,7 @@ def describe(setup: Setup) -> str:
     )
 
 
-def learn(setup: Setup, training: Training) -> Outcome:
+def learn(setup: MlirlSetup, training: Training) -> MlirlOutcome:
     """Learns with N seeds, keeps the one of least loss, and evaluates all."""
     model = setup.model
     learned, chosen, attempt = _with_guarantee(setup, training)
@@ -427,7 +429,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
 
         training.stage("certifying")
         data = guaranteed(setup.world.logged, model, setup.task.formula, policy)
-    return Outcome(
+    return MlirlOutcome(
         setup=setup,
         learned=learned,
         chosen=chosen,
@@ -440,7 +442,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     )
 
 
-def summary(outcome: Outcome) -> Record:
+def summary(outcome: MlirlOutcome) -> Record:
     """The results for ``result.json``."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
@@ -492,7 +494,9 @@ def summary(outcome: Outcome) -> Record:
     return plain(result)
 
 
-def _within_steps(setup: Setup, learned: Learned, chosen: int) -> tuple[Learned, Record | None]:
+def _within_steps(
+    setup: MlirlSetup, learned: LearnedPolicies, chosen: int
+) -> tuple[LearnedPolicies, Record | None]:
     """The kept policy with its expected steps within the bound, and the report on steps."""
     model, bound, before = setup.model, setup.bound, learned.policy[chosen]
     if bound is None:
@@ -509,7 +513,7 @@ def _within_steps(setup: Setup, learned: Learned, chosen: int) -> tuple[Learned,
     return learned, steps
 
 
-def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarray) -> Record:
+def _evidence(solution: Solution, model: Product, world: MappedModel, starts: np.ndarray) -> Record:
     parts = solution.value, solution.lower, solution.upper
     value, lower, upper = (from_starts(model, x) for x in parts)
     worst = int(starts[np.argmin(value[starts])])
@@ -525,7 +529,7 @@ def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarr
     }
 
 
-def save(out: Path, outcome: Outcome) -> None:
+def save(out: Path, outcome: MlirlOutcome) -> None:
     """Writes the kept policy to ``policy.npz`` in a directory.
 
     :func:`jaxltl.io.load_policy` reads it. Further arrays: ``weights [F]`` and ``features [F]``,

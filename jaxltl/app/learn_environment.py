@@ -18,7 +18,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.environment_setup import Method, load_environment, load_world, make_method
+from jaxltl.app.environment_setup import LearnerSetup, load_environment, load_world, make_method
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
 from jaxltl.app.reports.explorer import Curves, curves
@@ -66,13 +66,13 @@ Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Setup:
+class EnvironmentSetup:
     """A task, ready for learning."""
 
     task: EnvironmentFile  # the file
     automaton: Automaton  # of the formula
     environment: Environment  # the world with the task
-    method: Method  # the learner
+    method: LearnerSetup  # the learner
     num_steps: int  # limit of an episode in the evaluation
     trivial: str | None  # remark on a formula that is always true
     dynamics: Dynamics | None = None  # of a continuous world, in which the policy is proven
@@ -85,10 +85,10 @@ class Setup:
 
 
 @dataclass
-class Outcome:
+class EnvironmentOutcome:
     """Learned policies of all seeds and their evaluations."""
 
-    setup: Setup  # the task
+    setup: EnvironmentSetup  # the task
     states: PyTree  # of the learner, with a first axis of N seeds
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
     chosen: int  # index of the kept seed
@@ -98,7 +98,9 @@ class Outcome:
     proof: Proof | str | None = None  # or the reason for which there is none
 
 
-def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | None = None) -> Setup:
+def prepare(
+    task: EnvironmentFile, seed: int, world: Environment | Dynamics | None = None
+) -> EnvironmentSetup:
     """The environment with its task and the learner; ValueError for a task that does not fit."""
     del seed
     loaded = load_world(task) if world is None else world
@@ -132,7 +134,7 @@ def prepare(task: EnvironmentFile, seed: int, world: Environment | Dynamics | No
     num_steps = checked_steps(environment, steps)
     with errors_in(f"{task.path}: [{task.learner.method}] "):
         method = make_method(task, environment, num_steps)
-    return Setup(task, automaton, environment, method, num_steps, trivial, dynamics)
+    return EnvironmentSetup(task, automaton, environment, method, num_steps, trivial, dynamics)
 
 
 def _reward(task: EnvironmentFile, automaton: Automaton) -> Record:
@@ -158,7 +160,7 @@ def _reward(task: EnvironmentFile, automaton: Automaton) -> Record:
     return {**reward_options, "shaping": shaping, "learner_discount": own}
 
 
-def describe(setup: Setup) -> str:
+def describe(setup: EnvironmentSetup) -> str:
     """Sizes of the environment, of learning and of the evaluation, as text."""
     task, environment = setup.task, setup.environment
     actions = environment.actions
@@ -190,7 +192,7 @@ def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     return {n: f"{np.nanmedian(metrics[n]):.3g}" for n in known[:2]}
 
 
-def learn(setup: Setup, training: Training) -> Outcome:
+def learn(setup: EnvironmentSetup, training: Training) -> EnvironmentOutcome:
     """Learns with N seeds, selects the best by separate episodes, and evaluates all of them."""
     method, seed, num_seeds = setup.method, training.seed, training.num_seeds
     parts = method.algorithm, method.problem, method.hparams
@@ -219,10 +221,10 @@ def learn(setup: Setup, training: Training) -> Outcome:
         for i in range(_DRAWN)
     ]
     proof = _proven(setup, states[chosen], training.stage)
-    return Outcome(setup, chunks.state, history, chosen, each, episodes, seed, proof)
+    return EnvironmentOutcome(setup, chunks.state, history, chosen, each, episodes, seed, proof)
 
 
-def _proven(setup: Setup, state: PyTree, say: Report) -> Proof | str | None:
+def _proven(setup: EnvironmentSetup, state: PyTree, say: Report) -> Proof | str | None:
     """The proof of the kept policy, without random actions; None in a simulator."""
     if setup.dynamics is None:
         return None
@@ -232,7 +234,7 @@ def _proven(setup: Setup, state: PyTree, say: Report) -> Proof | str | None:
         return str(reason)
 
 
-def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> Proof:
+def prove(setup: EnvironmentSetup, agent: Agent, formula: str, say: Report) -> Proof:
     """The certificate of an agent that was learned in dynamics, and a run if it is refuted."""
     assert setup.dynamics is not None
     table = setup.task.proof
@@ -247,11 +249,13 @@ def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> Proof:
     return Proof(certificate, run)
 
 
-def _acting(setup: Setup, state: PyTree) -> Agent:
+def _acting(setup: EnvironmentSetup, state: PyTree) -> Agent:
     return setup.method.agent(state, setup.acts == "likeliest")
 
 
-def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:
+def _evaluated(
+    key: jax.Array, agent: Agent, setup: EnvironmentSetup, *, threshold: bool
+) -> Evaluation:
     evaluation = setup.task.evaluation
     return evaluate(
         key,
@@ -273,7 +277,7 @@ def _unshaped(environment: Environment) -> Environment:
     )
 
 
-def _merit(setup: Setup, evaluation: Evaluation) -> tuple[float, float, float]:
+def _merit(setup: EnvironmentSetup, evaluation: Evaluation) -> tuple[float, float, float]:
     """Lexicographic criterion of seeds: verdicts, then accepting visits or length."""
     success, violation, visits = evaluation.success, evaluation.violation, evaluation.visits
     assert success is not None and violation is not None and visits is not None
@@ -287,7 +291,7 @@ def _merit(setup: Setup, evaluation: Evaluation) -> tuple[float, float, float]:
 # --- results ----------------------------------------------------------------------------------
 
 
-def summary(outcome: Outcome) -> Record:
+def summary(outcome: EnvironmentOutcome) -> Record:
     """The result as a JSON object."""
     setup, history = outcome.setup, outcome.history
     task, environment, evaluation = (
@@ -333,7 +337,7 @@ def summary(outcome: Outcome) -> Record:
     )
 
 
-def _transitions(outcome: Outcome) -> int:
+def _transitions(outcome: EnvironmentOutcome) -> int:
     """Simulated steps of a seed: the learner's count, or an upper bound."""
     counted = outcome.history.get("transitions")
     upper = outcome.setup.task.learner.steps * outcome.setup.method.transitions
@@ -348,18 +352,18 @@ def _as_numbers(evaluation: Evaluation) -> Record:
     }
 
 
-def _drawn(outcome: Outcome) -> list[str]:
+def _drawn(outcome: EnvironmentOutcome) -> list[str]:
     """Names of the scalar metrics with finite values."""
     metrics = ((name, outcome.history[name]) for name in outcome.setup.method.drawn)
     return [name for name, x in metrics if x.ndim == 2 and np.isfinite(x).any()]
 
 
-def task_pictures(setup: Setup) -> list[Picture]:
+def task_pictures(setup: EnvironmentSetup) -> list[Picture]:
     """Picture of the formula's automaton."""
     return [automaton_picture(setup.automaton, "")]
 
 
-def pictures(outcome: Outcome) -> list[Picture]:
+def pictures(outcome: EnvironmentOutcome) -> list[Picture]:
     """Pictures of learning curves and episodes."""
     drawings = [learning_picture(outcome.history, _caption(outcome), _drawn(outcome))]
     drawn = _pictured(outcome)
@@ -370,17 +374,17 @@ def pictures(outcome: Outcome) -> list[Picture]:
     return [proof_picture(proof, dynamics, outcome.episodes), *drawings]
 
 
-def live(outcome: Outcome) -> list[Curves]:
+def live(outcome: EnvironmentOutcome) -> list[Curves]:
     """Interactive learning curves."""
     names = _drawn(outcome)
     return [curves("learning", "Learning", _caption(outcome), outcome.history, names)]
 
 
-def _caption(outcome: Outcome) -> str:
+def _caption(outcome: EnvironmentOutcome) -> str:
     return "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
 
 
-def _pictured(outcome: Outcome) -> Picture | None:
+def _pictured(outcome: EnvironmentOutcome) -> Picture | None:
     """Some episodes, if the world has positions; drawn here, since its code is the user's."""
     # Deferred: matplotlib.
     from jaxltl.plot.episodes import draw_episodes
@@ -400,7 +404,7 @@ def _pictured(outcome: Outcome) -> Picture | None:
     )
 
 
-def save(out: Path, outcome: Outcome) -> None:
+def save(out: Path, outcome: EnvironmentOutcome) -> None:
     """Writes ``policy.npz`` and, if the world has positions, ``episode.html`` into a directory."""
     from jaxltl.plot.episodes import play_episode
 
@@ -425,7 +429,7 @@ def save(out: Path, outcome: Outcome) -> None:
         file.write(page.encode())
 
 
-def _parts(method: Method, state: PyTree) -> list[tuple[str, PyTree]]:
+def _parts(method: LearnerSetup, state: PyTree) -> list[tuple[str, PyTree]]:
     """Names and arrays of a state that determine a policy."""
     fields = {name: getattr(state, name) for name in method.policy_fields}
     leaves, _ = jax.tree_util.tree_flatten_with_path(fields)
@@ -460,7 +464,7 @@ def load_policy(
     policy_file: Path,
     environment: Environment | Dynamics | None = None,
     task_file: str | Path | None = None,
-) -> tuple[Setup, Agent]:
+) -> tuple[EnvironmentSetup, Agent]:
     """The task of a policy file, and its agent; see :func:`load_agent`."""
     arrays = read_policy_file(policy_file)
     task = EnvironmentFile.read(task_file) if task_file else _kept_task(policy_file, arrays)

@@ -16,7 +16,7 @@ from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file
-from jaxltl.app.files.worlds import grid_options, World
+from jaxltl.app.files.worlds import grid_options, MappedModel
 from jaxltl.app.job import about, automaton_picture, plain
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.drawing import drawing, Picture
@@ -45,11 +45,11 @@ _LIMIT = 8  # groundings of a robust policy
 
 
 @dataclass(frozen=True)
-class Setup:
+class GroundingSetup:
     """A task, ready for learning."""
 
     task: GroundingFile
-    worlds: list[World]  # W maps with demonstrations, then those of [test]
+    worlds: list[MappedModel]  # W maps with demonstrations, then those of [test]
     meaning: np.ndarray  # bool[M, W', S], candidate meanings in all of them
     names: tuple[str, ...]  # of the meanings
     problem: grounding.Problem
@@ -57,7 +57,7 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Answer:
+class GroundingAnswer:
     """Policies in a world under the most likely grounding, and the robust one."""
 
     model: Product
@@ -68,18 +68,18 @@ class Answer:
 
 
 @dataclass
-class Outcome:
+class GroundingOutcome:
     """The posterior and its answers."""
 
-    setup: Setup
+    setup: GroundingSetup
     posterior: grounding.Posterior
     members: np.ndarray  # rows of the credible set
     table: list[grounding.Row]
-    query: grounding.Query
-    answers: list[Answer]
+    query: grounding.LabelQuery
+    answers: list[GroundingAnswer]
 
 
-def prepare(task: GroundingFile, seed: int) -> Setup:
+def prepare(task: GroundingFile, seed: int) -> GroundingSetup:
     """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
     path = task.path
     maps = zip(map(map_file, task.maps), task.maps, strict=True)
@@ -91,7 +91,9 @@ def prepare(task: GroundingFile, seed: int) -> Setup:
             {str(kind) for text in texts for kind in np.unique(parse_map(text))} - {wall}
         )
         options.setdefault("legend", {kind: [] if kind == "." else [kind] for kind in kinds})
-        worlds = [World(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts]
+        worlds = [
+            MappedModel(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts
+        ]
     names, seen = _observations(task, worlds)
     count, hparams = len(task.world.maps), grounding.Hparams(discount=task.demonstrations.discount)
     demonstrations = _demonstrations(task, worlds[:count], seed)
@@ -111,11 +113,11 @@ def prepare(task: GroundingFile, seed: int) -> Setup:
             every = replace(problem, observation=jnp.asarray(wide))
             meaning = grounding.cluster_meanings(every, task.grounding.clusters)
             names = tuple(f"cluster {m + 1}" for m in range(len(meaning)))
-    return Setup(task, worlds, meaning, names, problem, hparams)
+    return GroundingSetup(task, worlds, meaning, names, problem, hparams)
 
 
 def _observations(
-    task: GroundingFile, worlds: list[World]
+    task: GroundingFile, worlds: list[MappedModel]
 ) -> tuple[tuple[str, ...], list[np.ndarray]]:
     """Names of the columns, and observations ``float[S, O]`` of each world."""
     files = task.grounding.observations
@@ -138,7 +140,9 @@ def _observations(
     return names, seen
 
 
-def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list[Trajectories]:
+def _demonstrations(
+    task: GroundingFile, worlds: list[MappedModel], seed: int
+) -> list[Trajectories]:
     """Demonstrations in each world, read or simulated with the hidden meanings."""
     table, trajectories = task.demonstrations, []
     if table.files is not None:
@@ -170,7 +174,7 @@ def _demonstrations(task: GroundingFile, worlds: list[World], seed: int) -> list
     return trajectories
 
 
-def describe(setup: Setup) -> str:
+def describe(setup: GroundingSetup) -> str:
     """Numbers of worlds, meanings and demonstrations, as text."""
     problem, tests = setup.problem, len(setup.worlds) - len(setup.problem.observation)
     return (
@@ -180,7 +184,7 @@ def describe(setup: Setup) -> str:
     )
 
 
-def learn(setup: Setup, training: Training) -> Outcome:
+def learn(setup: GroundingSetup, training: Training) -> GroundingOutcome:
     """Weighs the groundings, and certifies policies in all worlds."""
     task, problem, hparams = setup.task, setup.problem, setup.hparams
     count, size = problem.observation.shape[:2]
@@ -190,7 +194,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
         )
     training.stage("certifying")
     members = grounding.credible_set(posterior, task.grounding.level)
-    return Outcome(
+    return GroundingOutcome(
         setup,
         posterior,
         members,
@@ -200,12 +204,16 @@ def learn(setup: Setup, training: Training) -> Outcome:
     )
 
 
-def labels_of(setup: Setup, posterior: grounding.Posterior, row: int, w: int) -> np.ndarray:
+def labels_of(
+    setup: GroundingSetup, posterior: grounding.Posterior, row: int, w: int
+) -> np.ndarray:
     """``bool[S, P]``, the labels of a world by a row of the posterior."""
     return setup.meaning[posterior.assignment[row], w, : setup.worlds[w].mdp.num_states].T
 
 
-def _answer(setup: Setup, posterior: grounding.Posterior, members: np.ndarray, w: int) -> Answer:
+def _answer(
+    setup: GroundingSetup, posterior: grounding.Posterior, members: np.ndarray, w: int
+) -> GroundingAnswer:
     mdp, automaton = setup.worlds[w].mdp, setup.task.formula
     labels = [labels_of(setup, posterior, i, w) for i in members]
     model = product(grounding.with_labels(mdp, labels[0], posterior.symbols), automaton)
@@ -216,7 +224,9 @@ def _answer(setup: Setup, posterior: grounding.Posterior, members: np.ndarray, w
     robust = None
     if len(labels) > 1:
         robust = grounding.robust_policy(mdp, labels, posterior.symbols, automaton)
-    return Answer(model, policy, satisfaction_probability(model, policy), inside.best, robust)
+    return GroundingAnswer(
+        model, policy, satisfaction_probability(model, policy), inside.best, robust
+    )
 
 
 def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
@@ -224,14 +234,14 @@ def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     return {}
 
 
-def _mean(answer: Answer, solution: Solution) -> Record:
+def _mean(answer: GroundingAnswer, solution: Solution) -> Record:
     """A probability from the initial distribution, with its bounds."""
     parts = (solution.value, solution.lower, solution.upper)
     mean = enclosure(*(at_starts(answer.model, x, "mean")[0] for x in parts))
     return {**mean, "status": Status(int(solution.status)).name}
 
 
-def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
+def _steps(setup: GroundingSetup, row: grounding.Row) -> list[Record]:
     """The decisive steps of a symbol, with the numbers of maps and demonstrations from 1."""
     records, problem = [], setup.problem
     for n, t, gain in row.steps:
@@ -243,7 +253,7 @@ def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
     return records
 
 
-def summary(outcome: Outcome) -> Record:
+def summary(outcome: GroundingOutcome) -> Record:
     """The results for ``result.json``."""
     setup, posterior, query = outcome.setup, outcome.posterior, outcome.query
     task, problem, members = setup.task, setup.problem, outcome.members
@@ -287,7 +297,7 @@ def summary(outcome: Outcome) -> Record:
     return plain(result)
 
 
-def save(out: Path, outcome: Outcome) -> None:
+def save(out: Path, outcome: GroundingOutcome) -> None:
     """Writes ``policy_1.npz`` and so on, the policy in each world."""
     for path in [*out.glob("policy_*.npz"), *out.glob("map_*.svg")]:
         path.unlink()
@@ -297,13 +307,13 @@ def save(out: Path, outcome: Outcome) -> None:
         save_policy(out / f"policy_{w + 1}.npz", policy, bounds)
 
 
-def task_pictures(setup: Setup) -> list[Picture]:
+def task_pictures(setup: GroundingSetup) -> list[Picture]:
     """Picture of the formula's automaton."""
     automaton = jax.tree.map(lambda x: np.asarray(x)[0], setup.problem.model.automaton)
     return [automaton_picture(automaton, "")]
 
 
-def pictures(outcome: Outcome) -> list[Picture]:
+def pictures(outcome: GroundingOutcome) -> list[Picture]:
     """The grounding on each map: for each symbol the posterior probability of its label."""
     setup, posterior = outcome.setup, outcome.posterior
     heavy = np.flatnonzero(posterior.weight > 1e-9).tolist()
@@ -323,7 +333,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
     return drawn
 
 
-def live(outcome: Outcome) -> list[Explorer]:
+def live(outcome: GroundingOutcome) -> list[Explorer]:
     """There are no interactive parts."""
     return []
 

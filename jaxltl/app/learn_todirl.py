@@ -1,8 +1,7 @@
 """Task-oriented deep inverse reinforcement learning: the job of ``method = "todirl"``.
 
-A reward network is learned in the training worlds (dissertation, chapter 3). Its soft-optimal
-policies are compared there and in test worlds with an expert for the formula and the uniform
-policy.
+A reward network is learned in training worlds (dissertation, chapter 3). Its soft-optimal policies
+are compared there and in test worlds with an expert for the formula and the uniform policy.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from jax import lax
 
 from jaxltl.algos import todirl
 from jaxltl.algos.common import learner
-from jaxltl.algos.common.chunks import Options
+from jaxltl.algos.common.chunks import ChunkOptions
 from jaxltl.app.files.demonstrations import require_cosafe, synthetic_demonstrations
 from jaxltl.app.files.scenes import (
     cell_kinds,
     load_automata,
     load_demonstrations,
     load_scenes,
-    Scene,
+    ObservedScene,
 )
 from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.guarantee import (
@@ -48,12 +47,12 @@ from jaxltl.app.reports.learn_todirl import (
     task_pictures as task_pictures,
 )
 from jaxltl.app.todirl_results import (
-    Evaluation,
-    Learned,
+    WorldEvaluation,
+    LearnedRewards,
     LENGTH,
-    Outcome,
+    TodirlOutcome,
     part_of,
-    Setup,
+    TodirlSetup,
     summary as summary,
     Worlds,
 )
@@ -93,11 +92,10 @@ from jaxltl.io.learned_reward import LearnedReward, save_reward
 DOUBLE, FILE = True, TodirlFile
 
 _BATCH = 64  # worlds in a batch of planning
-
 _EXPERT_DISCOUNT = 0.99  # largest default
 
 
-def prepare(task: TodirlFile, seed: int) -> Setup:
+def prepare(task: TodirlFile, seed: int) -> TodirlSetup:
     """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
     automaton, memory = load_automata(task)
     table = task.demonstrations
@@ -134,7 +132,7 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
         expert = np.tile(
             expert, (1, 1, len(memory.delta), 1)
         )  # the formula's automaton state varies fastest
-    setup = Setup(
+    setup = TodirlSetup(
         task,
         automaton,
         memory,
@@ -159,7 +157,7 @@ def prepare(task: TodirlFile, seed: int) -> Setup:
     return _narrowed(setup)
 
 
-def _until_mistakes(setup: Setup) -> Setup:
+def _until_mistakes(setup: TodirlSetup) -> TodirlSetup:
     """Demonstrations until the formula is lost or, for "best", a mistake has left the best probability."""
     shortened, unused = list[Trajectories](), 0
     for w, each in enumerate(setup.demonstrations):
@@ -174,7 +172,7 @@ def _until_mistakes(setup: Setup) -> Setup:
     return replace(setup, demonstrations=shortened, unused=unused)
 
 
-def _narrowed(setup: Setup) -> Setup:
+def _narrowed(setup: TodirlSetup) -> TodirlSetup:
     """Restricts a setup to optimal actions, and counts the demonstrated steps that are not."""
     task, worlds, count = setup.task, setup.worlds, 0
     allowed = [np.asarray(one.allowed) for one in setup.optimal or ()]
@@ -189,7 +187,7 @@ def _narrowed(setup: Setup) -> Setup:
 
 
 def _experts(
-    task: TodirlFile, scenes: list[Scene], automaton: Automaton, *, soft: bool
+    task: TodirlFile, scenes: list[ObservedScene], automaton: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
     """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft-optimal."""
     if soft:
@@ -209,7 +207,7 @@ def _experts(
 
 
 def _stack(
-    task: TodirlFile, scenes: list[Scene], automaton: Automaton, memory: Automaton
+    task: TodirlFile, scenes: list[ObservedScene], automaton: Automaton, memory: Automaton
 ) -> Worlds:
     """Stacks all worlds, so that one program serves them."""
     mdps = [scene.mdp for scene in scenes]
@@ -220,7 +218,7 @@ def _stack(
     return Worlds(scenes, model, task_model, _observations(scenes, model))
 
 
-def _observations(scenes: list[Scene], model: Product) -> jax.Array:
+def _observations(scenes: list[ObservedScene], model: Product) -> jax.Array:
     size = model.mdp.num_states
     return jnp.asarray(
         np.stack(
@@ -232,7 +230,7 @@ def _observations(scenes: list[Scene], model: Product) -> jax.Array:
     )
 
 
-def describe(setup: Setup) -> str:
+def describe(setup: TodirlSetup) -> str:
     """Numbers of worlds, memory states and demonstrations, as text."""
     pairs = sum(int(np.sum(trajectories.length)) for trajectories in setup.demonstrations)
     number = sum(len(trajectories.length) for trajectories in setup.demonstrations)
@@ -243,7 +241,7 @@ def describe(setup: Setup) -> str:
     )
 
 
-def learn(setup: Setup, training: Training) -> Outcome:
+def learn(setup: TodirlSetup, training: Training) -> TodirlOutcome:
     """Learns with N seeds, keeps one without looking at test worlds, and evaluates it."""
     table = setup.task.learner
     network = todirl.RewardNetwork(tuple(table.hidden))
@@ -276,12 +274,12 @@ def learn(setup: Setup, training: Training) -> Outcome:
         learned, chosen = _weighed(setup, problem, hparams, lane, seed), 0
     training.stage("checking")
     evaluation = _evaluate(setup, learned, network, hparams, chosen)
-    return Outcome(setup, learned, chosen, evaluation, training.seed)
+    return TodirlOutcome(setup, learned, chosen, evaluation, training.seed)
 
 
 def _train(
-    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, training: Training
-) -> Learned:
+    setup: TodirlSetup, problem: todirl.Problem, hparams: todirl.Hparams, training: Training
+) -> LearnedRewards:
     """Reward networks of N seeds."""
     chunks, history = run_seeds(
         todirl,
@@ -289,12 +287,12 @@ def _train(
         hparams,
         training,
         num_steps=setup.task.learner.steps,
-        options=Options(until=learner.has_stopped),
+        options=ChunkOptions(until=learner.has_stopped),
     )
     states, best = chunks.state, chunks.state.best
     score = np.asarray(best.neg_log_likelihood)
     best_step = np.minimum(np.asarray(best.step), len(history["held_out"]) - 1)
-    return Learned(
+    return LearnedRewards(
         parameters=best.parameters,
         held_out=score
         if hparams.mu is None
@@ -308,7 +306,7 @@ def _train(
     )
 
 
-def _least_loss(learned: Learned) -> int:
+def _least_loss(learned: LearnedRewards) -> int:
     """The seed of greatest held-out likelihood, or of least loss."""
     score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
     loss = np.where(np.isfinite(learned.history["loss"][-1]), learned.history["loss"][-1], np.inf)
@@ -316,14 +314,18 @@ def _least_loss(learned: Learned) -> int:
 
 
 def _weighed(
-    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, free: Learned, seed: int
-) -> Learned:
+    setup: TodirlSetup,
+    problem: todirl.Problem,
+    hparams: todirl.Hparams,
+    free: LearnedRewards,
+    seed: int,
+) -> LearnedRewards:
     """The network of one seed with the best weight of the satisfaction probability."""
 
-    def train(mu: float) -> Learned:
+    def train(mu: float) -> LearnedRewards:
         return _train(setup, problem, replace(hparams, mu=mu), Training(seed, 1))
 
-    def plans(learned: Learned) -> tuple[np.ndarray, np.ndarray]:
+    def plans(learned: LearnedRewards) -> tuple[np.ndarray, np.ndarray]:
         parameters = part_of(learned.parameters, 0)
         count = setup.num_training
         return _plans(setup, problem.network, parameters, replace(hparams, mu=None), count)[:2]
@@ -334,12 +336,12 @@ def _weighed(
 
 
 def _evaluate(
-    setup: Setup,
-    learned: Learned,
+    setup: TodirlSetup,
+    learned: LearnedRewards,
     network: todirl.RewardNetwork,
     hparams: todirl.Hparams,
     chosen: int,
-) -> Evaluation:
+) -> WorldEvaluation:
     worlds, automaton = setup.worlds, setup.automaton
     performances, policies, codes = [], [], []
     details = dict[str, np.ndarray]()  # of the chosen seed
@@ -372,7 +374,7 @@ def _evaluate(
     available = model.mdp.available[:, :, None]
     blind = available / jnp.sum(available, axis=-1, keepdims=True)
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
-    return Evaluation(
+    return WorldEvaluation(
         **details,
         policy=np.asarray(policies[chosen]),
         status=np.asarray(codes[chosen]),
@@ -386,7 +388,7 @@ def _evaluate(
 
 
 def _plans(
-    setup: Setup, network: object, parameters: PyTree, hparams: todirl.Hparams, count: int
+    setup: TodirlSetup, network: object, parameters: PyTree, hparams: todirl.Hparams, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.optimal or ()])
@@ -440,7 +442,7 @@ def _probability(model: Product, policy: jax.Array, horizon: int | None) -> Perf
     return step_bounded_performances(model, policy)
 
 
-def save(out: Path, outcome: Outcome) -> None:
+def save(out: Path, outcome: TodirlOutcome) -> None:
     """Writes ``network.npz`` and, for each training world, ``policy_1.npz`` and so on.
 
     :func:`jaxltl.io.load_reward` reads the network, and :func:`jaxltl.io.load_policy` a policy, whose
@@ -464,7 +466,7 @@ def save(out: Path, outcome: Outcome) -> None:
         )
 
 
-def learned_reward(outcome: Outcome) -> LearnedReward:
+def learned_reward(outcome: TodirlOutcome) -> LearnedReward:
     """The kept seed's reward with the parameters of planning."""
     task, i = outcome.setup.task, outcome.chosen
     kinds = COLORS if task.is_colored else (*cell_kinds(task.world), "off the map")
@@ -492,7 +494,7 @@ _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, i
 _HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
 
 
-def check_attainable(setup: Setup) -> None:
+def check_attainable(setup: TodirlSetup) -> None:
     """Raises ValueError for a probability that no policy attains in a world that counts."""
     task, scenes = setup.task, setup.worlds.scenes
     for w, (scene, optimal) in enumerate(zip(scenes, setup.optimal or (), strict=True)):
@@ -514,7 +516,7 @@ def check_attainable(setup: Setup) -> None:
             ) from None
 
 
-def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
+def hold(setup: TodirlSetup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
     """Mixes plans ``[W, S, Q, A]`` of all actions and of optimal ones, in the first W worlds."""
     requested, over = float(setup.requested), setup.task.over
     return [
@@ -525,7 +527,7 @@ def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
     ]
 
 
-def step_bounds(setup: Setup) -> list[StepBound] | None:
+def step_bounds(setup: TodirlSetup) -> list[StepBound] | None:
     """The bounds on the expected steps in all worlds; None for safety formulas."""
     task, bounds = setup.task, []
     for w, (scene, best) in enumerate(zip(setup.worlds.scenes, setup.optimal or (), strict=True)):
@@ -540,7 +542,7 @@ def step_bounds(setup: Setup) -> list[StepBound] | None:
     return bounds
 
 
-def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> list[Mixture]:
+def within_steps(setup: TodirlSetup, bounds: list[StepBound], policy: np.ndarray) -> list[Mixture]:
     """The policies ``[W, S, Q, A]`` of all worlds with their expected steps within the bounds."""
     mixtures = []
     for w, bound in enumerate(bounds):
@@ -553,16 +555,16 @@ def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> l
 
 
 def likeliest(
-    setup: Setup,
+    setup: TodirlSetup,
     counts: np.ndarray,
-    free: Learned,
-    train: Callable[[float], Learned] | None,
-    plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
+    free: LearnedRewards,
+    train: Callable[[float], LearnedRewards] | None,
+    plans: Callable[[LearnedRewards], tuple[np.ndarray, np.ndarray]],
 ) -> Attempt:
     """The network of greatest likelihood over some weights."""
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
 
-    def attempt(learned: Learned, weight: float) -> Attempt:
+    def attempt(learned: LearnedRewards, weight: float) -> Attempt:
         policy, inside = plans(learned)
         held = np.stack([one.policy for one in hold(setup, policy, inside)])
         loss = neg_log_likelihood(held[:, : counts.shape[1]], counts)

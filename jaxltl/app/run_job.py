@@ -43,7 +43,7 @@ Drawn = Callable[[], bytes]  # waits for a picture
 
 
 @dataclass(frozen=True)
-class Options:
+class RunOptions:
     """Options of a run of a job."""
 
     out: Path | None  # directory of results; None for one named after the task
@@ -90,7 +90,7 @@ def check(task_file: Path) -> str:
         return job.describe(job.prepare(job.FILE.read(task_file), seed=0))
 
 
-def learn(task_file: Path, options: Options, console: Console) -> Finished | None:
+def learn(task_file: Path, options: RunOptions, console: Console) -> Finished | None:
     """Runs the job of a task file unless it is finished; None in all processes but the first."""
     group = console.group
     with group.together():
@@ -113,7 +113,7 @@ def learn(task_file: Path, options: Options, console: Console) -> Finished | Non
         )
         result = None if options.again else _finished(out, mark)
         before = group.sees(f"{out}/result.json", result is not None)
-        run = _Run(job, out, options, mark, console)
+        run = _JobRun(job, out, options, mark, console)
         result = result or run.interruptible(task)
     if not group.is_first or result is None:
         return None
@@ -201,12 +201,12 @@ def locked(out: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class _Run(Generic[T, S, O]):
+class _JobRun(Generic[T, S, O]):
     """A run of a job into a directory of results."""
 
     job: Job[T, S, O]
     out: Path
-    options: Options
+    options: RunOptions
     mark: str  # the job's fingerprint, which the checkpoint must have
     console: Console
 

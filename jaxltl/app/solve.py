@@ -45,7 +45,7 @@ SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
 
 
 @dataclass(frozen=True)
-class Query:
+class PropertyQuery:
     """A property of the command or of a file."""
 
     text: str  # as given
@@ -54,10 +54,10 @@ class Query:
 
 
 @dataclass(frozen=True)
-class Result:
+class PropertyResult:
     """The answer to a property."""
 
-    query: Query  # the property
+    query: PropertyQuery  # the property
     answer: AnyAnswer | None  # its answer, or None
     seconds: float  # wall time
     error: str | None = None  # why there is no answer, or None
@@ -77,7 +77,9 @@ class Result:
         return SOLVED if self.status == "CONVERGED" else NOT_CONVERGED
 
 
-def parse_queries(arguments: Sequence[str], definitions: Definitions | None = None) -> list[Query]:
+def parse_queries(
+    arguments: Sequence[str], definitions: Definitions | None = None
+) -> list[PropertyQuery]:
     """Parses arguments: properties, or names of property files; errors are kept by property."""
     queries = []
     for argument in arguments:
@@ -85,9 +87,9 @@ def parse_queries(arguments: Sequence[str], definitions: Definitions | None = No
         if argument.lower().endswith(PROPERTY_FILES):
             place, text = f"{argument}: ", _text_of(Path(argument))
         try:
-            queries += [Query(p.text, p) for p in parse_properties(text, definitions)]
+            queries += [PropertyQuery(p.text, p) for p in parse_properties(text, definitions)]
         except ValueError as error:
-            queries.append(Query(argument, error=f"{place}{error}"))
+            queries.append(PropertyQuery(argument, error=f"{place}{error}"))
     return queries
 
 
@@ -106,7 +108,7 @@ def _text_of(path: Path) -> str:
 
 def read_queries(
     path: Path, constants: str | None, arguments: Sequence[str], mesh: object = None
-) -> tuple[Program | None, list[Query]]:
+) -> tuple[Program | None, list[PropertyQuery]]:
     """The program, if the model file is one, and the properties; ValueError if none is well-formed."""
     program, definitions = _read_source(path, constants, arguments)
     if program is not None and mesh is not None:
@@ -156,7 +158,9 @@ def load(
 
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            model = build_model(program, max_states=max_states or MAX_STATES, progress=_Progress())
+            model = build_model(
+                program, max_states=max_states or MAX_STATES, progress=_ProgressPrinter()
+            )
         for warning in caught:
             print(f"warning: {warning.message}", file=sys.stderr, flush=True)
     if isinstance(model, Game):
@@ -172,7 +176,7 @@ def load(
     return model
 
 
-class _Progress:
+class _ProgressPrinter:
     """Prints the states of a long exploration, and the bounds so far, every few seconds."""
 
     def __init__(self) -> None:
@@ -188,11 +192,11 @@ class _Progress:
 
 def solve(
     model: SparseMDP | IntervalMDP | Program,
-    queries: Sequence[Query],
+    queries: Sequence[PropertyQuery],
     tolerance: float,
     max_states: int | None = None,
     relative: bool = False,
-) -> Iterator[Result]:
+) -> Iterator[PropertyResult]:
     """Yields the result of each property; of a program, some states are explored for each."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
@@ -208,17 +212,17 @@ def solve(
             method="partial",
             tolerance=tolerance,
             max_states=max_states or MAX_STATES,
-            report=_Progress(),
+            report=_ProgressPrinter(),
         )
 
     return answers(queries, answer)
 
 
 def answers(
-    queries: Sequence[Query],
+    queries: Sequence[PropertyQuery],
     answer: Callable[[Property], AnyAnswer],
     is_fatal: Callable[[Exception], bool] = lambda error: False,
-) -> Iterator[Result]:
+) -> Iterator[PropertyResult]:
     """Yields the result of each property in order; errors of one do not end the others."""
     for one in queries:
         begin = time.perf_counter()
@@ -235,7 +239,7 @@ def answers(
                 if not isinstance(failure, ValueError | NotConverged):
                     traceback.print_exc()  # a bug must not lose the other answers
                     error = f"{type(failure).__name__}: {error}"
-        yield Result(one, result, time.perf_counter() - begin, error, fault)
+        yield PropertyResult(one, result, time.perf_counter() - begin, error, fault)
 
 
 # --- output -----------------------------------------------------------------------------------
@@ -253,7 +257,7 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
     }
 
 
-def result_entry(result: Result) -> Record:
+def result_entry(result: PropertyResult) -> Record:
     """Answer to a property, as a JSON object."""
     answer = result.answer
     none = dict.fromkeys(("value", "lower", "upper"))
@@ -302,7 +306,7 @@ def _number(x: object) -> Any:
     return x + 0.0 if isinstance(x, float) else x  # no negative zero; JSON has no infinity
 
 
-def text(result: Result) -> str:
+def text(result: PropertyResult) -> str:
     """Answer to a property, as text."""
     values = {"result": result, "answer": result.answer, "vacuous": is_vacuous}
     lines = render("jaxltl.app.reports", "solve.txt", **values)
@@ -312,7 +316,9 @@ def text(result: Result) -> str:
 # --- strategies -------------------------------------------------------------------------------
 
 
-def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path) -> bytes:
+def strategies(
+    model: SparseMDP | IntervalMDP, results: Sequence[PropertyResult], source: Path
+) -> bytes:
     """The optimal strategies as JSON; see docs/solve.md."""
     entries = [
         {"property": r.query.text, **_strategy(model, r.answer.strategy)}

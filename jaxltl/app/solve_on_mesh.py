@@ -16,7 +16,7 @@ import jaxltl
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import ProcessGroup, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import Query, Result, answers, load
+from jaxltl.app.solve import PropertyQuery, PropertyResult, answers, load
 from jaxltl.core.logic import Formula, Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.models import IntervalMDP, ShardedMDP, SparseMDP, on_host, shard, to_mesh
@@ -49,7 +49,7 @@ def on_mesh(model: SparseMDP | IntervalMDP, group: ProcessGroup) -> ShardedMDP:
 
 
 def read(
-    path: Path, queries: Sequence[Query], group: ProcessGroup
+    path: Path, queries: Sequence[PropertyQuery], group: ProcessGroup
 ) -> tuple[ShardedMDP, dict[str, str], Record]:
     """Reads a model over the devices: UMB by states, unless properties use built-in labels."""
     begin, mesh = time.perf_counter(), group.mesh
@@ -120,7 +120,7 @@ class MeshSolver:
                     make_directory(directory)
             self.group.sees(str(directory), directory.is_dir())
 
-    def solve(self, queries: Sequence[Query]) -> Iterator[Result]:
+    def solve(self, queries: Sequence[PropertyQuery]) -> Iterator[PropertyResult]:
         """Yields the result of each property in order; errors of one do not end the others."""
         return answers(queries, self._answer, self._is_fatal)
 

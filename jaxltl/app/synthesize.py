@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.app.files.game import (
     GameFile,
     StrategyTable,
-    World,
+    MappedGame,
     automaton_of,
     load_game,
     load_objective,
@@ -41,7 +41,7 @@ STAGES = ("reading", "solving", "checking", "strategy", "writing")
 
 
 @dataclass(frozen=True)
-class Nodes:
+class GameNodes:
     """The product game that is solved, with its reachable states numbered."""
 
     # N nodes, reachable from any state of the world; the initial distribution is that of the game
@@ -66,7 +66,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Play:
+class EnvironmentPlay:
     """A play that the environment wins."""
 
     steps: list[Step]  # its positions in order
@@ -80,15 +80,15 @@ class Synthesis:
     """A solved game with its strategies and their independent checks."""
 
     file: GameFile  # file, world, nodes: the game
-    world: World
-    nodes: Nodes
+    world: MappedGame
+    nodes: GameNodes
     winning: Winning  # the region and both players' strategies, on the nodes
     verdict: Verification  # of the independent check of both strategies
     # a permissive strategy, or None if the system wins from no initial state
     strategy: Permissive | None
     restricted: Restriction | None  # the game under that strategy
     strategy_verdict: Verification | None  # of the independent check of that game
-    play: Play | None  # one that the environment wins from an initial state, or None
+    play: EnvironmentPlay | None  # one that the environment wins from an initial state, or None
     # bounds of the expected moves of both players until acceptance from any initial state: with the
     # system's moves drawn uniformly, as by the saved policy, and with any of the allowed ones
     moves: tuple[float, ...] | None
@@ -142,7 +142,7 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
     )
 
 
-def make_nodes(file: GameFile, world: World) -> Nodes:
+def make_nodes(file: GameFile, world: MappedGame) -> GameNodes:
     """The product game of a file's world and objective."""
     game, objective = load_objective(file, world)
     automaton = automaton_of(game)
@@ -160,7 +160,7 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
     number = np.asarray(reached.base_state) * memories + np.asarray(reached.memory)
     initial = jnp.asarray(game.initial).ravel()[number]
     explicit = reached.model
-    return Nodes(
+    return GameNodes(
         game=explicit.replace(mdp=explicit.mdp.replace(initial=initial)),
         objective=objective_at(objective, jnp.asarray(number)),
         world_state=origin[number] // width,
@@ -171,7 +171,7 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
     )
 
 
-def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) -> Verification:
+def check_strategy(nodes: GameNodes, strategy: Permissive, restricted: Restriction) -> Verification:
     """Independent check that the system wins with any choice of allowed moves."""
     game = restricted.model
     base = strategy.base_state[restricted.base_state]
@@ -188,7 +188,7 @@ def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) 
 
 
 def expected_moves(
-    nodes: Nodes, strategy: Permissive, restricted: Restriction
+    nodes: GameNodes, strategy: Permissive, restricted: Restriction
 ) -> tuple[float, ...] | None:
     """The bounds of ``Synthesis.moves``; None for other objectives than Buchi and reachability."""
     game, base = restricted.model, strategy.base_state[restricted.base_state]
@@ -208,7 +208,9 @@ def expected_moves(
 # --- a play that the environment wins -------------------------------------------------------
 
 
-def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...]) -> Play:
+def lost_play(
+    nodes: GameNodes, winning: Winning, node: int, actions: tuple[str, ...]
+) -> EnvironmentPlay:
     """Play from a node of the losing region, until a violation or a repetition.
 
     The system delays a certain violation as long as possible, else takes its first move; random
@@ -249,10 +251,10 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
         node = target
         steps.append(Step(node, mover, "" if mover == "chance" else actions[action]))
         if (node, memory) in met:
-            return Play(steps, met[node, memory], False, bool(by_chance))
+            return EnvironmentPlay(steps, met[node, memory], False, bool(by_chance))
         met[node, memory] = len(steps) - 1
     # The automaton reads labels on exit, so that the violation is decided one step earlier.
-    return Play(
+    return EnvironmentPlay(
         steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
     )
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from jaxltl.app.files.scenes import Scene
+from jaxltl.app.files.scenes import ObservedScene
 from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.guarantee import StepBound, front
 from jaxltl.app.job import about, plain
@@ -31,7 +31,7 @@ LENGTH = 100  # limit of a demonstration of a soft-optimal expert
 class Worlds:
     """Worlds, and their products with the learner's memory and with the formula."""
 
-    scenes: list[Scene]  # W worlds
+    scenes: list[ObservedScene]  # W worlds
     # their products with the learner's memory, stacked; with a guarantee, restricted to optimal
     # actions
     model: Product
@@ -49,7 +49,7 @@ def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
 
 
 @dataclass(frozen=True)
-class Setup:
+class TodirlSetup:
     """A task, ready for learning."""
 
     task: TodirlFile  # the file
@@ -88,7 +88,7 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedRewards:
     """Reward networks of N seeds."""
 
     parameters: PyTree  # of the network, leading axis N
@@ -101,7 +101,7 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class WorldEvaluation:
     """Policies in some worlds, and their satisfaction probabilities."""
 
     policy: np.ndarray  # float[W, S, Q, A] with the learner's memory, of the kept seed
@@ -118,17 +118,17 @@ class Evaluation:
 
 
 @dataclass
-class Outcome:
+class TodirlOutcome:
     """Learned rewards of all seeds and their evaluations."""
 
-    setup: Setup  # setup, learned: the task, and the results of learning
-    learned: Learned
+    setup: TodirlSetup  # setup, learned: the task, and the results of learning
+    learned: LearnedRewards
     chosen: int  # index of the kept seed, by held-out likelihood or loss
-    evaluation: Evaluation  # in all worlds
+    evaluation: WorldEvaluation  # in all worlds
     seed: int  # the first seed
 
 
-def counted_worlds(setup: Setup) -> np.ndarray:
+def counted_worlds(setup: TodirlSetup) -> np.ndarray:
     """Indices of the test worlds that count."""
     names = enumerate(setup.worlds.names)
     counted = [w for w, x in names if w >= setup.num_training and x not in setup.task.left_out]
@@ -138,7 +138,7 @@ def counted_worlds(setup: Setup) -> np.ndarray:
 # --- summary ---------------------------------------------------------------------------------
 
 
-def summary(outcome: Outcome) -> Record:
+def summary(outcome: TodirlOutcome) -> Record:
     """The result as a JSON object."""
     setup, task = outcome.setup, outcome.setup.task
     pairs = [int(np.sum(trajectories.length)) for trajectories in setup.demonstrations]
@@ -183,7 +183,7 @@ def summary(outcome: Outcome) -> Record:
     return plain(result)
 
 
-def _about_learning(outcome: Outcome) -> Record:
+def _about_learning(outcome: TodirlOutcome) -> Record:
     """The final figures and the history of the kept seed, and figures of all."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     history, seeds, counted = learned.history, outcome.evaluation.seeds, counted_worlds(setup)
@@ -214,7 +214,7 @@ def _about_learning(outcome: Outcome) -> Record:
     }
 
 
-def _about_worlds(outcome: Outcome, part: slice) -> Record:
+def _about_worlds(outcome: TodirlOutcome, part: slice) -> Record:
     setup, evaluation = outcome.setup, outcome.evaluation
     scenes, names = setup.worlds.scenes[part], setup.worlds.names[part]
     models = part_of(setup.worlds.task_model, part)
@@ -259,7 +259,7 @@ def _about_worlds(outcome: Outcome, part: slice) -> Record:
     return record
 
 
-def _about_world(scene: Scene, evaluation: Evaluation, w: int) -> Record:
+def _about_world(scene: ObservedScene, evaluation: WorldEvaluation, w: int) -> Record:
     one = part_of(evaluation.performance["learned"], w)
     record = {
         "name": scene.name,

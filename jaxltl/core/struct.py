@@ -28,14 +28,14 @@ ClassT = TypeVar("ClassT")
 _CODES = {"status": Status}
 
 
-class _Text:
+class _TextField:
     """Values of text fields, equal to all others, since programs are the same for all."""
 
     def __init__(self, values: tuple[object, ...]) -> None:
         self.values = values
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Text)
+        return isinstance(other, _TextField)
 
     def __hash__(self) -> int:
         return 0
@@ -60,7 +60,7 @@ def register(
         leaves, values, texts = (
             tuple(getattr(tree, name) for name in names) for names in (arrays, static, text)
         )
-        return leaves, (values, _Text(texts))
+        return leaves, (values, _TextField(texts))
 
     def flatten_with_keys(
         tree: ClassT,

@@ -86,7 +86,7 @@ def _made(env: object) -> Any:
     return getattr(env, "unwrapped", env)
 
 
-class _Table(NamedTuple):
+class _ChoiceTable(NamedTuple):
     """The choices of all states, and their branches."""
 
     num_states: int
@@ -99,7 +99,7 @@ class _Table(NamedTuple):
     terminated: np.ndarray
 
 
-def _read(env: object) -> _Table:
+def _read(env: object) -> _ChoiceTable:
     table, name = getattr(env, "P", None), type(env).__name__
     if not isinstance(table, Mapping) or not table or set(table) != set(range(len(table))):
         description = (
@@ -126,7 +126,7 @@ def _read(env: object) -> _Table:
             choices.append((s, int(a)))
     row, probability, successor, reward, terminated = zip(*branches, strict=True)
     state, action = zip(*choices, strict=True)
-    return _Table(
+    return _ChoiceTable(
         len(table), np.array(state), np.array(action), np.array(row), np.array(probability),
         np.array(successor), np.array(reward), np.array(terminated),
     )  # fmt: skip

@@ -69,7 +69,7 @@ def _wrapper() -> type:
         raise ValueError(
             'gymnasium_task needs the package gymnasium; pip install "jaxltl[gymnasium]".'
         ) from problem
-    kinds = (_Steps, gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs)
+    kinds = (_GymnasiumSteps, gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs)
     return type("TaskWrapper", kinds, {})
 
 
@@ -79,7 +79,7 @@ def __getattr__(name: str) -> type:
     raise AttributeError(f"module {__name__} has no attribute {name!r}")
 
 
-class _Steps:
+class _GymnasiumSteps:
     env: PyTree
     observation_space: PyTree
 

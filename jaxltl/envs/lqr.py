@@ -51,7 +51,7 @@ class LQR:
 
 
 @brief
-class Run(NamedTuple):
+class LqrRun(NamedTuple):
     """A trajectory of a policy; axes of lanes of parameters are last.
 
     `state` is ``float[N + 1, n]``, `control` ``float[N, m]``, `total` J, and `violation` the maximum
@@ -78,7 +78,7 @@ class Optimum(NamedTuple):
     residual: float
 
 
-class _Limits(TypedDict, total=False):
+class _ControlLimits(TypedDict, total=False):
     """Bounds of controls and the unit of the objective of :func:`lqr`, described there."""
 
     low: ArrayLike
@@ -94,7 +94,7 @@ def lqr(
     control_cost: ArrayLike = ((0.3,),),
     start: ArrayLike = (1, -1),
     horizon: int = 20,
-    **limits: Unpack[_Limits],
+    **limits: Unpack[_ControlLimits],
 ) -> LQR:
     """A regulator problem, equation (4.17); the defaults are the dissertation's.
 
@@ -182,7 +182,7 @@ def _evaluate(
     return -total / jnp.asarray(world.scale, total.dtype), violation
 
 
-def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
+def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> LqrRun:
     """The trajectories of one or many policies.
 
     Args:
@@ -197,7 +197,7 @@ def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
 
 
 @jax.jit
-def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
+def _simulate(network: Network, world: LQR, parameters: jax.Array) -> LqrRun:
     world = _as(world, parameters)
     start = _start(world, parameters)
 
@@ -206,7 +206,7 @@ def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
         return carry, (carry[0], control)
 
     (_, total, violation), (states, controls) = lax.scan(step, start, None, length=world.horizon)
-    return Run(jnp.concatenate([start[0][None], states]), controls, *_finished(total, violation))
+    return LqrRun(jnp.concatenate([start[0][None], states]), controls, *_finished(total, violation))
 
 
 def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:

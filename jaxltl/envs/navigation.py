@@ -91,7 +91,7 @@ class State(NamedTuple):
 
 
 @brief
-class Run(NamedTuple):
+class NavigationRun(NamedTuple):
     """Trajectories: `state`, and `action` ``float[M, N, 2]``, speed and turn as shares of the largest."""
 
     state: State
@@ -372,7 +372,7 @@ def simulate(
     *,
     num_trajectories: int = 10,
     absorbing: bool = False,
-) -> Run:
+) -> NavigationRun:
     """The trajectories of a policy; differentiable in its parameters.
 
     Args:
@@ -396,7 +396,7 @@ def simulate(
 @jax.jit  # so that calls outside of jit share one compilation
 def _simulate(
     network: Network, settings: struct.Static, world: Navigation, parameters: jax.Array, key: Key
-) -> Run:
+) -> NavigationRun:
     num_trajectories, absorbing = settings.value
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
     world, parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), (world, parameters))
@@ -412,7 +412,7 @@ def _simulate(
 
     first = start_states(world, key, (num_trajectories,), dtype)
     _, (states, actions) = lax.scan(step, first, None, length=world.horizon)
-    return Run(jax.tree.map(lambda x: x.T, states), jnp.moveaxis(actions, 0, 1))
+    return NavigationRun(jax.tree.map(lambda x: x.T, states), jnp.moveaxis(actions, 0, 1))
 
 
 def evaluator(
@@ -465,7 +465,9 @@ def _check_fits(world: Navigation, network: Network) -> None:
         )
 
 
-def _table_4(task: struct.Static, world: Navigation, run: Run) -> tuple[jax.Array, jax.Array]:
+def _table_4(
+    task: struct.Static, world: Navigation, run: NavigationRun
+) -> tuple[jax.Array, jax.Array]:
     return scores(world, run.state, task.value)
 
 

@@ -39,7 +39,7 @@ class Place(NamedTuple):
 
 
 @struct.dataclass
-class _Settings:
+class _StepSettings:
     """Settings; the task is traced, so that one compiled program serves all four."""
 
     task: jax.Array
@@ -76,7 +76,7 @@ def as_environment(
     """
     nav.check_task(task)
     stays = task == 1 if absorbing is None else validation.boolean("absorbing", absorbing)
-    settings = _Settings(
+    settings = _StepSettings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float))
     )
     reset, step, observe, labels = (
@@ -93,22 +93,22 @@ def as_environment(
     )
 
 
-def _reset(settings: _Settings, world: Navigation, key: Key) -> Place:
+def _reset(settings: _StepSettings, world: Navigation, key: Key) -> Place:
     state = nav.start_states(world, key, dtype=settings.dtype)
     no = jnp.bool_(False)
     return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no, jnp.int32(0))
 
 
-def _labels(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
+def _labels(settings: _StepSettings, world: Navigation, place: Place) -> jax.Array:
     return nav.labels(world, place.state)
 
 
-def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
+def _observe(settings: _StepSettings, world: Navigation, place: Place) -> jax.Array:
     return nav.observe(world, place.state)
 
 
 def _step(
-    settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: object
+    settings: _StepSettings, world: Navigation, place: Place, action: jax.Array, key: object
 ) -> Timestep:
     task, dtype = settings.task, settings.dtype
     in_goal, in_obstacle = nav.labels(world, place.state)

@@ -68,7 +68,7 @@ def robots(size: int) -> Game:
     )
 
 
-class _Reading(TypedDict, total=False):
+class _GridGameOptions(TypedDict, total=False):
     """Options of the map of :func:`grid_game`, described there."""
 
     legend: Mapping[str, Collection[str]] | None
@@ -83,7 +83,7 @@ def grid_game(
     slip: float = 0.0,
     system_stays: bool = True,
     environment_stays: bool = False,
-    **reading: Unpack[_Reading],
+    **reading: Unpack[_GridGameOptions],
 ) -> Game:
     """The game of two robots on a text map, in turns.
 
@@ -213,7 +213,7 @@ def reward_against_task() -> tuple[Game, jax.Array]:
 # --- one robot's moves, and two robots in turns -----------------------------------------------
 
 
-class _Moves(NamedTuple):
+class _RobotMoves(NamedTuple):
     """One robot's moves among C places: ``[C, A, K]``, ``[C, A, K]`` and ``[C, A]``."""
 
     target: np.ndarray
@@ -221,7 +221,7 @@ class _Moves(NamedTuple):
     available: np.ndarray
 
 
-def _moves(world: MDP, cells: np.ndarray) -> _Moves:
+def _moves(world: MDP, cells: np.ndarray) -> _RobotMoves:
     """Moves of a robot in a gridworld with staying; places are ``cells[0], ...``."""
     count = cells.size
     number = np.zeros(world.num_states, np.int32)
@@ -235,16 +235,16 @@ def _moves(world: MDP, cells: np.ndarray) -> _Moves:
     # Without slip the first successor is the cell ahead, the robot's own where that is blocked.
     available = target[:, :, 0] != own
     available[:, _STAY] = True
-    return _Moves(target, probability, available)
+    return _RobotMoves(target, probability, available)
 
 
-def _without_stay(moves: _Moves) -> _Moves:
+def _without_stay(moves: _RobotMoves) -> _RobotMoves:
     available = moves.available.copy()
     available[:, _STAY] = False
     return moves._replace(available=available)
 
 
-def _require_moves(player: str, moves: _Moves, position: np.ndarray) -> None:
+def _require_moves(player: str, moves: _RobotMoves, position: np.ndarray) -> None:
     stuck = np.flatnonzero(~moves.available.any(axis=1))
     if stuck.size:
         row, column = position[stuck[0]]
@@ -301,8 +301,8 @@ def _different(environment: np.ndarray, system: np.ndarray) -> np.ndarray:
 
 
 def _in_turns(
-    system: _Moves,
-    environment: _Moves,
+    system: _RobotMoves,
+    environment: _RobotMoves,
     *,
     position: np.ndarray,
     mark: np.ndarray,

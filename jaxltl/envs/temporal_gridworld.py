@@ -133,7 +133,7 @@ class Appearance(TypedDict, total=False):
     slip: float
 
 
-class _Grid(NamedTuple):
+class _CheckedAppearance(NamedTuple):
     """The validated :class:`Appearance` of a world, with a world of no kinds."""
 
     shape: tuple[int, int]
@@ -143,7 +143,7 @@ class _Grid(NamedTuple):
     blank: MDP
 
 
-def _grid(function: str, appearance: Appearance) -> _Grid:
+def _grid(function: str, appearance: Appearance) -> _CheckedAppearance:
     validation.keywords(function, appearance, Appearance)
     shape, margin = appearance.get("shape", (10, 10)), appearance.get("margin", 1)
     objects = appearance.get("objects", OBJECTS)
@@ -151,7 +151,9 @@ def _grid(function: str, appearance: Appearance) -> _Grid:
     validation.integer("margin", margin, least=1)
     if len(shape) != 2 or min(shape) < 1:
         raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
-    return _Grid(shape, kinds, len(objects), margin, _blank(shape, appearance.get("slip", 0.0)))
+    return _CheckedAppearance(
+        shape, kinds, len(objects), margin, _blank(shape, appearance.get("slip", 0.0))
+    )
 
 
 def make_world(

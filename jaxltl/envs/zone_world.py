@@ -57,7 +57,7 @@ class ZoneState(NamedTuple):
 
 
 @struct.dataclass
-class _Numbers:
+class _ZoneParameters:
     radius: np.float32
     extent: np.float32
     time_step: np.float32
@@ -128,7 +128,7 @@ def zone_world(
     places = draw_places(len(names) * zones, extent, num_maps, seed)
     thrust, drag = 0.3 * 0.05 / _MASS, 0.01 / _MASS
     values = (radius, extent, 0.02, thrust, saturation, drag, 0.3 / 0.095, 3.0, 0.5)
-    numbers = _Numbers(*map(np.float32, values))
+    numbers = _ZoneParameters(*map(np.float32, values))
     count = len(names) * _BINS + 11
     world = make_environment(
         Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
@@ -191,7 +191,7 @@ def _ahead(heading: jax.Array) -> jax.Array:
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
-def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: Key) -> Timestep:
+def _move(n: _ZoneParameters, world: ZoneState, action: jax.Array, key: Key) -> Timestep:
     action = jnp.clip(action, -1, 1).astype(jnp.float32)
     turning = jnp.clip(n.turn * action[1], -n.most_turn, n.most_turn)
     heading = world.heading + turning * n.time_step
@@ -220,7 +220,7 @@ def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
     )
 
 
-def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
+def _lidar(n: _ZoneParameters, world: ZoneState) -> jax.Array:
     """``float32[P, 16]``: lidar with bin i at the i-th sixteenth of a turn to the left."""
     seen = _own_frame(world.heading, world.zone - world.place)
     proximity = jnp.exp(-n.gain * jnp.linalg.norm(seen, axis=-1))
@@ -232,7 +232,7 @@ def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
     return (proximity[..., None] * share).max(axis=-2).astype(jnp.float32)
 
 
-def _see(n: _Numbers, world: ZoneState) -> jax.Array:
+def _see(n: _ZoneParameters, world: ZoneState) -> jax.Array:
     return jnp.concatenate(
         [
             _lidar(n, world).ravel(),
@@ -245,5 +245,5 @@ def _see(n: _Numbers, world: ZoneState) -> jax.Array:
     ).astype(jnp.float32)
 
 
-def _labels(n: _Numbers, world: ZoneState) -> jax.Array:
+def _labels(n: _ZoneParameters, world: ZoneState) -> jax.Array:
     return (jnp.sum((world.zone - world.place) ** 2, axis=-1) <= n.radius**2).any(axis=-1)

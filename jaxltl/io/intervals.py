@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxltl.core.models.interval import ROW_SUM_TOLERANCE
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.io.tokens import Block, Text, as_double, edges
+from jaxltl.io.tokens import TokenBlock, Text, as_double, edges
 
 EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
 _TO_BLANKS = bytes.maketrans(b"[,]", b"   ")
@@ -24,12 +24,12 @@ _REWARDS = re.compile(
 _POINT = re.compile(rb"\[([^\[\],]*),([^\[\],]*)\]")
 
 
-def has_bracket(block: Block, token: Integers) -> bool:
+def has_bracket(block: TokenBlock, token: Integers) -> bool:
     """True if any of the tokens starts with a bracket."""
     return bool((block.data[block.start[token]] == ord("[")).any())
 
 
-def joined_brackets(block: Block, column: int, lines: Booleans | None = None) -> Block:
+def joined_brackets(block: TokenBlock, column: int, lines: Booleans | None = None) -> TokenBlock:
     """Merges the tokens of each bracketed interval in a column; `lines` restricts the lines."""
     looked_at = block.count > column
     if lines is not None:
@@ -56,7 +56,7 @@ def joined_brackets(block: Block, column: int, lines: Booleans | None = None) ->
     return replace(block, start=block.start[outer], end=end[outer], first=first)
 
 
-def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
+def intervals(block: TokenBlock, token: Integers) -> tuple[Floats, Floats]:
     """Lower and upper bounds of tokens ``p`` or ``[l, u]``: ``float64[...]`` twice."""
     joined = block.joined(token)
     ends = (block.end[token] - block.start[token] + 1).cumsum()
@@ -70,7 +70,7 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     is_pair = joined[np.append(0, ends[:-1])] == ord("[")
     first = np.concatenate([[0], (1 + is_pair).cumsum()])
     line = block.line[np.searchsorted(block.first, token, "right") - 1]
-    numbers = Block(block.text, data, *edges(data), first, line)
+    numbers = TokenBlock(block.text, data, *edges(data), first, line)
     lower = numbers.floats(first[:-1], EXPECTED)
     upper = numbers.floats(first[1:] - 1, EXPECTED) if is_pair.any() else lower
     block.require(

@@ -26,7 +26,7 @@ Fields = tuple[str, ...]
 
 
 @dataclass(slots=True)
-class _Record:
+class _LogRecord:
     """Equal lines of a log: the first one, its count, and how often it occurs."""
 
     line: int
@@ -84,14 +84,14 @@ def read_log(
     if not isinstance(count, str):
         raise ValueError(f"count={validation.shorten(count)}; give the name of a column.")
     name, total = str(path), 0
-    record_of: dict[Fields, _Record] = {}
+    record_of: dict[Fields, _LogRecord] = {}
     for line, fields in read_columns(path, columns, count):
         if (record := record_of.get(fields)) is None:
             digits = fields[-1]
             if not _COUNT.fullmatch(digits) or int(digits) > _MAX_COUNT:
                 message = f"the count is {digits[:60]!r}; expected an integer from 0 to 2^53."
                 raise _error(name, line, message)
-            record = record_of[fields] = _Record(line, int(digits))
+            record = record_of[fields] = _LogRecord(line, int(digits))
         record.repeats += 1
         total += record.count
         if total > _MAX_COUNT:

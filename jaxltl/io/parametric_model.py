@@ -214,7 +214,7 @@ class ParametricModel:
         inside, model = point_inside(low, high, exact)
         states = np.repeat(np.arange(self.row_start.size - 1), np.diff(self.row_start))
         pairs = [(f.numerator, f.denominator) for f in self.functions]
-        numbers = _Numbers(
+        numbers = _ParametricNumbers(
             make_rationals(pairs, len(self.parameters)),
             function.astype(np.int32),
             None if new.all() else (new.cumsum() - 1).astype(np.int32),
@@ -238,7 +238,7 @@ class ParametricModel:
 
 
 @struct.dataclass
-class _Numbers:
+class _ParametricNumbers:
     """Probabilities and rewards as functions of the parameters."""
 
     functions: Rationals  # all functions

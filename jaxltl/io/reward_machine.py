@@ -73,14 +73,16 @@ def read_reward_machine(
     """
     is_text = isinstance(source, str) and "\n" in source
     place = "read_reward_machine" if is_text else str(source)
-    reader = _Reader(place, str(source) if is_text else read_text(source, "a reward machine"))
+    reader = _RewardMachineReader(
+        place, str(source) if is_text else read_text(source, "a reward machine")
+    )
     initial, terminal, transitions = reader.statements()
     names = tuple(sorted({name for x in transitions for name in x.guard.propositions}))
     alphabet = make_alphabet(names, letters, f"{place}: line {reader.last}")
     return _machine(initial, terminal, transitions, names, alphabet)
 
 
-class _Transition(NamedTuple):
+class _MachineTransition(NamedTuple):
     source: int
     target: int
     guard: Formula
@@ -97,7 +99,7 @@ _TRANSITION = re.compile(
 _NAME = re.compile(r"[A-Za-z_][\w.-]*", re.ASCII)
 
 
-class _Reader:
+class _RewardMachineReader:
     """Parser of reward machines; keeps non-empty lines with their numbers."""
 
     def __init__(self, place: str, text: str) -> None:
@@ -110,7 +112,7 @@ class _Reader:
     def error(self, line: int, message: str) -> ValueError:
         return ValueError(f"{self.place}, line {line}: {message}")
 
-    def statements(self) -> tuple[int, set[int], list[_Transition]]:
+    def statements(self) -> tuple[int, set[int], list[_MachineTransition]]:
         head = iter(self.lines)
         line, text = next(head, (self.last, ""))
         if not _STATE.fullmatch(text):
@@ -125,7 +127,7 @@ class _Reader:
             )
         return initial, {int(x) for x in _STATE.findall(text)}, [self._transition(*x) for x in head]
 
-    def _transition(self, line: int, text: str) -> _Transition:
+    def _transition(self, line: int, text: str) -> _MachineTransition:
         match = _TRANSITION.fullmatch(text)
         if match is None:
             raise self.error(
@@ -142,7 +144,7 @@ class _Reader:
         if not re.fullmatch(_NUMBER, number) or not np.isfinite(float(number)):
             raise self.error(line, f"the reward is {number[:40]!r}; expected a finite number.")
         guard = self._guard(line, single if double is None else double)
-        return _Transition(int(source), int(target), guard, float(number))
+        return _MachineTransition(int(source), int(target), guard, float(number))
 
     def _guard(self, line: int, text: str) -> Formula:
         if text not in self.guards:
@@ -166,7 +168,7 @@ def _quoted(name: str) -> str:
 
 
 def _machine(
-    initial: int, terminal: set[int], transitions: list[_Transition], names: tuple[str, ...],
+    initial: int, terminal: set[int], transitions: list[_MachineTransition], names: tuple[str, ...],
     alphabet: NDArray[np.bool_],
 ) -> RewardMachine:  # fmt: skip
     states = sorted({initial, *terminal, *[q for x in transitions for q in x[:2]]})

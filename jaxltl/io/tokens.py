@@ -48,7 +48,7 @@ class Text:
                 return content, line - 1, Text(self.name, self.data, place, self.stop, line)
         return b"", line, Text(self.name, self.data, self.stop, self.stop, line)
 
-    def blocks(self, comment: bytes) -> Iterator[Block]:
+    def blocks(self, comment: bytes) -> Iterator[TokenBlock]:
         """Blocks of lines, without empty lines and comment lines."""
         place, line = self.begin, self.line
         while place < self.stop:
@@ -65,7 +65,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Block:
+class TokenBlock:
     """Tokens of consecutive lines."""
 
     text: Text  # their source
@@ -244,7 +244,9 @@ def edges(data: NDArray[np.uint8]) -> tuple[Integers, Integers]:
     return edge[::2], edge[1::2]
 
 
-def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tuple[Block, int]:
+def _block(
+    text: Text, data: NDArray[np.uint8], line: int, comment: bytes
+) -> tuple[TokenBlock, int]:
     """Tokenizes a block; also returns its number of lines in the file."""
     if data[-1] > 32:
         data = np.append(data, np.uint8(10))
@@ -261,7 +263,7 @@ def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tu
         start, end, count = start[words], end[words], count[~skipped]
     numbers = line + of[first][~skipped].astype(np.int64)
     starts = np.concatenate([[0], count.cumsum()])
-    return Block(text, data, start, end, starts, numbers), int(is_end.sum())
+    return TokenBlock(text, data, start, end, starts, numbers), int(is_end.sum())
 
 
 def label_matrix(text: Text, num_states: int, num_labels: int) -> Booleans:

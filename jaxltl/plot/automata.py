@@ -73,7 +73,7 @@ def automaton(
 
 
 def draw_graph(
-    graph: drawing.Graph,
+    graph: drawing.GraphLayout,
     lines: Sequence[str],
     edge_color: Callable[[drawing.Key], str],
     label_color: Callable[[drawing.Key], str],

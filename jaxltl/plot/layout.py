@@ -48,7 +48,7 @@ class Label(NamedTuple):
     center: Points
 
 
-class Graph(NamedTuple):
+class GraphLayout(NamedTuple):
     """A drawing: positions ``float[Q, 2]``, curves, labels, and its width and height."""
 
     position: Points
@@ -57,7 +57,7 @@ class Graph(NamedTuple):
     size: tuple[float, float]
 
 
-class Box(NamedTuple):
+class Rectangle(NamedTuple):
     """An axis-parallel rectangle, by its centre and half its sides."""
 
     center: Points
@@ -86,7 +86,7 @@ def arrange(
     doomed: NDArray[np.bool_],
     texts: Mapping[Key, Rows],
     position: Points | None = None,
-) -> Graph:
+) -> GraphLayout:
     """The layout of a transition graph, with `doomed` states below the others."""
     texts = {key: _wrapped(rows) for key, rows in texts.items()}
     if position is None:
@@ -99,7 +99,7 @@ def arrange(
     wishes = {k: _along(_curve(position[k[0]], position[k[1]], 0)) for k in keys}
     placed: list[Points] = [position[initial] - [[RADIUS + 0.2, 0]]]
     edges: list[Edge] = []
-    boxes: list[Box] = []
+    boxes: list[Rectangle] = []
     labels: list[Label] = []
     for key in sorted(k for k in texts if k[0] == k[1]):
         # The self-loop of a sink has no information, and its label takes space.
@@ -158,14 +158,14 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
 
 
 def _framed(
-    position: Points, edges: list[Edge], labels: list[Label], boxes: list[Box], initial: int
-) -> Graph:
+    position: Points, edges: list[Edge], labels: list[Label], boxes: list[Rectangle], initial: int
+) -> GraphLayout:
     points = [position - RADIUS, position + RADIUS, position[[initial]] - [RADIUS + 0.42, 0]]
     points += [_along(e.curve) for e in edges]
     points += [np.array([b.center - b.half, b.center + b.half]) for b in boxes]
     low = np.min(np.concatenate(points), axis=0) - _MARGIN / 2
     high = np.max(np.concatenate(points), axis=0) + _MARGIN / 2
-    return Graph(
+    return GraphLayout(
         position - low,
         [e._replace(curve=e.curve - low) for e in edges],
         [label._replace(center=label.center - low) for label in labels],
@@ -275,7 +275,7 @@ def _best_curve(
     target: int,
     crowded: bool,
     placed: list[Points],
-    boxes: list[Box],
+    boxes: list[Rectangle],
 ) -> Points:
     bends = (
         (0.22, -0.22, 0.4, -0.4) if crowded else (0, 0.12, -0.12, 0.25, -0.25, 0.4, -0.4, 0.6, -0.6)
@@ -288,7 +288,7 @@ def _best_curve(
         points, close = _reachable(inside, 0.1, drawn, boxes)
         gap = np.min(_distances(inside, others), initial=np.inf)
         hits = np.sum(_distances(inside, points).min(axis=1, initial=np.inf) < 0.07)
-        hits += 4 * sum(Box(*box).holds(inside) for box in close)
+        hits += 4 * sum(Rectangle(*box).holds(inside) for box in close)
         return 60 * max(0, RADIUS + 0.14 - gap) + 0.25 * hits + 3 * abs(bend) + 0.01 * (bend < 0)
 
     return _curve(position[source], position[target], min(bends, key=cost))
@@ -309,14 +309,14 @@ def _curve(start: Points, end: Points, bend: float) -> Points:
 
 
 def _best_loop(
-    position: Points, q: int, rows: Rows, placed: list[Points], boxes: list[Box]
-) -> tuple[Points, Box]:
+    position: Points, q: int, rows: Rows, placed: list[Points], boxes: list[Rectangle]
+) -> tuple[Points, Rectangle]:
     half = label_size(rows) / 2
     drawn, others = np.concatenate(placed), np.delete(position, q, axis=0)
     reach = 4 * RADIUS + 2 * float(half.sum())
     drawn, close_boxes = _reachable(position[[q]], reach, drawn, boxes)
 
-    def candidate(angle: float) -> tuple[Points, Box]:
+    def candidate(angle: float) -> tuple[Points, Rectangle]:
         def rim(turn: float, reach: float) -> Points:
             return position[q] + reach * np.array([np.cos(angle + turn), np.sin(angle + turn)])
 
@@ -330,7 +330,7 @@ def _best_loop(
         )
         way = np.array([np.cos(angle), np.sin(angle)])
         tip = position[q] + 2.33 * RADIUS * way
-        return curve, Box(tip + way * (half * np.abs(way) + 0.06), half)
+        return curve, Rectangle(tip + way * (half * np.abs(way) + 0.06), half)
 
     at_rim = drawn[np.hypot(*(drawn - position[q]).T) < RADIUS + 0.12] - position[q]
     taken = np.arctan2(at_rim[:, 1], at_rim[:, 0])
@@ -351,8 +351,8 @@ def _best_loop(
 
 
 def _best_label(
-    position: Points, edge: Edge, rows: Rows, placed: list[Points], boxes: list[Box]
-) -> Box:
+    position: Points, edge: Edge, rows: Rows, placed: list[Points], boxes: list[Rectangle]
+) -> Rectangle:
     half = label_size(rows) / 2
     own = _along(edge.curve)
     drawn = np.concatenate([p for p in placed if not np.array_equal(p, own)])
@@ -363,7 +363,7 @@ def _best_label(
         normal = np.array([-along[1], along[0]]) / np.hypot(*along)
         clear = np.abs(normal) @ half + 0.05
         for shift in (0.0, clear, -clear, clear + 0.1, -clear - 0.1):
-            box = Box(own[i] + shift * normal, half)
+            box = Rectangle(own[i] + shift * normal, half)
             cost = _label_cost(box, position, drawn, close_boxes) + abs(i - 30) * 0.05
             # A label hides the line under it, so a position next to the line is better.
             cost += 6.0 if shift == 0 else 2.0 * box.holds(own) + 2.0 * (abs(shift) > clear)
@@ -374,18 +374,18 @@ def _best_label(
 
 
 def _reachable(
-    around: Points, reach: float, drawn: Points, boxes: list[Box]
+    around: Points, reach: float, drawn: Points, boxes: list[Rectangle]
 ) -> tuple[Points, Points]:
     """Of points and boxes, all that come so near to some points, for speed, and perhaps more."""
     low, high = around.min(axis=0) - reach, around.max(axis=0) + reach
-    region = Box((low + high) / 2, (high - low) / 2)
+    region = Rectangle((low + high) / 2, (high - low) / 2)
     inside = np.all(np.abs(drawn - region.center) < region.half, axis=1)
     stacked = np.array(boxes).reshape(-1, 2, 2)
     return drawn[inside], stacked[region.overlapped(stacked)]
 
 
-def _label_cost(box: Box, nodes: Points, drawn: Points, boxes: Points) -> float:
-    grown = Box(box.center, box.half + 0.03)
+def _label_cost(box: Rectangle, nodes: Points, drawn: Points, boxes: Points) -> float:
+    grown = Rectangle(box.center, box.half + 0.03)
     clashes = int(box.overlapped(boxes).sum())
     return 60 * box.num_within(nodes, RADIUS + 0.04) + 40 * clashes + 2.0 * grown.holds(drawn)
 

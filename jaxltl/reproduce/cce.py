@@ -31,7 +31,7 @@ LQR_SEEDS, SEEDS = 50, 5
 
 
 @dataclass(frozen=True)
-class Plan:
+class CceExperimentPlan:
     """Sizes of the experiment; the defaults are those of the command line."""
 
     networks: tuple[str, ...] = NETWORKS  # of the regulator
@@ -49,10 +49,13 @@ class Plan:
 
 @experiment
 def measure(
-    progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
+    progress: Callable[[str], None],
+    *,
+    seeds: int | None = None,
+    plan: CceExperimentPlan | None = None,
 ) -> Record:
     """Figures 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
-    plan = plan or Plan()
+    plan = plan or CceExperimentPlan()
     optimum = lqr.optimum(lqr.lqr())
     regulators = []
     for network in plan.networks:
@@ -116,7 +119,9 @@ def _keys(seeds: int, part: int) -> jax.Array:
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(i), part))(jnp.arange(seeds))
 
 
-def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple[Record, Record]:
+def _regulator(
+    name: str, seeds: int, plan: CceExperimentPlan, optimum: lqr.Optimum
+) -> tuple[Record, Record]:
     """A network's row, and its curves of figure 8."""
     world, network = lqr.lqr(), make_network(name)
     size = network.num_parameters
@@ -175,7 +180,7 @@ class Robot(NamedTuple):
     stepwise: tr.Problem
 
 
-class Search(NamedTuple):
+class MethodSearch(NamedTuple):
     """The learning curves ``[seeds, T]`` and final states of a method, perhaps not yet computed."""
 
     method: str
@@ -221,13 +226,17 @@ def _robot(task: int) -> Robot:
     return Robot(task, world, problem, hparams, environment, by_steps)
 
 
-def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.Array, jax.Array]:
+def _scores(
+    task: jax.Array, world: nav.Navigation, run: nav.NavigationRun
+) -> tuple[jax.Array, jax.Array]:
     """J and Z of a traced task, so that one compiled search serves all tasks."""
     every = [nav.scores(world, run.state, number) for number in nav.TASKS]
     return tuple(jnp.stack(part)[task - 1] for part in zip(*every, strict=True))  # type: ignore
 
 
-def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTree = None) -> Search:
+def _search(
+    robot: Robot, method: str, seeds: int, plan: CceExperimentPlan, pretrained: PyTree = None
+) -> MethodSearch:
     """A search by a method, from scratch or from pretrained distributions of policies."""
     keys = _keys(seeds, robot.task)
     num_steps, trust_steps = plan.steps, plan.trust_steps
@@ -236,7 +245,9 @@ def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTre
     if method == "CCE":
         state, metrics = _train(keys, robot.problem, robot.hparams, num_steps, pretrained)
         trajectories, cost = metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.cost[..., 0]
-        return Search(method, keys, trajectories, metrics.objective, cost, state, robot.hparams)
+        return MethodSearch(
+            method, keys, trajectories, metrics.objective, cost, state, robot.hparams
+        )
     hparams = replace(
         _TRUST,
         method="cpo" if method == "CPO" else "trpo",
@@ -247,7 +258,9 @@ def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTre
     if pretrained is not None:
         state = _imitate(state, robot, hparams, pretrained)
     state, metrics = _run(state, robot.stepwise, hparams, trust_steps)
-    return Search(method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
+    return MethodSearch(
+        method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams
+    )
 
 
 @partial(jax.jit, static_argnums=3)
@@ -297,7 +310,7 @@ def _episodes(
     return jax.vmap(lambda k: run_episode(k, environment, agent, num_steps=horizon))(keys)
 
 
-def _agents(robot: Robot, run: Search, plan: Plan) -> Iterator[Agent]:
+def _agents(robot: Robot, run: MethodSearch, plan: CceExperimentPlan) -> Iterator[Agent]:
     """The returned policy of each seed; if none is feasible, the one of the least violation."""
     act = network_agent(nav.policy_network(robot.world), robot.environment)
     for i, key in enumerate(run.keys):
@@ -316,7 +329,9 @@ def _agents(robot: Robot, run: Search, plan: Plan) -> Iterator[Agent]:
         yield act(least.parameters if result.solution is None else result.solution)
 
 
-def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Record, Record, Record]:
+def _evaluated(
+    robot: Robot, run: MethodSearch, plan: CceExperimentPlan
+) -> tuple[Record, Record, Record]:
     """A row, the learning curves, and trajectories of the first seed's policy."""
     limit = nav.LIMITS[robot.task]
     trajectories, objectives, costs = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxltl.algos import mlirl as irl
 from jaxltl.algos.common import learner
-from jaxltl.algos.common.chunks import Options, run_in_chunks
+from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
 from jaxltl.app.wording import Record
 from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.construct.restrict import restrict
@@ -91,7 +91,7 @@ def learn_cases(
         problem,
         hparams,
         num_steps=400,
-        options=Options(until=learner.gradient_vanishes(1e-6), keep="before", lanes=True),
+        options=ChunkOptions(until=learner.gradient_vanishes(1e-6), keep="before", lanes=True),
     )
     states, last = learned.state, jax.tree.map(lambda x: x[-1], learned.metrics)
     shape = (len(mus), len(STARTS))

@@ -30,7 +30,7 @@ _DISCOUNT = 0.95
 
 
 @dataclass(frozen=True)
-class Plan:
+class TodirlExperimentPlan:
     """Sizes of the experiment; the defaults are those of the command line."""
 
     methods: tuple[str, ...] = METHODS  # the learners
@@ -44,10 +44,13 @@ class Plan:
 
 @experiment
 def measure(
-    progress: Callable[[str], None], *, seeds: int | None = None, plan: Plan | None = None
+    progress: Callable[[str], None],
+    *,
+    seeds: int | None = None,
+    plan: TodirlExperimentPlan | None = None,
 ) -> Record:
     """Figures 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
-    plan, num_seeds = plan or Plan(), seeds or 10
+    plan, num_seeds = plan or TodirlExperimentPlan(), seeds or 10
     setting = _setting(num_seeds, plan)
     rows, drawn = [], []
     for method in plan.methods:
@@ -78,7 +81,7 @@ class Setting(NamedTuple):
     demonstrations: list[Trajectories]
 
 
-def _setting(num_seeds: int, plan: Plan) -> Setting:
+def _setting(num_seeds: int, plan: TodirlExperimentPlan) -> Setting:
     train = [grid.training_world(seed, margin=2) for seed in range(num_seeds)]
     test = grid.random_worlds(range(1000, 1000 + plan.test_worlds), margin=2)
     task = _automaton(grid.COMPLETE, train)
@@ -131,7 +134,7 @@ def _run(learner: Any, states: PyTree, problems: PyTree, hparams: PyTree, num_st
 
 
 def _learned(
-    setting: Setting, method: str, number: int, plan: Plan
+    setting: Setting, method: str, number: int, plan: TodirlExperimentPlan
 ) -> tuple[Record, Record | None]:
     """A row, and its learning curve for one number of demonstrations."""
     memory = setting.task

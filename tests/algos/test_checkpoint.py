@@ -12,7 +12,7 @@ import pytest
 
 from jaxltl.algos import behavioral_cloning
 from jaxltl.algos.common import checkpoint
-from jaxltl.algos.common.chunks import Options, run_in_chunks
+from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
 from jaxltl.core.files import atomic_write
 from tests.algos.test_learner import assert_bitwise, start, toy_init, toy_step
 
@@ -71,7 +71,12 @@ def test_states_of_another_run_are_refused(tmp_path):
         checkpoint.load(path, start("cce"))
     with pytest.raises(ValueError, match="Delete the file to start afresh"):
         run_in_chunks(
-            toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, options=Options(checkpoint=path)
+            toy_step,
+            start("toy"),
+            jnp.zeros(3),
+            0.1,
+            num_steps=3,
+            options=ChunkOptions(checkpoint=path),
         )
 
 

@@ -28,7 +28,7 @@ def written(path, array, cuts):
 def test_any_block_is_read_from_any_pieces(tmp_path, cuts):
     array = np.random.default_rng(0).normal(size=(7, 4))
     stored = written(tmp_path / "run.npz", array, cuts)
-    with parts._Parts(tmp_path / "run.npz") as found:
+    with parts._ArrayParts(tmp_path / "run.npz") as found:
         np.testing.assert_array_equal(found.read(stored), array)
         for a, b in itertools.combinations(range(8), 2):
             np.testing.assert_array_equal(found.read(stored, (slice(a, b),)), array[a:b])
@@ -42,7 +42,7 @@ def test_only_the_parts_that_are_needed_are_read(tmp_path):
     stored = written(tmp_path / "run.npz", array, ((2, 4), ()))
     (tmp_path / stored.pieces[0][2]).unlink()
     (tmp_path / stored.pieces[1][2]).write_bytes(b"PK of no use")
-    with parts._Parts(tmp_path / "run.npz") as found:
+    with parts._ArrayParts(tmp_path / "run.npz") as found:
         np.testing.assert_array_equal(found.read(stored, (slice(4, 6),)), array[4:])
         with pytest.raises(ValueError, match=r"its part 'run.npz.part-0-x' is missing"):
             found.read(stored)

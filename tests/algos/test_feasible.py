@@ -362,7 +362,7 @@ def test_the_script_of_the_page_runs(capsys):
 def forged(problem, points, values):
     """What a search that is wrong would say."""
     states = jax.vmap(lambda x: search.start_at(x, jax.random.key(0), problem, Hparams()))(points)
-    best = search.Best(points, values)
+    best = search.BestPoint(points, values)
     size = len(values)
     code = jnp.zeros(size, jnp.int32)
     metrics = search.Metrics(values, values, values, code)

@@ -24,7 +24,7 @@ import jaxltl as jl
 from jaxltl import algos
 from jaxltl.algos import mlirl
 from jaxltl.algos.common import checkpoint, learner, loops
-from jaxltl.algos.common.chunks import Options, run_in_chunks
+from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
 from jaxltl.core import struct
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import Status
@@ -459,7 +459,7 @@ def test_a_run_in_chunks_is_the_run():
         problem,
         hparams,
         num_steps=10,
-        options=Options(chunk=4, report=lambda done, row: reports.append((done, int(row.at)))),
+        options=ChunkOptions(chunk=4, report=lambda done, row: reports.append((done, int(row.at)))),
     )
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=10)
     assert_bitwise(found.state, whole)
@@ -475,7 +475,7 @@ def test_runs_side_by_side_in_chunks():
     module, problem, *_ = case("toy")
     given = np.array([0.1, 0.2, 0.3])
     chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9)
-    options = Options(
+    options = ChunkOptions(
         chunk=4,
         lanes=True,
         until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4),
@@ -508,7 +508,12 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
 
     def run(state, hparams, problem=problem, **options):
         return run_in_chunks(
-            module.step, state, problem, hparams, num_steps=6, options=Options(chunk=3, **options)
+            module.step,
+            state,
+            problem,
+            hparams,
+            num_steps=6,
+            options=ChunkOptions(chunk=3, **options),
         )
 
     with pytest.raises(KeyboardInterrupt):

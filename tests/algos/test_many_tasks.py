@@ -205,7 +205,7 @@ def test_what_is_worth_more_than_the_choice_has_been_is_taken_up():
 def one_state_plan():
     """Of an automaton with one state and one sequence."""
     reach = np.array([[[[False, True]]]])
-    return many_tasks.Plan(reach, ~reach, np.array([[1]], np.int32))
+    return many_tasks.SequencePlan(reach, ~reach, np.array([[1]], np.int32))
 
 
 def test_masks_are_kept():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxltl.algos.mlirl.constrained import Point, constrained_points
+from jaxltl.algos.mlirl.constrained import ConstrainedPoint, constrained_points
 
 
 def circle(x, *, broken=False):
@@ -11,7 +11,7 @@ def circle(x, *, broken=False):
     goal = np.array([2.0, 0.0])
     probability = np.exp(-x @ x)
     nan = np.nan if broken else 1.0
-    return Point(
+    return ConstrainedPoint(
         x,
         float((x - goal) @ (x - goal)) * nan,
         probability,

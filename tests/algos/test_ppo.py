@@ -342,7 +342,7 @@ def test_the_slope_of_the_loss_is_that_of_a_slow_one():
     weights, worth = rng.normal(size=(5, num)), rng.normal(size=5)
     problem = ppo.Problem(WALK.replace(actions=Finite(num)), (), Table(num))
     hparams = ppo.Hparams(discount=0.9, value_weight=0.7, entropy_weight=0.05, value_clip=0.1)
-    given = collecting.Rows(**{k: jnp.asarray(v) for k, v in rows.items()})
+    given = collecting.TransitionRows(**{k: jnp.asarray(v) for k, v in rows.items()})
     found, slope = jax.value_and_grad(lambda p: updating.loss(p, given, (), problem, hparams)[0])(
         {"scores": jnp.asarray(weights), "worth": jnp.asarray(worth)}
     )

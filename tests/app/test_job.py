@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.algos.common.chunks import Options
+from jaxltl.algos.common.chunks import ChunkOptions
 from jaxltl.app.job import run_seeds
 from jaxltl.app.protocols import Training
 from tests.algos.test_learner import case
@@ -28,7 +28,7 @@ def seeds():
     def run(seeds=3, num_steps=6, **options):
         training = Training(3, seeds, **options)
         return run_seeds(
-            module, problem, hparams, training, num_steps=num_steps, options=Options(chunk=2)
+            module, problem, hparams, training, num_steps=num_steps, options=ChunkOptions(chunk=2)
         )
 
     return run

@@ -114,7 +114,7 @@ def drawn(path, rng, scale):
         policy = weight / weight.sum(-1, keepdims=True)
         loss = np.array([neg_log_likelihood(policy, np.asarray(problem.counts))])
         zero, names = np.zeros(1), setup.features.names
-        return job.Learned(
+        return job.LearnedPolicies(
             policy=policy[None],
             weights=np.zeros((1, len(names))),
             names=names,

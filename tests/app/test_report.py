@@ -17,7 +17,7 @@ from jaxltl.app.reports.drawing import Picture, draw, drawing
 from jaxltl.app.reports.explorer import (
     START,
     Explorer,
-    Layer,
+    MapLayer,
     curves,
     demonstrated_runs,
     learned_runs,
@@ -65,8 +65,13 @@ def layers():
     value = np.linspace(0, 1, CELLS.size)
     moves = policy()
     return {
-        **{str(q): Layer(f"memory {q}", value if q else value[::-1], moves[:, q]) for q in (0, 1)},
-        START: Layer("where a run starts", np.where(np.arange(CELLS.size) == 8, 0.5, np.nan), None),
+        **{
+            str(q): MapLayer(f"memory {q}", value if q else value[::-1], moves[:, q])
+            for q in (0, 1)
+        },
+        START: MapLayer(
+            "where a run starts", np.where(np.arange(CELLS.size) == 8, 0.5, np.nan), None
+        ),
     }
 
 

@@ -6,7 +6,7 @@ import pytest
 import jaxltl as jl
 from benchmarks.required_probability import cases, write
 from jaxltl.app import learn as job
-from jaxltl.app.guarantee import Search
+from jaxltl.app.guarantee import GuaranteeSearch
 from jaxltl.app.protocols import Training
 from jaxltl.core.values.undiscounted import mixture
 from jaxltl.core.values.undiscounted.optimum import policy_reachability
@@ -45,7 +45,7 @@ def test_where_no_reward_attains_a_probability_none_is_searched(tmp_path):
     available = np.asarray(setup.model.available)
     uniform, counts = available / available.sum(-1, keepdims=True), np.zeros(available.shape)
     best = np.eye(available.shape[-1])[np.asarray(setup.guarantee.best.policy)]
-    search = Search(
+    search = GuaranteeSearch(
         setup.model,
         setup.guarantee,
         counts,

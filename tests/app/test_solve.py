@@ -350,7 +350,7 @@ def test_no_number_is_given_where_the_bounds_exclude_nothing(low, high):
     answer = module.Answer(
         np.zeros(1, int), *bounds, None, jaxltl.Status.PRECISION, "value iteration", None
     )
-    result = module.Result(query, answer, 0.0)
+    result = module.PropertyResult(query, answer, 0.0)
     text = module.text(result)
     assert "0.25" not in text and f"in [{low}, {high}]" in text and "PRECISION" in text
     assert module.result_entry(result)["value"] is None

@@ -442,7 +442,7 @@ def test_at_most_eight_files_pass_the_formula_on(write, tmp_path, monkeypatch):
 
     monkeypatch.setattr(sys.modules[product.__module__], "to_automaton", translate)
     package = files_that_handle(
-        lambda: run_job.learn(path, run_job.Options(tmp_path / "out", 0, 1), console),
+        lambda: run_job.learn(path, run_job.RunOptions(tmp_path / "out", 0, 1), console),
         lambda x: isinstance(x, File) or (isinstance(x, str) and x == formula),
         Translated,
     )

@@ -19,7 +19,7 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.io import files as _files
 from jaxltl.io.umb import umb
 from jaxltl.io.umb import values as _umb_values
-from jaxltl.io.umb.index import Record, Type, Variable
+from jaxltl.io.umb.index import Record, RecordVariable, Type
 from jaxltl.io.umb.members import members, tar_pieces, write_gzip
 from jaxltl.io.umb.umb import read_umb, write_umb
 from jaxltl.io.umb.values import read_numbers, read_variables
@@ -365,7 +365,7 @@ def test_variables_are_bits_at_any_place():
                 offset, values = None, None
             if values is not None:
                 expected[f"v{i}"] = values
-                variables.append(Variable(f"v{i}", Type(kind, size), offset, start, presence))
+                variables.append(RecordVariable(f"v{i}", Type(kind, size), offset, start, presence))
             start += size
         width = -(-start // 8)
         content = np.frombuffer(b"".join(x.to_bytes(width, "little") for x in records), np.uint8)

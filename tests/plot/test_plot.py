@@ -78,7 +78,7 @@ def test_an_automaton_is_drawn(formula):
 def test_labels_stand_clear_of_states_and_each_other(formula):
     table = to_automaton(formula)
     graph = arranged(table)
-    boxes = [drawing.Box(x.center, drawing.label_size(x.rows) / 2) for x in graph.labels]
+    boxes = [drawing.Rectangle(x.center, drawing.label_size(x.rows) / 2) for x in graph.labels]
     if len(table.delta) <= 5:  # in a dense graph a label may touch its neighbour
         for i, box in enumerate(boxes):
             assert not box.overlapped(np.array(boxes[:i]).reshape(-1, 2, 2)).any()

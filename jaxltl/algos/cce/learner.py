@@ -84,7 +84,7 @@ __all__ = [
     "Metrics",
     "Polynomial",
     "Problem",
-    "Result",
+    "SearchResult",
     "State",
     "assess",
     "init",
@@ -312,7 +312,7 @@ class Assessment:
 
 
 @brief
-class Result(NamedTuple):
+class SearchResult(NamedTuple):
     """The solution of a search, by fresh evaluations.
 
     Attributes:
@@ -396,8 +396,8 @@ def _moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def result(
     state: State, problem: Problem, hparams: Hparams, key: Key, *, num_evaluations: int = 1000
-) -> Result:
-    """The :class:`Result` of a search: the mean policy and the best sample on fresh evaluations.
+) -> SearchResult:
+    """The :class:`SearchResult` of a search: the mean policy and the best sample on fresh evaluations.
 
     On the host, of the `state`, `problem` and `hparams` of one run, with `num_evaluations` of each policy by
     keys of a fresh `key`.
@@ -442,7 +442,7 @@ def result(
             f"The {name} policy is feasible on {num_evaluations} fresh evaluations{sure}; its "
             f"objective is {float(both[name].objective):.6g}."
         )
-    return Result(
+    return SearchResult(
         None if name is None else both[name].parameters,
         name,
         both["mean"],

@@ -109,7 +109,7 @@ def dense(width: int, scale: float, name: str) -> nn.Dense:
     )
 
 
-class _Layers(nn.Module):
+class _HiddenLayers(nn.Module):
     """Hidden layers and a linear layer, orthogonal at initialisation."""
 
     hidden: Sequence[int]
@@ -171,7 +171,7 @@ def action_parameters(module: nn.Module, layer: Callable[[int], jax.Array]) -> P
 
 def _heads(module: nn.Module, x: jax.Array) -> tuple[PyTree, jax.Array]:
     """Action parameters and value, by two networks that share nothing."""
-    layers = partial(_Layers, tuple(module.hidden), activation=module.activation)
+    layers = partial(_HiddenLayers, tuple(module.hidden), activation=module.activation)
     actor = action_parameters(module, lambda n: layers(n, 0.01, name="actor")(x))
     return actor, layers(1, 1.0, name="critic")(x)[0]
 

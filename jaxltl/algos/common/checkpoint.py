@@ -92,7 +92,7 @@ def load(
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
         or other hyperparameters.
     """
-    with _Parts(path) as others:
+    with _ArrayParts(path) as others:
         try:
             # An open file of our own is closed even where a damaged archive is given up.
             with open(path, "rb") as file:
@@ -116,7 +116,7 @@ class _Another(Exception):
     """An array of another learner or problem."""
 
 
-def _loaded(path: str, name: str, leaf: PyTree, array: PyTree, others: _Parts) -> PyTree:
+def _loaded(path: str, name: str, leaf: PyTree, array: PyTree, others: _ArrayParts) -> PyTree:
     """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
     if array is None or not _fits(array, expected):
@@ -337,7 +337,7 @@ def _unlink(paths: list[Path]) -> None:
         path.unlink(missing_ok=True)
 
 
-class _Parts(contextlib.ExitStack):
+class _ArrayParts(contextlib.ExitStack):
     """The parts of a file, read on demand, each piece once, and closed in the end."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

@@ -35,7 +35,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import checkpoint as files
-from jaxltl.algos.common.loops import Progress, Step, Until, block_lengths, run_blocks
+from jaxltl.algos.common.loops import RunProgress, Step, Until, block_lengths, run_blocks
 from jaxltl.algos.common.settings import require_hparams
 from jaxltl.algos.common.trees import either, strong
 from jaxltl.core import validation
@@ -45,7 +45,7 @@ from jaxltl.core.models.ops.array_namespace import to_jax
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ChunkOptions:
     """Options of :func:`run_in_chunks`.
 
     Attributes:
@@ -98,7 +98,7 @@ def run_in_chunks(
     hparams: PyTree,
     *,
     num_steps: int,
-    options: Options = Options(),
+    options: ChunkOptions = ChunkOptions(),
 ) -> Chunks:
     """The :class:`Chunks` of steps in compiled chunks, with a report and a checkpoint after each.
 
@@ -152,13 +152,13 @@ def run_in_chunks(
 
 def _begin(
     step: Step, state: PyTree, problem: PyTree, hparams: PyTree, num_lanes: int | None
-) -> Progress:
+) -> RunProgress:
     """Progress before the first chunk, without compilation."""
     lanes = () if num_lanes is None else (num_lanes,)
     shape = _metrics_of(step, state, problem, hparams, num_lanes)
     metrics = jax.tree.map(lambda x: np.zeros((*lanes, *x.shape), x.dtype), shape)
     count = np.asarray(on_host(state.step), np.int32)
-    return Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
+    return RunProgress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
 
 
 def _metrics_of(
@@ -174,12 +174,12 @@ def _metrics_of(
 
 @cache  # compiled once for each step, so it must stay the same function
 def _progress_step(step: Step, keep: str) -> Step:
-    """A step of :class:`Progress`, with rows of counts and metrics."""
+    """A step of :class:`RunProgress`, with rows of counts and metrics."""
 
-    def one(now: Progress, problem: PyTree, settings: PyTree) -> tuple[Progress, PyTree]:
+    def one(now: RunProgress, problem: PyTree, settings: PyTree) -> tuple[RunProgress, PyTree]:
         hparams, until = settings
 
-        def go(now: Progress) -> Progress:
+        def go(now: RunProgress) -> RunProgress:
             after, metrics = step(now.state, problem, hparams)
             if until is None:
                 return replace(now, state=after, metrics=metrics)
@@ -196,11 +196,11 @@ def _progress_step(step: Step, keep: str) -> Step:
 
 @partial(jax.jit, static_argnames="step")
 def _run_lanes(
-    step: Step, now: Progress, problem: PyTree, settings: PyTree, lengths: np.ndarray
-) -> tuple[Progress, PyTree]:
+    step: Step, now: RunProgress, problem: PyTree, settings: PyTree, lengths: np.ndarray
+) -> tuple[RunProgress, PyTree]:
     """Blocks of steps of all lanes; the rows lie along the first axis."""
 
-    def run(now: Progress, hparams: PyTree) -> tuple[Progress, PyTree]:
+    def run(now: RunProgress, hparams: PyTree) -> tuple[RunProgress, PyTree]:
         return run_blocks(step, now, problem, (hparams, settings[1]), lengths)
 
     if len(now.count) > 1:

@@ -145,7 +145,7 @@ def run_until(
 
 
 @struct.dataclass
-class Progress:
+class RunProgress:
     """A run: `state` and `metrics` of the last step, `count` of steps, and `done`, the condition's value."""
 
     state: PyTree
@@ -174,12 +174,12 @@ def _loop(
     state: PyTree,
     arguments: tuple[PyTree, ...],
 ) -> Learned:
-    def active(carry: tuple[Progress, PyTree], arguments: tuple[PyTree, ...]) -> jax.Array:
+    def active(carry: tuple[RunProgress, PyTree], arguments: tuple[PyTree, ...]) -> jax.Array:
         return ~carry[0].done & (carry[0].count < arguments[-1])
 
     def body(
-        carry: tuple[Progress, PyTree], arguments: tuple[PyTree, ...]
-    ) -> tuple[Progress, PyTree]:
+        carry: tuple[RunProgress, PyTree], arguments: tuple[PyTree, ...]
+    ) -> tuple[RunProgress, PyTree]:
         going, (problem, hparams, until, _) = active(carry, arguments), arguments
         now, window = carry
         before = now.state if window is None else window
@@ -188,7 +188,7 @@ def _loop(
         due = number % check_every == 0
         done = due & jnp.asarray(until(before, after, metrics))
         last = choose(done, before, after) if keep == "before" else after
-        new = Progress(last, metrics, jnp.where(going, number, now.count), done & going)
+        new = RunProgress(last, metrics, jnp.where(going, number, now.count), done & going)
         if idle:  # the step left the state of a finished lane unchanged
             metrics = choose(going, metrics, now.metrics)
             new = replace(new, metrics=metrics, done=new.done | now.done)
@@ -198,7 +198,7 @@ def _loop(
 
     problem, hparams, *_ = arguments
     empty = _zero_metrics(step, state, problem, hparams, *([jnp.bool_(True)] if idle else []))
-    begin = Progress(state, empty, jnp.int32(0), jnp.bool_(False))
+    begin = RunProgress(state, empty, jnp.int32(0), jnp.bool_(False))
     end, _ = while_active(active, body, (begin, None if check_every == 1 else state), arguments)
     status = jnp.where(end.done, Status.COMPLETED, Status.MAX_STEPS).astype(jnp.int32)
     return Learned(

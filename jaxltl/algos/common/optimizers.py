@@ -92,7 +92,7 @@ class Point:
 
 
 @struct.dataclass
-class Search:
+class OptimizerSearch:
     """State of the search; `known` is True if the point was evaluated."""
 
     point: Point
@@ -118,13 +118,15 @@ def _directions() -> optax.GradientTransformation:
     return optax.scale_by_lbfgs(memory_size=_MEMORY)
 
 
-def start_search(parameters: PyTree, point: Point) -> Search:
+def start_search(parameters: PyTree, point: Point) -> OptimizerSearch:
     """The state before the first evaluation; `point` gives the shapes."""
     zero = optax.tree.zeros_like(parameters)
-    return Search(point, zero, strong(_directions().init(parameters)), jnp.bool_(False))
+    return OptimizerSearch(point, zero, strong(_directions().init(parameters)), jnp.bool_(False))
 
 
-def search_step(evaluate: Callable[[PyTree, Point], Point], search: Search) -> tuple[Search, Point]:
+def search_step(
+    evaluate: Callable[[PyTree, Point], Point], search: OptimizerSearch
+) -> tuple[OptimizerSearch, Point]:
     """One step of L-BFGS (Liu and Nocedal 1989) to a point that satisfies Wolfe's conditions.
 
     The step size is bracketed and bisected or doubled (Lewis and Overton 2013), which terminates
@@ -190,7 +192,7 @@ def search_step(evaluate: Callable[[PyTree, Point], Point], search: Search) -> t
     memory = either(
         fresh & ~jnp.isnan(new.loss), strong(_directions().init(new.parameters)), memory
     )
-    return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), end.base
+    return OptimizerSearch(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), end.base
 
 
 def _ahead(base: Point, direction: PyTree, size: jax.Array) -> PyTree:

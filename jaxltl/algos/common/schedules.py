@@ -91,7 +91,7 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 
 
 @brief
-class Condition(NamedTuple):
+class TheoremCondition(NamedTuple):
     """A condition of theorem 1: its `name`, `holds` (None if that is unknown), and the `reason`.
 
     >>> Condition("samples grow", False, "constant").holds
@@ -104,7 +104,7 @@ class Condition(NamedTuple):
 
 
 @brief
-class Conditions(NamedTuple):
+class TheoremConditions(NamedTuple):
     """Result of :func:`theorem_conditions`.
 
     Attributes:
@@ -116,7 +116,7 @@ class Conditions(NamedTuple):
 
     holds: bool | None
     failing: tuple[str, ...]
-    conditions: tuple[Condition, ...]
+    conditions: tuple[TheoremCondition, ...]
     assumed: tuple[str, ...]
 
 
@@ -130,8 +130,8 @@ _ASSUMED = (
 )
 
 
-def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Conditions:
-    """The :class:`Conditions` of theorem 1 (assumption 2b) on concrete `hparams` of ``cce``; on the host.
+def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> TheoremConditions:
+    """The :class:`TheoremConditions` of theorem 1 (assumption 2b) on concrete `hparams` of ``cce``; on the host.
 
     ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive, decreases to 0 and has an infinite
     sum; ``lambda_l = O(l^-lambda)`` with lambda > 0 and ``beta + 2 lambda > 1``; and the method is
@@ -149,12 +149,12 @@ def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Cond
         samples,
         *_rate_conditions(hparams.rate),
         share,
-        Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
-        Condition(
+        TheoremCondition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
+        TheoremCondition(
             "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"
         ),
         *(
-            Condition(
+            TheoremCondition(
                 f"no {name}", getattr(hparams, name) in (None, False), "not part of algorithm 2"
             )
             for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
@@ -162,7 +162,7 @@ def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Cond
     )
     failing = tuple(c.name for c in conditions if c.holds is False)
     unknown = any(c.holds is None for c in conditions)
-    return Conditions(
+    return TheoremConditions(
         False if failing else None if unknown else True, failing, conditions, _ASSUMED
     )
 
@@ -177,42 +177,44 @@ def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
 _FUNCTION = "it is a function with unknown limits"
 
 
-def _samples_condition(hparams: PyTree, num_steps: int | None) -> tuple[float | None, Condition]:
+def _samples_condition(
+    hparams: PyTree, num_steps: int | None
+) -> tuple[float | None, TheoremCondition]:
     name = "samples grow"
     if hparams.num_samples is None:
-        return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
+        return 0.0, TheoremCondition(name, False, f"n_l is always {hparams.population}")
     polynomial = _polynomial(hparams.num_samples)
     if polynomial is None:
-        return None, Condition(name, None, f"num_samples: {_FUNCTION}")
+        return None, TheoremCondition(name, None, f"num_samples: {_FUNCTION}")
     scale, power, offset = polynomial
     if not (scale > 0 and power > 0):
-        return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
+        return min(power, 0.0), TheoremCondition(name, False, f"n_l = {scale:g} l^{power:g}")
     full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + SLACK), 0)
     reason = f"n_l ~ l^{power:g} until step {full}, then population={hparams.population}"
-    return power, Condition(name, num_steps is not None and num_steps <= full, reason)
+    return power, TheoremCondition(name, num_steps is not None and num_steps <= full, reason)
 
 
-def _rate_conditions(rate: Schedule) -> list[Condition]:
+def _rate_conditions(rate: Schedule) -> list[TheoremCondition]:
     names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
     polynomial = _polynomial(rate)
     if polynomial is None:
-        return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
+        return [TheoremCondition(name, None, f"rate: {_FUNCTION}") for name in names]
     scale, power, offset = polynomial
     first = scale * (1 + offset) ** power if offset > -1 else math.nan
     decays = power < 0 and scale > 0
     holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
     reason = f"alpha_l = {scale:g} (l + {offset:g})^{power:g}"
-    return [Condition(name, held, reason) for name, held in zip(names, holds, strict=True)]
+    return [TheoremCondition(name, held, reason) for name, held in zip(names, holds, strict=True)]
 
 
-def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
+def _share_condition(share: Schedule) -> tuple[float | None, TheoremCondition]:
     name = "sample share decays"
     polynomial = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
     if polynomial is None:
-        return None, Condition(name, None, f"sample_share: {_FUNCTION}")
+        return None, TheoremCondition(name, None, f"sample_share: {_FUNCTION}")
     scale, power, offset = polynomial
     if scale == 0:  # of any order
-        return math.inf, Condition(name, True, "lambda_l = 0")
+        return math.inf, TheoremCondition(name, True, "lambda_l = 0")
     first = scale * (1 + offset) ** power if offset > -1 else math.nan
     reason = f"lambda_l = {scale:g} (l + {offset:g})^{power:g}"
-    return -power, Condition(name, power < 0 and 0 <= first <= 1, reason)
+    return -power, TheoremCondition(name, power < 0 and 0 <= first <= 1, reason)

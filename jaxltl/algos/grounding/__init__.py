@@ -2,7 +2,7 @@
 
 from jaxltl.algos.grounding import hidden_modes as hidden_modes
 from jaxltl.algos.grounding.answer import (
-    Query as Query,
+    LabelQuery as LabelQuery,
     RobustPolicy as RobustPolicy,
     Row as Row,
     best_query as best_query,
@@ -29,7 +29,7 @@ from jaxltl.algos.grounding.hypotheses import (
 )
 from jaxltl.algos.grounding.learner import (
     Metrics as Metrics,
-    Objective as Objective,
+    GroundingObjective as GroundingObjective,
     State as State,
     cluster_meanings as cluster_meanings,
     fit_labels as fit_labels,

@@ -79,7 +79,7 @@ class Row(NamedTuple):
     steps: tuple[tuple[int, int, float], ...]
 
 
-class Query(NamedTuple):
+class LabelQuery(NamedTuple):
     """A state with the label that gives most information about the grounding.
 
     Attributes:
@@ -162,8 +162,8 @@ def grounding_table(problem: Problem, hparams: Hparams, posterior: Posterior) ->
     return rows
 
 
-def best_query(posterior: Posterior) -> Query:
-    """The (first) state with the label that gives most information about the grounding, a :class:`Query`.
+def best_query(posterior: Posterior) -> LabelQuery:
+    """The (first) state with the label that gives most information about the grounding, a :class:`LabelQuery`.
 
     A grounding determines all labels, so that the mutual information of a state's label and the
     grounding is the entropy of the label under the `posterior`.
@@ -187,7 +187,7 @@ def best_query(posterior: Posterior) -> Query:
         if mass[code] > 0
     )
     information = max(entropy[inverse.ravel()[state]], 0.0)
-    return Query(state // num_states, state % num_states, information, labels)
+    return LabelQuery(state // num_states, state % num_states, information, labels)
 
 
 def robust_policy(

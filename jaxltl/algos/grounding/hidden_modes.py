@@ -289,7 +289,7 @@ _STRENGTHS = tuple(2.0**k for k in range(-1, 9))
 _LEAST = 1e-6  # probability: bounds the evidence of one table
 
 
-class _Level(NamedTuple):
+class _ContextLevel(NamedTuple):
     """Sorted codes of the contexts, their counts ``float[K + 1, A]``, the last row 0, and strengths."""
 
     keys: np.ndarray
@@ -308,7 +308,7 @@ class HistoryTables(NamedTuple):
     """
 
     world: MDP
-    chains: tuple[tuple[_Level, ...], ...]
+    chains: tuple[tuple[_ContextLevel, ...], ...]
     left_out: np.ndarray
 
     def evidence(self, demonstrations: Trajectories) -> np.ndarray:
@@ -345,8 +345,8 @@ def _evaluated(
     world: MDP,
     demonstrations: Trajectories,
     orders: list[int],
-    chains: tuple[tuple[_Level, ...], ...] = (),
-) -> tuple[tuple[tuple[_Level, ...], ...], np.ndarray]:
+    chains: tuple[tuple[_ContextLevel, ...], ...] = (),
+) -> tuple[tuple[tuple[_ContextLevel, ...], ...], np.ndarray]:
     """Levels and evidence; without levels they are fitted and each demonstration is left out."""
     require_states(demonstrations, world)
     mask, action = np.asarray(demonstrations.mask), np.asarray(demonstrations.action)
@@ -354,7 +354,7 @@ def _evaluated(
     width, base = world.num_actions, max(world.num_states, world.num_actions) + 1
     evidence, fitted = [], []
     for c, symbols in enumerate(_symbols(world, demonstrations, orders)):
-        levels: list[_Level] = []
+        levels: list[_ContextLevel] = []
         probability = available / available.sum(-1, keepdims=True)
         code = np.zeros_like(symbols[0])
         for k, symbol in enumerate(symbols):
@@ -366,7 +366,10 @@ def _evaluated(
                 level, own = chains[c][k], np.zeros((1, 1), np.int64)
             else:
                 counts = _counts(code[mask], action[mask], len(keys) + 1, width)
-                level, own = _Level(keys, counts, _STRENGTHS), _own(code, action, mask, width)
+                level, own = (
+                    _ContextLevel(keys, counts, _STRENGTHS),
+                    _own(code, action, mask, width),
+                )
             others, trials = (level.counts[code] - own), []
             for strength in level.strengths:
                 total = others.sum(-1, keepdims=True) + strength

@@ -98,7 +98,7 @@ class Metrics:
 
 
 @struct.dataclass
-class Objective:
+class GroundingObjective:
     """Terms of the loss.
 
     Attributes:
@@ -118,7 +118,7 @@ class Objective:
 
 def objective(
     parameters: PyTree, problem: Problem, hparams: Hparams
-) -> tuple[jax.Array, Objective]:
+) -> tuple[jax.Array, GroundingObjective]:
     """``-sum_n log sum_q prod_t pi(a_t | s_t, q_t) M(s_t, q_{t-1}, q_t) + penalties``.
 
     The loss ``float[]`` adds ``l2 / 2`` times the squared parameters of grounding and features and
@@ -143,7 +143,7 @@ def objective(
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(penalized))
     loss = -jnp.sum(log_likelihoods) + hparams.l2 / 2 * squares
     loss += hparams.entropy_weight * jnp.sum(problem.length) * entropy
-    parts = Objective(
+    parts = GroundingObjective(
         log_likelihood=log_likelihoods,
         entropy=entropy,
         policy=jnp.exp(log_policy),

@@ -16,7 +16,7 @@ _PRECISION = 1e-10  # of the loss, at which SLSQP has converged
 
 
 @dataclass(frozen=True)
-class Point:
+class ConstrainedPoint:
     """Evaluated parameters ``float[F]``."""
 
     parameters: np.ndarray
@@ -49,16 +49,16 @@ class _BudgetSpent(Exception):
 
 
 def constrained_points(
-    evaluate: Callable[[np.ndarray], Point],
+    evaluate: Callable[[np.ndarray], ConstrainedPoint],
     starts: Sequence[np.ndarray],
     required: float,
     max_evaluations: int,
-) -> list[Point]:
+) -> list[ConstrainedPoint]:
     """Points of SLSQP (Kraft 1988) from several starts, by at most `max_evaluations` evaluations.
 
     The last start gets the evaluations that earlier ones leave.
     """
-    points: list[Point] = []
+    points: list[ConstrainedPoint] = []
     for i, start in enumerate(starts):
         budget = max_evaluations * (i + 1) // len(starts) - len(points)
         points += _search(evaluate, np.asarray(start, float), required, budget)
@@ -66,12 +66,15 @@ def constrained_points(
 
 
 def _search(
-    evaluate: Callable[[np.ndarray], Point], start: np.ndarray, required: float, budget: int
-) -> list[Point]:
+    evaluate: Callable[[np.ndarray], ConstrainedPoint],
+    start: np.ndarray,
+    required: float,
+    budget: int,
+) -> list[ConstrainedPoint]:
     """The points that SLSQP evaluates from one start."""
-    known: dict[bytes, Point] = {}
+    known: dict[bytes, ConstrainedPoint] = {}
 
-    def at(x: np.ndarray) -> Point:
+    def at(x: np.ndarray) -> ConstrainedPoint:
         key = x.tobytes()
         if key not in known:
             if len(known) >= budget:

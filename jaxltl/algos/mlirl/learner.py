@@ -65,7 +65,7 @@ __all__ = [
     "Features",
     "Hparams",
     "Metrics",
-    "Objective",
+    "MlirlObjective",
     "Problem",
     "Reward",
     "State",
@@ -179,7 +179,7 @@ class Metrics:
 
 
 @struct.dataclass
-class Objective:
+class MlirlObjective:
     """Terms of the loss.
 
     Attributes:
@@ -275,10 +275,10 @@ def _solve(
 
 def objective(
     parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
-) -> tuple[jax.Array, Objective]:
+) -> tuple[jax.Array, MlirlObjective]:
     """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
 
-    The loss ``float[]`` and :class:`Objective`, for `parameters`, `problem`, `hparams` and `initial` as in
+    The loss ``float[]`` and :class:`MlirlObjective`, for `parameters`, `problem`, `hparams` and `initial` as in
     :func:`solve`. Differentiable in the parameters: exactly, or as in (2.7) with the policy held
     constant in the Bellman equation.
 
@@ -305,7 +305,7 @@ def objective(
         # enough that its equation is solved.
         solved = attained.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
         status = worst(status, jnp.where(solved, Status.CONVERGED, attained.status))
-    parts = Objective(
+    parts = MlirlObjective(
         neg_log_likelihood=-log_likelihood,
         satisfaction=satisfaction,
         value=solution.value,
@@ -323,7 +323,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     if hparams.optimizer == "lbfgs":
         # A placeholder, of which only the shapes are read.
         zero = jnp.zeros((), value.dtype)
-        parts = Objective(
+        parts = MlirlObjective(
             neg_log_likelihood=zero, satisfaction=zero, value=value, status=jnp.int32(0)
         )
         optimizer = optimizers.start_search(
@@ -373,7 +373,7 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
     return State(state.key, state.step + 1, parameters, value, optimizer), metrics
 
 
-def _usable(parts: Objective) -> jax.Array:
+def _usable(parts: MlirlObjective) -> jax.Array:
     """The value, or zero if its solve failed, as the initial value of the next solve."""
     return jnp.where(parts.status < Status.NONFINITE, parts.value, 0)
 

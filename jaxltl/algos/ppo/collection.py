@@ -171,7 +171,7 @@ class Metrics:
     status: jax.Array
 
 
-class Rows(NamedTuple):
+class TransitionRows(NamedTuple):
     """Transitions ``[T, N, ...]``, flattened, or a minibatch; observations are normalised."""
 
     observation: PyTree
@@ -190,7 +190,7 @@ def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
     return trees.choose(fine, new, moments)
 
 
-class _Record(NamedTuple):
+class _TransitionRecord(NamedTuple):
     """Records of the transitions, ``[T, N, ...]``, and figures of their episodes so far."""
 
     of: Transition
@@ -208,7 +208,7 @@ def evaluate(run: tuple[Problem, PyTree, PyTree], memory: PyTree, observation: P
 
 def collected(
     key: Key, state: State, problem: Problem, hparams: Hparams
-) -> tuple[State, PyTree, Rows, dict[str, jax.Array]]:
+) -> tuple[State, PyTree, TransitionRows, dict[str, jax.Array]]:
     """T transitions of N environments: the next state, initial memories, transitions, and figures."""
     walkers, record = _walked(key, state, problem, hparams)
     path = record.of
@@ -230,7 +230,9 @@ def collected(
         reward, value, following, discount, hparams.gae_lambda, ended
     )
     seen = normalized(state.moments, path.observation)
-    rows = Rows(seen, record.start, path.allowed, path.raw, path.log_density, value, advantage)
+    rows = TransitionRows(
+        seen, record.start, path.allowed, path.raw, path.log_density, value, advantage
+    )
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
     variance = jnp.var(advantage + value)
@@ -250,7 +252,9 @@ def collected(
     return after, state.walkers.memory, rows, figures
 
 
-def _walked(key: Key, state: State, problem: Problem, hparams: Hparams) -> tuple[Walkers, _Record]:
+def _walked(
+    key: Key, state: State, problem: Problem, hparams: Hparams
+) -> tuple[Walkers, _TransitionRecord]:
     environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
     noise_key, move_key, reset_key = jax.random.split(key, 3)
     dtype = state.walkers.discounted.dtype
@@ -274,17 +278,17 @@ def _walk(
     step: PyTree,
     *,
     sharding: NamedSharding | None,
-) -> tuple[Walkers, _Record]:
+) -> tuple[Walkers, _TransitionRecord]:
     """Transitions of all environments, or of one device's."""
     run, hparams, pool = step
     problem, environment = run[0], run[0].environment
 
-    def one(walker: Walkers, noise: jax.Array, key: Key) -> tuple[Walkers, _Record]:
+    def one(walker: Walkers, noise: jax.Array, key: Key) -> tuple[Walkers, _TransitionRecord]:
         before = (walker.world, walker.memory)
         world, memory, record = transition(
             environment, partial(evaluate, run), hparams.squash, before, noise, key
         )
-        row = _Record(
+        row = _TransitionRecord(
             of=record,
             start=walker.episode_length == 0,
             episode_return=walker.episode_return + record.reward,
@@ -293,7 +297,7 @@ def _walk(
         )
         return replace(walker, world=world, memory=memory), row
 
-    def following(walker: Walkers, fresh: PyTree, row: _Record) -> Walkers:
+    def following(walker: Walkers, fresh: PyTree, row: _TransitionRecord) -> Walkers:
         """The environment before its next transition, restarted at the end of an episode."""
         discount = jnp.asarray(hparams.discount * row.of.discount, row.discounted.dtype)
         figures = (row.episode_return, row.episode_length, discount * row.discounted)

@@ -74,7 +74,7 @@ from jaxltl.algos.ppo.collection import (
     Hparams,
     Metrics,
     Problem,
-    Rows,
+    TransitionRows,
     State,
     Walkers,
     collected,
@@ -280,7 +280,7 @@ def descent(hparams: Hparams) -> optax.GradientTransformation:
 
 def loss(
     parameters: PyTree,
-    rows: Rows,
+    rows: TransitionRows,
     begun: PyTree,
     problem: Problem,
     hparams: Hparams,
@@ -323,7 +323,7 @@ def loss(
     }
 
 
-def _said(parameters: PyTree, rows: Rows, begun: PyTree, problem: Problem) -> Output:
+def _said(parameters: PyTree, rows: TransitionRows, begun: PyTree, problem: Problem) -> Output:
     say = jax.vmap(partial(evaluated, problem, parameters))
     if not has_memory(problem):
         return say((), rows.observation)
@@ -338,7 +338,7 @@ def _said(parameters: PyTree, rows: Rows, begun: PyTree, problem: Problem) -> Ou
 
 
 def improved(
-    key: Key, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
+    key: Key, state: State, rows: TransitionRows, begun: PyTree, problem: Problem, hparams: Hparams
 ) -> tuple[PyTree, PyTree, Figures]:
     """Parameters and optimiser state after the epochs, up to `target_kl`, and mean figures."""
     recurrent, over = has_memory(problem), hparams.sharding

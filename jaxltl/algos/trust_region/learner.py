@@ -70,9 +70,9 @@ from jaxltl.algos.common.moments import Moments, no_moments, scale_of, updated_m
 from jaxltl.algos.common.settings import applied, require_own
 from jaxltl.algos.trust_region.policies import (
     METHODS,
-    Batch,
+    TrajectoryBatch,
     Hparams,
-    Network,
+    TanhNetwork,
     Problem,
     State,
     act,
@@ -92,11 +92,11 @@ from jaxltl.core.environments.environment import require_key, some_action
 
 __all__ = [
     "METHODS",
-    "Batch",
     "Hparams",
     "Metrics",
     "Problem",
     "State",
+    "TrajectoryBatch",
     "act",
     "greedy",
     "init",
@@ -242,8 +242,8 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 # --- values -----------------------------------------------------------------------------------
 
 
-def _value_network(hparams: Hparams, dtype: jax.typing.DTypeLike) -> Network:
-    return Network(hparams.value_hidden, 1, 0.1, dtype)
+def _value_network(hparams: Hparams, dtype: jax.typing.DTypeLike) -> TanhNetwork:
+    return TanhNetwork(hparams.value_hidden, 1, 0.1, dtype)
 
 
 def values_at(values: PyTree, hparams: Hparams, inputs: jax.Array) -> jax.Array:
@@ -260,7 +260,7 @@ def value_inputs(inputs: jax.Array) -> jax.Array:
 
 
 def _estimated(
-    state: State, batch: Batch, inputs: jax.Array, hparams: Hparams
+    state: State, batch: TrajectoryBatch, inputs: jax.Array, hparams: Hparams
 ) -> tuple[jax.Array, jax.Array]:
     """Values and advantages ``float[V, T, N]``."""
     mean, deviation = state.value_moments[..., None, None]
@@ -342,7 +342,7 @@ def _moments(x: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _improved(
     parameters: PyTree,
-    batch: Batch,
+    batch: TrajectoryBatch,
     inputs: jax.Array,
     advantage: jax.Array,
     problem: Problem,

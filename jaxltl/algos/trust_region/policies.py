@@ -178,7 +178,7 @@ class State(RunState):
 # --- the policy -------------------------------------------------------------------------------
 
 
-class Network(nn.Module):
+class TanhNetwork(nn.Module):
     """Tanh layers and a linear layer, initialised at `last_scale` times the usual scale."""
 
     hidden: tuple[int, ...]
@@ -197,9 +197,9 @@ class Network(nn.Module):
         return layer(self.outputs, "out", self.last_scale)(x)
 
 
-def mean_network(hparams: Hparams, num_actions: int, dtype: DTypeLike) -> Network:
+def mean_network(hparams: Hparams, num_actions: int, dtype: DTypeLike) -> TanhNetwork:
     """The network of a policy's mean."""
-    return Network(hparams.hidden, num_actions, 0.1, dtype)
+    return TanhNetwork(hparams.hidden, num_actions, 0.1, dtype)
 
 
 def gaussian(
@@ -270,7 +270,7 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
 
 
 @brief
-class Batch(NamedTuple):
+class TrajectoryBatch(NamedTuple):
     """Trajectories, zero after their end or where excluded.
 
     Attributes:
@@ -303,8 +303,8 @@ def rollout(
     *,
     num_trajectories: int,
     sampled: bool = True,
-) -> Batch:
-    """The :class:`Batch` of `num_trajectories` trajectories of the policy, of a random `key`.
+) -> TrajectoryBatch:
+    """The :class:`TrajectoryBatch` of `num_trajectories` trajectories of the policy, of a random `key`.
 
     Of a run's `state`, `problem` and `hparams`; actions are `sampled`, or the policy's mean is taken;
     both static. Sums over its first axis are those of trajectories.
@@ -319,7 +319,7 @@ def rollout(
 @partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
 def _rollout(
     key: Key, state: State, problem: Problem, hparams: Hparams, num_trajectories: int, sampled: bool
-) -> Batch:
+) -> TrajectoryBatch:
     environment, size = problem.environment, (problem.horizon, num_trajectories)
     start, noise_key, step_key = jax.random.split(key, 3)
     worlds = jax.vmap(environment.reset)(jax.random.split(start, num_trajectories))
@@ -353,4 +353,6 @@ def _rollout(
     observation, action, signals = (jnp.where(valid[..., None], x, 0).astype(dtype) for x in parts)
     reward, cost, discount = jnp.moveaxis(signals, -1, 0)
     last = jnp.where(truncated[:, None], last, 0)
-    return Batch(observation, action, reward, cost, discount, valid, finite, last, truncated)
+    return TrajectoryBatch(
+        observation, action, reward, cost, discount, valid, finite, last, truncated
+    )

@@ -14,7 +14,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import off_map, read_bytes
 from jaxltl.app.files.task import SyntheticTable
 from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.files.worlds import World
+from jaxltl.app.files.worlds import MappedModel
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.construct.counts import listed
 from jaxltl.core.models import Product, Trajectories, make_trajectories, project_trajectories
@@ -24,13 +24,13 @@ _STEP_BYTES = 128  # of a simulated step, measured while demonstrations are made
 _LARGEST_BYTES = 4e9
 
 
-def load_demonstrations(task: MlirlFile, world: World) -> Trajectories:
+def load_demonstrations(task: MlirlFile, world: MappedModel) -> Trajectories:
     """The demonstrations of a task's file; see :func:`read_demonstrations`."""
     assert task.demonstrations.file is not None
     return read_demonstrations(task.path.parent / task.demonstrations.file, world)
 
 
-def read_demonstrations(path: Path, world: World) -> Trajectories:
+def read_demonstrations(path: Path, world: MappedModel) -> Trajectories:
     """Demonstrations of a JSON file, ``{"demonstrations": [...]}``.
 
     Each is an object with ``"cells"``, ``[row, column]`` counted from 1 at the top left (or
@@ -53,7 +53,7 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
     return make_trajectories(world.mdp, sequences)
 
 
-def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
+def _read_demonstration(one: Any, world: MappedModel) -> list[tuple[int, int]]:
     keys = set(one) if isinstance(one, dict) else set()
     if keys not in ({"cells", "actions"}, {"states", "actions"}):
         content = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
@@ -76,7 +76,7 @@ def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
     return list(zip(states, actions, strict=False))
 
 
-def _check_steps(states: list[int], actions: list[int], world: World) -> None:
+def _check_steps(states: list[int], actions: list[int], world: MappedModel) -> None:
     """Raises ValueError for an unavailable action, or a successor of probability 0."""
     available = np.asarray(world.mdp.available)
     successor, probability = np.asarray(world.mdp.successor), np.asarray(world.mdp.probability)
@@ -95,7 +95,7 @@ def _check_steps(states: list[int], actions: list[int], world: World) -> None:
 
 
 def _each_step(
-    read: Callable[[object, World], int], values: list[object], world: World
+    read: Callable[[object, MappedModel], int], values: list[object], world: MappedModel
 ) -> list[int]:
     numbers = []
     for step, value in enumerate(values, start=1):
@@ -108,7 +108,7 @@ def _is_int(value: object) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _read_cell(value: object, world: World) -> int:
+def _read_cell(value: object, world: MappedModel) -> int:
     if world.shape is None:
         raise ValueError('the model has no map, so give "states" instead of "cells".')
     if not (isinstance(value, list) and len(value) == 2 and all(map(_is_int, value))):
@@ -120,7 +120,7 @@ def _read_cell(value: object, world: World) -> int:
     return (row - 1) * columns + column - 1
 
 
-def _read_state(value: object, world: World) -> int:
+def _read_state(value: object, world: MappedModel) -> int:
     if world.logged is not None:
         return _read_name("state", value, world.logged.states)
     last = world.mdp.num_states - 1
@@ -137,7 +137,7 @@ def _read_name(kind: str, value: object, names: tuple[str, ...]) -> int:
     raise ValueError(f"the {kind} {value!r} is not in the log, which has {listed(names)}.")
 
 
-def _read_action(value: object, world: World) -> int:
+def _read_action(value: object, world: MappedModel) -> int:
     if world.logged is not None:
         return _read_name("action", value, world.actions)
     if value in world.actions:

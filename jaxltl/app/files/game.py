@@ -138,7 +138,7 @@ class GameFile(File):
 
 
 @dataclass(frozen=True)
-class World:
+class MappedGame:
     """A game, with its map if it has one."""
 
     game: Game  # the game, with successor lists
@@ -176,7 +176,7 @@ class World:
         )
 
 
-def load_game(file: GameFile) -> World:
+def load_game(file: GameFile) -> MappedGame:
     """The game that a game file describes."""
     table = file.game
     with errors_in(f"{file.path}: [game] "):
@@ -189,10 +189,10 @@ def load_game(file: GameFile) -> World:
             if isinstance(options.get(key), tuple):
                 options[key] = _cell(options[key], key, parse_map(text), wall)
         game = grid_game(text, **options)
-    return World(game, ACTIONS, text, wall, places(text, wall=wall))
+    return MappedGame(game, ACTIONS, text, wall, places(text, wall=wall))
 
 
-def _from_model(path: Path, table: GameTable) -> World:
+def _from_model(path: Path, table: GameTable) -> MappedGame:
     loaded = read_padded(path, ("system",), table.constants)
     if "system" not in loaded.more:
         raise ValueError(
@@ -202,7 +202,7 @@ def _from_model(path: Path, table: GameTable) -> World:
     mdp = initial_where(loaded.mdp, table.initial, path)
     with errors_in(f"{str(path)!r}: "):
         game = make_game(mdp, loaded.more["system"])
-    return World(game, loaded.actions)
+    return MappedGame(game, loaded.actions)
 
 
 def _cell(cell: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
@@ -214,7 +214,7 @@ def _cell(cell: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tupl
     return row - 1, column - 1
 
 
-def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
+def load_objective(file: GameFile, world: MappedGame) -> tuple[Game, Parity | GR1]:
     """Objective, and the game with the states on which it is defined."""
     task, game = file.task, world.game
     with errors_in(f"{file.path}: [task] "):

@@ -13,7 +13,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_todirl import TodirlFile, WorldTable, map_file
-from jaxltl.app.files.worlds import World, grid_options
+from jaxltl.app.files.worlds import MappedModel, grid_options
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import parse_ltl
@@ -26,7 +26,7 @@ from jaxltl.io.colored_world import read_world
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(World):
+class ObservedScene(MappedModel):
     """A world and its observations."""
 
     name: str  # for people
@@ -40,7 +40,9 @@ class Scene(World):
         return rows, columns
 
 
-def load_scenes(task: TodirlFile, automaton: Automaton) -> tuple[list[Scene], list[Scene]]:
+def load_scenes(
+    task: TodirlFile, automaton: Automaton
+) -> tuple[list[ObservedScene], list[ObservedScene]]:
     """The training worlds and the test worlds."""
     test_maps = (task.test and task.test.maps) or []
     training = [_read_scene(task, "world", i, x) for i, x in enumerate(task.world.maps)]
@@ -68,7 +70,9 @@ def load_scenes(task: TodirlFile, automaton: Automaton) -> tuple[list[Scene], li
     return training, test
 
 
-def _read_scene(task: TodirlFile, table: str, number: int, entry: str | dict[str, str]) -> Scene:
+def _read_scene(
+    task: TodirlFile, table: str, number: int, entry: str | dict[str, str]
+) -> ObservedScene:
     file = map_file(entry)
     name = f"map {number + 1}" if file is None else file
     with errors_in(f"{task.path}: [{table}] {name}: "):
@@ -81,7 +85,7 @@ def _read_scene(task: TodirlFile, table: str, number: int, entry: str | dict[str
         return make(name, text, task.world, task.learner.radius)
 
 
-def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
+def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> ObservedScene:
     colored = read_world(_with_settings(text, world))
     if _gives_kinds(world):
         own = {
@@ -121,21 +125,21 @@ def _obstacles(world: WorldTable) -> Mapping[str, Mapping[str, int]]:
     return temporal_gridworld.OBSTACLES if world.obstacles is None else world.obstacles
 
 
-def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> Scene:
+def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> ObservedScene:
     if radius > world.margin:
         raise ValueError(
             f"the learner sees {radius} cells around its own, the map has a margin of "
             f"{world.margin}; give [learner] radius = {world.margin}, or a map with a wider margin."
         )
     seen = temporal_gridworld.observations(world, radius)
-    return Scene(mdp=world.mdp, cells=None, name=name, observation=seen, colored=world)
+    return ObservedScene(mdp=world.mdp, cells=None, name=name, observation=seen, colored=world)
 
 
-def _plain_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
+def _plain_scene(name: str, text: str, world: WorldTable, radius: int) -> ObservedScene:
     cells = parse_map(text)
     mdp = gridworld(text, **grid_options(world))
     seen = cell_observations(cells, cell_kinds(world), radius)
-    return Scene(mdp=mdp, cells=cells, name=name, observation=jnp.asarray(seen, mdp.dtype))
+    return ObservedScene(mdp=mdp, cells=cells, name=name, observation=jnp.asarray(seen, mdp.dtype))
 
 
 def cell_kinds(world: WorldTable) -> list[str]:
@@ -155,7 +159,9 @@ def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> n
     return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)
 
 
-def _generate(task: TodirlFile, number: int, first: Scene, automaton: Automaton) -> list[Scene]:
+def _generate(
+    task: TodirlFile, number: int, first: ObservedScene, automaton: Automaton
+) -> list[ObservedScene]:
     table, colored = task.test, first.colored
     assert table is not None and colored is not None
     objects, obstacles = _objects(task.world), _obstacles(task.world)
@@ -228,7 +234,7 @@ def _translate(
         return to_automaton(formula, letters=list(letters))
 
 
-def load_demonstrations(task: TodirlFile, scenes: Sequence[Scene]) -> list[Trajectories]:
+def load_demonstrations(task: TodirlFile, scenes: Sequence[ObservedScene]) -> list[Trajectories]:
     """The demonstrations in each of the training worlds, from their files."""
     files = (task.path.parent / name for name in task.demonstrations.files or ())
     return [read_demonstrations(file, scene) for file, scene in zip(files, scenes, strict=True)]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class World:
+class MappedModel:
     """A model, with its map if it has one."""
 
     mdp: MDP  # the model
@@ -52,7 +52,7 @@ def grid_options(table: GridTable) -> Record:
     return {name: value for name, value in table.specified().items() if name in names}
 
 
-def load_world(path: Path, table: WorldTable) -> World:
+def load_world(path: Path, table: WorldTable) -> MappedModel:
     """The model that ``[world]`` of a task file describes."""
     with errors_in(f"{path}: [world] "):
         # Imports here: most tasks have a map, and need no reader of logs or models.
@@ -60,17 +60,17 @@ def load_world(path: Path, table: WorldTable) -> World:
             from jaxltl.app.certify import load_logged
 
             mdp, actions, logged = load_logged(path.parent, table)
-            return World(mdp, None, actions, logged)
+            return MappedModel(mdp, None, actions, logged)
         if table.model is not None:
             from jaxltl.app.files.models import read_padded
 
             file = path.parent / table.model
             loaded = read_padded(file, constants=table.constants)
             assert not isinstance(table.initial, list)
-            return World(initial_where(loaded.mdp, table.initial, file), None, loaded.actions)
+            return MappedModel(initial_where(loaded.mdp, table.initial, file), None, loaded.actions)
         assert table.map is not None
         text = read_map(path, table.map)
-        return World(gridworld(text, **grid_options(table)), parse_map(text), ACTIONS)
+        return MappedModel(gridworld(text, **grid_options(table)), parse_map(text), ACTIONS)
 
 
 def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:

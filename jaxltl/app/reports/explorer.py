@@ -27,7 +27,7 @@ START = "start"  # key of the layer of initial states
 
 
 @dataclass(frozen=True)
-class Layer:
+class MapLayer:
     """A map: its name, values ``float[S]`` in [0, 1] or None, and policy ``float[S, A]`` or None."""
 
     name: str
@@ -36,7 +36,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Run:
+class ReportTrajectory:
     """A trajectory: world states, memory states and actions, None in a last step without one."""
 
     name: str
@@ -52,8 +52,8 @@ class Explorer:
     caption: str
     size: int  # S, the number of states or cells
     automaton: Automaton | None  # the policy's memory, or None
-    layers: Mapping[str, Layer]  # maps by memory state or :data:`START`
-    runs: list[Run]  # trajectories
+    layers: Mapping[str, MapLayer]  # maps by memory state or :data:`START`
+    runs: list[ReportTrajectory]  # trajectories
     place: Any = None  # cells of a text map, a coloured world, or None without a map
     actions: Sequence[str] = ()  # A names
     label: str = ""  # of values
@@ -145,7 +145,7 @@ def curves(
     return Curves(name, title, caption, metrics, history["step"])
 
 
-class _Dynamics:
+class _WorldTransitions:
     """Transitions of a world and of a policy's memory, as NumPy arrays."""
 
     def __init__(self, model: Product) -> None:
@@ -165,9 +165,9 @@ class _Dynamics:
         return int(self.next_memory[there if self.on_entry else here, memory])
 
 
-def demonstrated_runs(model: Product, demonstrations: Trajectories) -> list[Run]:
+def demonstrated_runs(model: Product, demonstrations: Trajectories) -> list[ReportTrajectory]:
     """The first demonstrations with their memory states, and a deterministic last successor."""
-    world, runs = _Dynamics(model), []
+    world, runs = _WorldTransitions(model), []
     states, actions = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
     lengths = np.asarray(demonstrations.length)
     for number in np.flatnonzero(lengths > 0)[:MAX_RUNS].tolist():
@@ -180,13 +180,15 @@ def demonstrated_runs(model: Product, demonstrations: Trajectories) -> list[Run]
         for here, there in itertools.pairwise(at):
             memory.append(world.remember(memory[-1], here, there))
         steps = list(itertools.zip_longest(at, memory, did))
-        runs.append(Run(f"demonstration {number + 1} of {len(lengths)}", steps))
+        runs.append(ReportTrajectory(f"demonstration {number + 1} of {len(lengths)}", steps))
     return runs
 
 
-def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) -> list[Run]:
+def learned_runs(
+    model: Product, policy: np.ndarray, seed: int, count: int = 3
+) -> list[ReportTrajectory]:
     """Rollouts of a policy until the formula is decided, or :data:`LONGEST_RUN` steps."""
-    rng, world = np.random.default_rng(seed), _Dynamics(model)
+    rng, world = np.random.default_rng(seed), _WorldTransitions(model)
     decided = verdicts(model.automaton) != Verdict.UNDECIDED
     initial = np.asarray(model.mdp.initial, float)
     longest = LONGEST_RUN if policy.ndim == 3 else min(len(policy), LONGEST_RUN)
@@ -205,5 +207,9 @@ def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) 
             reached, likely = world.reached(here, action)
             there = int(rng.choice(reached, p=likely))
             memory, here = world.remember(memory, here, there), there
-        runs.append(Run(f"learned policy, trajectory {number + 1}", [*steps, (here, memory, None)]))
+        runs.append(
+            ReportTrajectory(
+                f"learned policy, trajectory {number + 1}", [*steps, (here, memory, None)]
+            )
+        )
     return runs

@@ -14,7 +14,7 @@ from jaxltl.app.reports.explorer import (
     START,
     Curves,
     Explorer,
-    Layer,
+    MapLayer,
     curves,
     demonstrated_runs,
     learned_runs,
@@ -168,7 +168,7 @@ _TABLE = (
 )
 
 
-def _layers(outcome: Any) -> dict[str, Layer]:
+def _layers(outcome: Any) -> dict[str, MapLayer]:
     """A layer for each memory state that is undecided and reachable, and one of initial states."""
     model = outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
@@ -179,7 +179,7 @@ def _layers(outcome: Any) -> dict[str, Layer]:
     memories = np.flatnonzero(undecided & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
     layers = {
-        str(q): Layer(
+        str(q): MapLayer(
             f"memory state {q}: {names[q]}",
             np.where(met[:, q], value[:, q], np.nan),
             np.where(met[:, q, None], policy[:, q], np.nan),
@@ -187,7 +187,7 @@ def _layers(outcome: Any) -> dict[str, Layer]:
         for q in memories
     }
     at_start = np.where(starts, from_starts(model, value), np.nan)
-    return {**layers, START: Layer("initial states", at_start, None)}
+    return {**layers, START: MapLayer("initial states", at_start, None)}
 
 
 def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:

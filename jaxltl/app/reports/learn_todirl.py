@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.scenes import Scene
+from jaxltl.app.files.scenes import ObservedScene
 from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
@@ -17,8 +17,8 @@ from jaxltl.app.reports.explorer import (
     START,
     Curves,
     Explorer,
-    Layer,
-    Run,
+    MapLayer,
+    ReportTrajectory,
     curves,
     demonstrated_runs,
     learned_runs,
@@ -29,7 +29,7 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.todirl_results import Outcome, Setup, counted_worlds, part_of, summary
+from jaxltl.app.todirl_results import TodirlOutcome, TodirlSetup, counted_worlds, part_of, summary
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
@@ -102,7 +102,7 @@ _PICTURES = 3  # worlds that are drawn, of each kind
 _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
-def task_pictures(setup: Setup) -> list[Picture]:
+def task_pictures(setup: TodirlSetup) -> list[Picture]:
     """Pictures of the automata of the formula and of the memory."""
     same = setup.memory is setup.automaton
     drawings = [automaton_picture(setup.automaton, "training-1" if same else "")]
@@ -119,7 +119,7 @@ def task_pictures(setup: Setup) -> list[Picture]:
     return drawings
 
 
-def pictures(outcome: Outcome) -> list[Picture]:
+def pictures(outcome: TodirlOutcome) -> list[Picture]:
     """Pictures of learning curves and of policies in worlds."""
     drawings = [learning_picture(outcome.learned.history, _caption_of_curves(outcome), _FIGURES)]
     if time := summary(outcome)["training"].get("expected_steps"):
@@ -129,7 +129,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
     return drawings
 
 
-def live(outcome: Outcome) -> list[Explorer | Curves]:
+def live(outcome: TodirlOutcome) -> list[Explorer | Curves]:
     """Interactive policies in worlds, and learning curves."""
     caption, history = _caption_of_curves(outcome), outcome.learned.history
     return [
@@ -138,7 +138,7 @@ def live(outcome: Outcome) -> list[Explorer | Curves]:
     ]
 
 
-def _caption_of_curves(outcome: Outcome) -> str:
+def _caption_of_curves(outcome: TodirlOutcome) -> str:
     scores = outcome.learned.held_out
     choice = ". The parameters with the least held-out figure are kept"
     return (
@@ -149,10 +149,10 @@ def _caption_of_curves(outcome: Outcome) -> str:
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _DrawnWorld:
     """A world that is drawn: its index, file stem, title, and demonstrations."""
 
-    outcome: Outcome
+    outcome: TodirlOutcome
     w: int
     stem: str
     title: str
@@ -160,7 +160,7 @@ class _Drawn:
     demonstrations: Trajectories | None
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> ObservedScene:
         return self.outcome.setup.worlds.scenes[self.w]
 
     @property
@@ -192,14 +192,14 @@ class _Drawn:
         return np.asarray(value)[: self.scene.mdp.num_states]
 
 
-def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
+def _drawn_worlds(outcome: TodirlOutcome) -> Iterator[_DrawnWorld]:
     setup, mean = outcome.setup, np.asarray(outcome.evaluation.performance["learned"].mean)
 
     def drawn(
         w: int, kind: str, stem: str, arrows: bool, demonstrations: Trajectories | None
-    ) -> _Drawn:
+    ) -> _DrawnWorld:
         title = f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
-        return _Drawn(outcome, w, stem, title, arrows, demonstrations)
+        return _DrawnWorld(outcome, w, stem, title, arrows, demonstrations)
 
     for w, demonstrations in enumerate(setup.demonstrations[:_PICTURES]):
         yield drawn(w, "Training world", f"training_{w + 1}", True, demonstrations)
@@ -212,12 +212,12 @@ def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
             yield drawn(w, f"Test world, {rank}", f"test_{n + 1}", n == 0, None)
 
 
-def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
+def _look_into(outcome: TodirlOutcome, one: _DrawnWorld) -> Explorer:
     setup, scene = outcome.setup, one.scene
     names = _memory_names(setup)
-    layers = {str(q): Layer(name, None, one.moving[:, q]) for q, name in names.items()}
+    layers = {str(q): MapLayer(name, None, one.moving[:, q]) for q, name in names.items()}
     starts = np.asarray(scene.mdp.initial) > 0
-    layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
+    layers[START] = MapLayer("initial states", np.where(starts, one.value, np.nan), None)
     model = part_of(setup.worlds.model, one.w)
     demonstrated = (
         [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
@@ -239,7 +239,7 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer:
     )
 
 
-def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
+def _draw(outcome: TodirlOutcome, one: _DrawnWorld) -> list[Picture]:
     """Pictures of a world: its policy, and trajectories."""
     setup, scene, caption = outcome.setup, one.scene, one.caption
     names, moving = _memory_names(setup), one.moving
@@ -283,18 +283,21 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     return drawings
 
 
-def _memory_names(setup: Setup) -> dict[int, str]:
+def _memory_names(setup: TodirlSetup) -> dict[int, str]:
     """The undecided memory states, with their names."""
     names = setup.memory.state_names or ("",) * len(setup.memory.delta)
     undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED).tolist()
     return {q: f"memory state {q}: {names[q]}" for q in undecided or [0]}
 
 
-def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
+def _runs(outcome: TodirlOutcome, one: _DrawnWorld) -> list[ReportTrajectory]:
     """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
     setup, policy, count = outcome.setup, one.policy, 1
     if setup.memory is not setup.automaton:
         policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.automaton))
         count = len(setup.automaton.delta)  # the formula's automaton state varies fastest
     rollouts = learned_runs(part_of(setup.worlds.task_model, one.w), policy, outcome.seed)
-    return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in rollouts]
+    return [
+        ReportTrajectory(run.name, [(s, q // count, a) for s, q, a in run.steps])
+        for run in rollouts
+    ]

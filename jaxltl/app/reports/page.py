@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.explorer import START, Curves, Explorer, Run
+from jaxltl.app.reports.explorer import START, Curves, Explorer, ReportTrajectory
 from jaxltl.app.wording import Record, Result, counted, position_text, state_position
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
@@ -203,7 +203,7 @@ def layer_table(part: Explorer, key: str) -> tuple[tuple[object, ...], list[Any]
     return ("row", *range(1, across + 1)), rows, caption
 
 
-def run_rows(part: Explorer, run: Run) -> list[tuple[object, ...]]:
+def run_rows(part: Explorer, run: ReportTrajectory) -> list[tuple[object, ...]]:
     """Step, position, memory state and action of a trajectory."""
     return [
         (t, position(part, s), q, "" if a is None else part.actions[a])

@@ -14,9 +14,9 @@ from jaxltl.app.files.game import task_text
 from jaxltl.app.job import plain, took
 from jaxltl.app.run_job import write_results
 from jaxltl.app.reports.drawing import Picture, draw
-from jaxltl.app.reports.explorer import Explorer, Run
+from jaxltl.app.reports.explorer import Explorer, ReportTrajectory
 from jaxltl.app.reports.page import Report, aligned, number
-from jaxltl.app.synthesize import Play, Synthesis
+from jaxltl.app.synthesize import EnvironmentPlay, Synthesis
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.games import GR1, Permissive, Winning
 from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
@@ -151,7 +151,7 @@ def describe_play(synthesis: Synthesis) -> list[str]:
     return [f"  {line}" for line in (*aligned(rows), _ending(play, synthesis))]
 
 
-def _ending(play: Play, synthesis: Synthesis) -> str:
+def _ending(play: EnvironmentPlay, synthesis: Synthesis) -> str:
     last = len(play.steps) - 1
     if play.failed:
         chance = ", after random moves against the system" if play.by_chance else ""
@@ -162,7 +162,7 @@ def _ending(play: Play, synthesis: Synthesis) -> str:
     return f"{round_} for ever, and {_missed(play, synthesis) or 'violate the objective'}"
 
 
-def _missed(play: Play, synthesis: Synthesis) -> str:
+def _missed(play: EnvironmentPlay, synthesis: Synthesis) -> str:
     """The guarantees that a repeated part of a play never satisfies."""
     objective = synthesis.winning.objective
     guarantees = synthesis.file.task.guarantees or ()
@@ -383,9 +383,11 @@ def play_explorer(synthesis: Synthesis) -> Explorer:
     world, nodes = synthesis.world, synthesis.nodes
     runs = []
     if synthesis.strategy is not None and synthesis.restricted is not None:
-        runs.append(Run("the system follows its strategy", _strategy_play(synthesis)))
+        runs.append(ReportTrajectory("the system follows its strategy", _strategy_play(synthesis)))
     if synthesis.play is not None:
-        runs.append(Run("the environment wins", _counter_play(synthesis, synthesis.play)))
+        runs.append(
+            ReportTrajectory("the environment wins", _counter_play(synthesis, synthesis.play))
+        )
     visited = {state for run in runs for state, _, _ in run.steps}
     place, cells, caption = None, {}, "Step by step."
     if world.text is not None and world.places is not None:
@@ -412,7 +414,7 @@ def play_explorer(synthesis: Synthesis) -> Explorer:
     )
 
 
-def _counter_play(synthesis: Synthesis, play: Play) -> list[tuple[int, int, int | None]]:
+def _counter_play(synthesis: Synthesis, play: EnvironmentPlay) -> list[tuple[int, int, int | None]]:
     """The play that the environment wins; chance has no action."""
     nodes, actions = synthesis.nodes, synthesis.world.actions
     moves: list[int | None] = [

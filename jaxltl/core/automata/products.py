@@ -18,7 +18,7 @@ Parities = tuple[int, ...]  # of the least recurring priority of each automaton
 Word = tuple[Integers, Integers]  # the letters of a prefix and of a cycle
 
 
-class Edges(NamedTuple):
+class ProductEdges(NamedTuple):
     """E transitions, by their sources; `priority` is ``[K, E]`` for K automata.
 
     Of those with equal ends and priorities, the one with the first letter.
@@ -29,22 +29,22 @@ class Edges(NamedTuple):
     letter: Integers
     priority: Integers
 
-    def chosen(self, mask: Booleans) -> Edges:
-        return Edges(*(column[..., mask] for column in self))
+    def chosen(self, mask: Booleans) -> ProductEdges:
+        return ProductEdges(*(column[..., mask] for column in self))
 
 
-class Product(NamedTuple):
+class AutomataProduct(NamedTuple):
     """K automata as one graph of N nodes, numbered breadth first from the first ones."""
 
     states: Integers  # [N, K]
     delta: Integers  # [N, L]
-    edges: Edges
+    edges: ProductEdges
     number: Integers  # of each tuple of states in row-major order, -1 where it is not reached
 
 
 def product(
     tables: Sequence[ParityTable], starts: Integers | None = None, max_size: float = math.inf
-) -> Product | None:
+) -> AutomataProduct | None:
     """The product from the initial states, or some tuples; None beyond a number of transitions."""
     sizes = [len(table.delta) for table in tables]
     width = tables[0].delta.shape[1]
@@ -78,13 +78,13 @@ def product(
     code = np.sort(code * width + np.arange(width), axis=1)
     first = np.diff(code // width, axis=1, prepend=-1) != 0
     source, letter = np.nonzero(first)[0], code[first] % width
-    edges = Edges(source, delta[source, letter], letter, priority[:, source, letter])
-    return Product(np.stack(states, axis=1), delta, edges, number)
+    edges = ProductEdges(source, delta[source, letter], letter, priority[:, source, letter])
+    return AutomataProduct(np.stack(states, axis=1), delta, edges, number)
 
 
 def loops(
-    edges: Edges, num_nodes: int, wanted: Collection[Parities]
-) -> Iterator[tuple[Edges, Booleans]]:
+    edges: ProductEdges, num_nodes: int, wanted: Collection[Parities]
+) -> Iterator[tuple[ProductEdges, Booleans]]:
     """Components whose least priorities have wanted parities, and where these are: ``bool[K, E]``.
 
     A transition with the least priority of its component is on no cycle of another parity, so
@@ -110,7 +110,7 @@ def loops(
                 waiting.append((edges.chosen(rest), [parities]))
 
 
-def may(edges: Edges, num_nodes: int, wanted: Collection[Parities]) -> Booleans:
+def may(edges: ProductEdges, num_nodes: int, wanted: Collection[Parities]) -> Booleans:
     """Nodes from which some word gives wanted parities: ``bool[N]``."""
     sources = np.zeros(num_nodes, bool)
     for inside, _ in loops(edges, num_nodes, wanted):
@@ -125,7 +125,9 @@ def states_that_may(table: ParityTable, parity: int) -> Booleans:
     return may(every.edges, len(table.delta), [(parity,)])
 
 
-def word_through(edges: Edges, num_nodes: int, inside: Edges, marks: Booleans) -> Word:
+def word_through(
+    edges: ProductEdges, num_nodes: int, inside: ProductEdges, marks: Booleans
+) -> Word:
     """A word from node 0 around a cycle through all marks, in the nearest of some components."""
     marked = np.flatnonzero(marks.any(axis=0))
     first = marked[np.lexsort((-marks[:, marked].sum(axis=0), inside.source[marked]))[0]]
@@ -143,7 +145,7 @@ def word_through(edges: Edges, num_nodes: int, inside: Edges, marks: Booleans) -
     return np.array(prefix, int), np.array(cycle + back, int)
 
 
-def _walk(edges: Edges, start: int, goal: Booleans) -> tuple[list[int], int]:
+def _walk(edges: ProductEdges, start: int, goal: Booleans) -> tuple[list[int], int]:
     """The letters of a shortest path to a goal, which must be reachable, and its end."""
     reached = np.zeros(goal.size, bool)
     reached[start] = True

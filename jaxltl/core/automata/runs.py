@@ -15,7 +15,7 @@ from jaxltl.core.automata.products import (
     EVEN,
     ODD,
     Parities,
-    Product,
+    AutomataProduct,
     loops,
     product,
     states_that_may,
@@ -122,7 +122,7 @@ def _table(automaton: Automaton) -> ParityTable:
     return ParityTable(delta, priority, int(automaton.initial))
 
 
-def joint_runs(automata: Sequence[Automaton]) -> Product:
+def joint_runs(automata: Sequence[Automaton]) -> AutomataProduct:
     """The reachable tuples of states of automata over the same letters."""
     runs = product([_table(automaton) for automaton in automata])
     assert runs is not None

@@ -44,7 +44,7 @@ from jaxltl.core.logic.ltl import (
 )
 from jaxltl.core.logic.normal_form import (
     Combination,
-    Part,
+    LimitPart,
     combination,
     extent,
     is_pure,
@@ -190,7 +190,7 @@ class Trackers:
         return list(zip(*every, strict=True))
 
 
-def _followed(part: Part) -> tuple[str, _Followed]:
+def _followed(part: LimitPart) -> tuple[str, _Followed]:
     """The polarity of the marks of a part's tracker, and the formulas that it follows."""
     limits = limit_parts(part.formula) if part.kind == "limit" else ()
     often = limits[0].operator == "G" if limits else part.kind == "pi2"
@@ -202,7 +202,7 @@ def _followed(part: Part) -> tuple[str, _Followed]:
 
 
 def _condition(parts: Combination, number: dict[_Followed, int]) -> Condition:
-    if isinstance(parts, Part):
+    if isinstance(parts, LimitPart):
         polarity, followed = _followed(parts)
         return polarity, number.setdefault(followed, len(number))
     operator = {"&": "and", "|": "or"}[parts[0]]

@@ -229,7 +229,7 @@ Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Limits:
+class RefinementLimits:
     """When refinement stops; see :class:`~jaxltl.core.continuous.certificate.ProofOptions`."""
 
     tolerance: float = 1e-3
@@ -248,7 +248,7 @@ class Limits:
 
 @brief
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class CellBounds:
     """Bounds of the satisfaction probability of product states, after refinement."""
 
     grid: Grid  # the cells and the memory
@@ -274,7 +274,7 @@ class Bounds:
         undecided = (self.task.decided < 0)[:, None]
         return undecided & (self.lower < 1) & (self.upper > 0) & (self.lower < self.upper)
 
-    def complement(self) -> Bounds:
+    def complement(self) -> CellBounds:
         """The bounds of the negated formula."""
         how = np.where(self.upper <= 0, SURE, UNPROVEN).astype(np.int8)
         lower, upper, task = 1 - self.upper, 1 - self.lower, self.task.complement()
@@ -328,10 +328,10 @@ class Abstraction:
     # float[A, m], over which lower bounds are maximised; one row of any numbers for the step
     # of a policy
     actions: Floats
-    limits: Limits  # when refinement stops
+    limits: RefinementLimits  # when refinement stops
     seconds: dict[str, float] = field(default_factory=dict)  # wall time by stage
 
-    def bounds(self, grid: Grid) -> Bounds:
+    def bounds(self, grid: Grid) -> CellBounds:
         """Bounds after refinement; an interrupt leaves those of the last finished grid, and so does
         a finer one with more transition probabilities than memory should hold."""
         bounds = refined = first = self._first(grid)
@@ -358,7 +358,7 @@ class Abstraction:
                 return bounds
             refined = self._refined(bounds, *finer)
 
-    def vacuous(self, grid: Grid) -> Bounds:
+    def vacuous(self, grid: Grid) -> CellBounds:
         """Bounds 0 and 1 in all states, where a value may be NaN."""
         try:
             bounds = self._first(grid)
@@ -368,7 +368,7 @@ class Abstraction:
         unproven = np.full(shape, UNPROVEN, np.int8)
         return replace(bounds, lower=np.zeros(shape), upper=np.ones(shape), how=unproven)
 
-    def safe_actions(self, bounds: Bounds) -> Booleans:
+    def safe_actions(self, bounds: CellBounds) -> Booleans:
         """Actions ``bool[Q, C, A]`` that lead only to states of lower bound 1.
 
         In states that are satisfied surely or with probability 1, at least the policy's action is one.
@@ -384,7 +384,7 @@ class Abstraction:
         safe[task.decided == 1] = True
         return safe
 
-    def _first(self, grid: Grid, labelled: bool = True) -> Bounds:
+    def _first(self, grid: Grid, labelled: bool = True) -> CellBounds:
         """Bounds 0 and 1."""
         dynamics, names = self.dynamics, self.dynamics.propositions
         low, high = grid.boxes()
@@ -397,7 +397,7 @@ class Abstraction:
         closed = replace(dynamics.initial, high=np.nextafter(dynamics.initial.high, np.inf))
         shape = (task.num_memory, grid.num_cells)
         decided = np.broadcast_to(task.decided[:, None], shape)
-        return Bounds(
+        return CellBounds(
             grid,
             task,
             (decided == 1).astype(np.float64),
@@ -408,7 +408,7 @@ class Abstraction:
             np.ones(grid.num_cells, bool),
         )
 
-    def _refined(self, bounds: Bounds, grid: Grid, parents: tuple[Integers, ...]) -> Bounds:
+    def _refined(self, bounds: CellBounds, grid: Grid, parents: tuple[Integers, ...]) -> CellBounds:
         """The same bounds on a finer grid with the parents of its intervals."""
         fresh = self._first(grid)
         if not fresh.task.same_memory(
@@ -439,7 +439,7 @@ class Abstraction:
         count = len(self.actions)
         return images, Successors(images.cells, count, start, stop, outside, None, grid.shape)
 
-    def _improved(self, bounds: Bounds) -> Bounds:
+    def _improved(self, bounds: CellBounds) -> CellBounds:
         """Better bounds on the same grid: lower ones, then upper ones as those of the negation."""
         grid, limits = bounds.grid, self.limits
         cells = np.flatnonzero(bounds.undecided.any(0) & bounds.needed)
@@ -448,7 +448,7 @@ class Abstraction:
         limits.report(f"{grid.num_cells:,} cells: images of {len(cells):,} cells")
         box = noise_box(self.dynamics)
         with self.stage("images"):
-            problem = _Problem(self, *self._rows(grid, cells, box), box)
+            problem = _AbstractionProblem(self, *self._rows(grid, cells, box), box)
         bounds = problem.improved(bounds, True)
         upper = bounds.upper
         goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
@@ -467,7 +467,7 @@ class Abstraction:
 
 
 def _finer(
-    grid: Grid, needed: Booleans, limits: Limits
+    grid: Grid, needed: Booleans, limits: RefinementLimits
 ) -> tuple[Grid, tuple[Integers, ...]] | None:
     """The refined grid and the parents of its intervals, or None if it has too many cells."""
     finer, parents = grid.halve(needed)
@@ -475,7 +475,7 @@ def _finer(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _AbstractionProblem:
     """The rows of one grid."""
 
     abstraction: Abstraction
@@ -483,13 +483,13 @@ class _Problem:
     rows: Successors
     box: NoiseBox
 
-    def needed(self, bounds: Bounds, active: Integers) -> Booleans:
+    def needed(self, bounds: CellBounds, active: Integers) -> Booleans:
         """Cells ``bool[C]`` at rows' positions."""
         needed = np.zeros(bounds.grid.num_cells, bool)
         needed[self.rows.cells[active]] = True
         return needed
 
-    def improved(self, bounds: Bounds, maximize: bool) -> Bounds:
+    def improved(self, bounds: CellBounds, maximize: bool) -> CellBounds:
         """Better lower bounds, by sets and by value iteration."""
         task, stage, limits = bounds.task, self.abstraction.stage, self.abstraction.limits
         value, how, action = bounds.lower.copy(), bounds.how.copy(), bounds.action.copy()
@@ -524,7 +524,7 @@ class _Problem:
             how[lower > value] = ITERATED
         return replace(bounds, lower=lower, action=best)
 
-    def active(self, bounds: Bounds) -> Integers:
+    def active(self, bounds: CellBounds) -> Integers:
         """Rows' positions of cells that matter for initial states and are not decided."""
         finished = (bounds.lower >= 1) | (bounds.upper <= 0)
         met = reachable(bounds.task, self.rows, bounds.initial, finished)

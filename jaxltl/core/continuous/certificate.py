@@ -19,9 +19,9 @@ from jaxltl.core.array_types import Booleans, Floats, Integers, PyTree
 from jaxltl.core.continuous.abstraction import (
     ALMOST_SURE,
     Abstraction,
-    Bounds,
+    CellBounds,
     ITERATED,
-    Limits,
+    RefinementLimits,
     SURE,
 )
 from jaxltl.core.continuous.dynamics import Dynamics, Step, to_environment
@@ -333,7 +333,7 @@ def certify_policy(
 
 def prove(
     dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
-) -> tuple[Certificate, Abstraction, Bounds]:
+) -> tuple[Certificate, Abstraction, CellBounds]:
     """The certificate of a step under the best actions of a grid, and its parts."""
     limits = _limits(options)
     validation.instance("formula", formula, (str, Formula), "a formula or its text")
@@ -359,7 +359,7 @@ def prove(
     return certificate, abstraction, bounds
 
 
-def _limits(options: ProofOptions) -> Limits:
+def _limits(options: ProofOptions) -> RefinementLimits:
     """The checked options of a proof, without its first grid."""
     settings: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
     for name, value in settings.items():
@@ -373,7 +373,7 @@ def _limits(options: ProofOptions) -> Limits:
             settings[name] = validation.boolean(name, value)
         elif name == "report":
             validation.function(name, value)
-    return Limits(**settings)
+    return RefinementLimits(**settings)
 
 
 def _require_initial_inside(dynamics: Dynamics) -> None:

@@ -23,8 +23,8 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.continuous.regions import UndefinedError
 from jaxltl.core.enclosures.interval import Interval
-from jaxltl.core.enclosures.linear_bounds import AffineForm, Enclosed, propagate
-from jaxltl.core.enclosures.program import Elementwise, Program, make_program
+from jaxltl.core.enclosures.linear_bounds import AffineForm, EnclosedProgram, propagate
+from jaxltl.core.enclosures.program import Elementwise, StraightLineProgram, make_program
 from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
@@ -45,7 +45,7 @@ _ADVERSARY = (
 )
 
 
-def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
+def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> StraightLineProgram:
     """A step, and its derivatives ``[k, n]`` in the noise unless they bound no variation.
 
     One program for both, since the derivatives need what the step computes: of a policy, say.
@@ -72,7 +72,7 @@ def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
         return program
 
 
-def jumps(program: Program) -> bool:
+def jumps(program: StraightLineProgram) -> bool:
     """True if a function that may jump is applied to variables that depend on the last input."""
     noisy = {program.inputs[-1]}
     for operation in program.operations:
@@ -86,7 +86,7 @@ def jumps(program: Program) -> bool:
     return False
 
 
-def gain_bounds(known: Enclosed, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+def gain_bounds(known: EnclosedProgram, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
     """Bounds ``[C, k, n]`` of the derivatives over boxes; infinite where none is known."""
     if len(known.program.outputs) == 1:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
@@ -287,7 +287,7 @@ class _Forms:
 
 
 def _forms(
-    program: Program,
+    program: StraightLineProgram,
     grid: Grid,
     start: Integers,
     size: tuple[int, ...],

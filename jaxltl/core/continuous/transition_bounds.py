@@ -33,7 +33,7 @@ class TooManyProbabilitiesError(ValueError):
 
 @brief
 @dataclass(frozen=True)
-class Factors:
+class CoordinateProbabilities:
     """Interval probabilities of one coordinate, for U different images."""
 
     start: Integers  # int[U], first interval of the window
@@ -60,7 +60,7 @@ class _Stage:
 class TransitionBounds:
     """Interval transition probabilities of rows, as factors."""
 
-    factors: tuple[Factors, ...]  # for each coordinate of the state, in their order
+    factors: tuple[CoordinateProbabilities, ...]  # for each coordinate of the state, in their order
     ids: tuple[Integers, ...]  # for each coordinate, int[R], the factors of each row
     stages: tuple[_Stage, ...]  # order of the contraction
     shape: tuple[int, ...]  # of the grid, with its axes in that order
@@ -153,7 +153,7 @@ def _factors(
     edges: Floats,
     noise: Distribution | None,
     clipped: bool,
-) -> Factors:
+) -> CoordinateProbabilities:
     """Probabilities of intervals for images ``[U, 4]`` of low, high, gain and variation."""
     count = len(edges) - 1
     start = np.clip(np.searchsorted(edges, ends[0], "right") - 1, 0, count - 1)
@@ -195,7 +195,7 @@ def _factors(
         )
     gap = np.subtract(upper, lower, out=upper)
     np.add(gap, _UNIT, out=gap, where=gap > 0)
-    return Factors(start, lower, np.maximum(gap, 0, out=gap), outside, rest)
+    return CoordinateProbabilities(start, lower, np.maximum(gap, 0, out=gap), outside, rest)
 
 
 def _bounds(
@@ -223,7 +223,7 @@ def _bounds(
 
 
 def _stages(
-    factors: Sequence[Factors], ids: Sequence[Integers], shape: tuple[int, ...]
+    factors: Sequence[CoordinateProbabilities], ids: Sequence[Integers], shape: tuple[int, ...]
 ) -> tuple[_Stage, ...]:
     """Groups of rows that share factors, from the last axis to the first."""
     num_rows = len(ids[0])
@@ -259,7 +259,9 @@ def _stages(
     return tuple(stages)
 
 
-def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -> Floats:
+def _contract(
+    stage: _Stage, factors: CoordinateProbabilities, source: Floats, outside: float
+) -> Floats:
     """One stage: the least expectation along an axis, for each group and each cell of the others."""
     size = max(int(np.prod(stage.width)), 1)
     window = factors.low.shape[1]
@@ -290,7 +292,9 @@ def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -
     return values
 
 
-def _least(value: Floats, factors: Factors, factor: Integers, outside: float) -> Floats:
+def _least(
+    value: Floats, factors: CoordinateProbabilities, factor: Integers, outside: float
+) -> Floats:
     """Least expectation along the last axis: the mass that is free goes to the least values first.
 
     ``sum low v + min sum x v`` over ``0 <= x <= gap`` with ``sum x = 1 - sum low``. Intervals that

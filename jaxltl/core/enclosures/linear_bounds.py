@@ -43,7 +43,7 @@ from jaxltl.core.enclosures.matrix_product import nonnegative, product
 from jaxltl.core.enclosures.program import (
     Elementwise,
     MatrixProduct,
-    Program,
+    StraightLineProgram,
     Select,
     make_program,
 )
@@ -83,10 +83,10 @@ class LinearForm:
 
 
 @dataclass(frozen=True)
-class Enclosed:
+class EnclosedProgram:
     """A program with enclosures of its variables over C boxes."""
 
-    program: Program
+    program: StraightLineProgram
     intervals: Mapping[int, Interval]  # arrays [C, n]; [1, n] for known variables
     radius: Array  # float[C, J], of the box, with the entries of all inputs in order
     middle: Array
@@ -105,7 +105,9 @@ class Enclosed:
 
 
 @np.errstate(all="ignore")  # infinite bounds make NaN, which is no bound
-def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> Enclosed:
+def propagate(
+    program: StraightLineProgram, boxes: list[Interval], linear: bool = True
+) -> EnclosedProgram:
     """Enclosures of all variables over boxes with arrays [C, n], from the first operation on."""
     intervals: dict[int, Interval] = {}
     xp = module_of(boxes[0].low) if boxes else np
@@ -148,7 +150,7 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
         for x in operation.inputs:
             if last_use[x] == position and x not in program.outputs:
                 forms.pop(x, None)
-    return Enclosed(program, intervals, radius, middle, forms)
+    return EnclosedProgram(program, intervals, radius, middle, forms)
 
 
 def _is_bounded(form: AffineForm | None) -> bool:
@@ -315,7 +317,7 @@ def _forward_elementwise(bounds: Relaxation, inputs: list[AffineForm]) -> Affine
 class _Coefficients:
     """Coefficients of one variable's bounds by the variables still to be resolved."""
 
-    def __init__(self, known: Enclosed, target: int) -> None:
+    def __init__(self, known: EnclosedProgram, target: int) -> None:
         self.known = known
         self.xp = xp = module_of(known.radius)
         size = known.intervals[target].low.shape[-1]
@@ -355,7 +357,7 @@ class _Coefficients:
 
 
 @np.errstate(all="ignore")
-def backward(known: Enclosed, target: int) -> LinearForm:
+def backward(known: EnclosedProgram, target: int) -> LinearForm:
     """Linear bounds of a variable over the boxes, by backward propagation."""
     state, intervals = _Coefficients(known, target), known.intervals
     xp = state.xp
@@ -546,7 +548,7 @@ def linear_bounds(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyT
 
 def over_boxes(
     function: Callable[[PyTree], PyTree], low: PyTree, high: PyTree, linear: bool = True
-) -> Enclosed:
+) -> EnclosedProgram:
     """The function's variables over a batch of boxes, with a leading axis C of all arrays."""
     structure: PyTree = jax.tree.structure(low)
     if structure != jax.tree.structure(high):

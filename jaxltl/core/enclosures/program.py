@@ -95,7 +95,7 @@ Operation = Select | MatrixProduct | Elementwise
 
 
 @dataclass(frozen=True)
-class Program:
+class StraightLineProgram:
     """A straight-line program on flat vectors."""
 
     operations: tuple[Operation, ...]
@@ -106,7 +106,7 @@ class Program:
     output_tree: jax.tree_util.PyTreeDef
 
 
-def make_program(function: Callable[..., PyTree], *args: PyTree) -> Program:
+def make_program(function: Callable[..., PyTree], *args: PyTree) -> StraightLineProgram:
     """The program of a JAX function at arguments of given shapes and dtypes.
 
     Raises:
@@ -124,7 +124,7 @@ def make_program(function: Callable[..., PyTree], *args: PyTree) -> Program:
     builder = _Builder()
     inputs = [builder.new(spec_of(v)) for v in closed.jaxpr.invars]
     outputs = builder.inline(closed.jaxpr, closed.consts, inputs)
-    return Program(
+    return StraightLineProgram(
         tuple(builder.operations),
         tuple(inputs),
         builder.known,

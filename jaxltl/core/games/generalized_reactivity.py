@@ -36,7 +36,7 @@ class Layers(NamedTuple):
 NEVER = np.iinfo(np.int32).max
 
 
-class _Arena(NamedTuple):
+class _GR1Arena(NamedTuple):
     """A game graph with its owners and its objective."""
 
     graph: Graph
@@ -46,7 +46,7 @@ class _Arena(NamedTuple):
 
 def solve_gr1(graph: Graph, system: Array, objective: GR1, moves: Array | None = None) -> Reactive:
     """Winning region of a GR(1) objective, and winning strategies of both players."""
-    xp, arena = graph.xp, _Arena(graph, system, objective)
+    xp, arena = graph.xp, _GR1Arena(graph, system, objective)
     num_guarantees, num_assumptions = len(objective.guarantees), len(objective.assumptions)
     moves = graph.available if moves is None else moves & graph.available
     _, first = graph.first(moves)
@@ -69,26 +69,26 @@ def solve_gr1(graph: Graph, system: Array, objective: GR1, moves: Array | None =
     return Reactive(region, xp.stack(actions, axis=-1), xp.moveaxis(counters, 0, -1))
 
 
-def _keep(arena: _Arena, moves: Array, inside: Array, counters: Array) -> tuple[Array, Array]:
+def _keep(arena: _GR1Arena, moves: Array, inside: Array, counters: Array) -> tuple[Array, Array]:
     """The subset in which the system can remain."""
     graph, system, _ = arena
     out = attract(graph, ~inside, moves, rule=~system, among=inside)
     return inside & ~out.region, graph.xp.where(inside & out.region, out.action, counters)
 
 
-def _within(arena: _Arena, moves: Array, inside: Array) -> Array:
+def _within(arena: _GR1Arena, moves: Array, inside: Array) -> Array:
     """Moves of the system that surely stay inside, and all moves of the environment."""
     result: Array = moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
     return result
 
 
-def _near(arena: _Arena, target: Array) -> Array:
+def _near(arena: _GR1Arena, target: Array) -> Array:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
     result: Array = arena.graph.exists(target) & ~arena.graph.on_choices(arena.system)
     return result
 
 
-def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array, Array]:
+def _pursue(arena: _GR1Arena, j: int, inside: Array, allowed: Array) -> tuple[Array, Array]:
     """States from which the system, inside a set, meets guarantee j or an assumption fails."""
     graph, system, objective = arena
     xp = graph.xp
@@ -112,7 +112,7 @@ def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array
 
 
 def _waiting(
-    arena: _Arena, i: int, inside: Array, allowed: Array, excluded: Array, target: Array
+    arena: _GR1Arena, i: int, inside: Array, allowed: Array, excluded: Array, target: Array
 ) -> Array:
     """States in which assumption i fails while the play is outside `excluded` and not near `target`."""
     missed = inside & ~excluded
@@ -126,7 +126,7 @@ def _waiting(
     return inside & ~forced.region
 
 
-def _prevent(arena: _Arena, inside: Array, allowed: Array, target: Array) -> Array:
+def _prevent(arena: _GR1Arena, inside: Array, allowed: Array, target: Array) -> Array:
     """Moves of the environment, ``int32[M, S]``, that meet every assumption and avoid a set."""
     graph, system, objective = arena
     missed = inside & ~target
@@ -142,7 +142,7 @@ def _prevent(arena: _Arena, inside: Array, allowed: Array, target: Array) -> Arr
 
 def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:
     """Rounds of the triple fixpoint inside the region, one step each."""
-    xp, arena = graph.xp, _Arena(graph, system, objective)
+    xp, arena = graph.xp, _GR1Arena(graph, system, objective)
     # In round r, with Y the states covered before, layer (r, i) is the greatest X from which the
     # system, moving within the region, is at guarantee j, or enters Y with positive probability, or
     # stays in X where assumption i does not hold.

@@ -138,7 +138,7 @@ def permissive_strategy(
         )
     if isinstance(objective, Parity):
         objective = _without_won(objective)
-    arena = _Arena(world, graph, objective)
+    arena = _PermissiveArena(world, graph, objective)
     region = _region(arena)
     _require_start(world, region)
     stay = staying(graph, region)
@@ -238,7 +238,7 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
 # --- shared by all methods -------------------------------------------------------------------
 
 
-class _Arena(NamedTuple):
+class _PermissiveArena(NamedTuple):
     """A game in NumPy arrays, its graph, and the system's objective."""
 
     game: Game
@@ -258,7 +258,7 @@ def concrete_graph(game: Game, objective: Parity | GR1 | None = None) -> RowGrap
     return graph
 
 
-def _region(arena: _Arena) -> np.ndarray:
+def _region(arena: _PermissiveArena) -> np.ndarray:
     solve: Callable[..., PyTree] = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
     result: np.ndarray = solve(arena.graph, arena.game.system, arena.objective).region
     return result
@@ -285,7 +285,7 @@ def _require_start(game: Game, region: np.ndarray) -> None:
         )
 
 
-def _always_wins(arena: _Arena, region: np.ndarray, mask: np.ndarray) -> bool:
+def _always_wins(arena: _PermissiveArena, region: np.ndarray, mask: np.ndarray) -> bool:
     """True if every path within a mask achieves the objective."""
     _, graph, objective = arena
     if isinstance(objective, Parity) and objective.num_priorities == 1:
@@ -328,8 +328,8 @@ def _is_lazy(game: Game) -> bool:
 
 
 def _explicit(
-    arena: _Arena, region: np.ndarray, mask: np.ndarray
-) -> tuple[_Arena, Restriction | None]:
+    arena: _PermissiveArena, region: np.ndarray, mask: np.ndarray
+) -> tuple[_PermissiveArena, Restriction | None]:
     """The game with explicit states, restricted to its winning region."""
     game, _, objective = arena
     if not _is_lazy(game):
@@ -338,7 +338,7 @@ def _explicit(
     restriction = jax.tree.map(np.asarray, restrict(game, start / start.sum(), allowed=mask))
     origin = restriction.base_state * game.state_shape[1] + restriction.memory
     model = restriction.model
-    return _Arena(model, concrete_graph(model), _at(objective, origin)), restriction
+    return _PermissiveArena(model, concrete_graph(model), _at(objective, origin)), restriction
 
 
 def _at(objective: Parity | GR1, origin: np.ndarray) -> PyTree:
@@ -405,7 +405,7 @@ def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restrict
 # --- the methods ------------------------------------------------------------------------------
 
 
-def _by_rank(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
+def _by_rank(arena: _PermissiveArena, region: Array, stay: Array, bound: int | None) -> Permissive:
     del bound
     game, graph, objective = arena
     if isinstance(objective, GR1):
@@ -433,7 +433,7 @@ def _some_nearer(graph: RowGraph, rank: np.ndarray, region: np.ndarray) -> np.nd
     return graph.least(rank) < rank[..., None]
 
 
-def _by_layers(arena: _Arena, region: Array, stay: Array) -> Permissive:
+def _by_layers(arena: _PermissiveArena, region: Array, stay: Array) -> Permissive:
     arena, origin = _explicit(arena, region, stay)
     game, graph, objective = arena
     layers: PyTree = gr1_layers(graph, game.system, objective)
@@ -471,7 +471,9 @@ def pursuing(game: Game, sets: Booleans) -> Game:
     return _beside(game, step, 0, letter.ravel(), "exit")
 
 
-def _by_counter(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
+def _by_counter(
+    arena: _PermissiveArena, region: Array, stay: Array, bound: int | None
+) -> Permissive:
     if not _is_buchi(arena.objective):
         raise ValueError('method="counter" is for Buchi objectives; choose parity.')
     if bound is None:
@@ -500,7 +502,9 @@ def _by_counter(arena: _Arena, region: Array, stay: Array, bound: int | None) ->
     )
 
 
-def _by_parity(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
+def _by_parity(
+    arena: _PermissiveArena, region: Array, stay: Array, bound: int | None
+) -> Permissive:
     if not isinstance(arena.objective, Parity):
         raise ValueError(
             'method="parity" is for parity objectives; GR(1) has rank, and as a '
@@ -577,7 +581,7 @@ def _safe_beside(
         num_priorities=objective.num_priorities,
     )
     graph = concrete_graph(joint)
-    region = _region(_Arena(joint, graph, safe))
+    region = _region(_PermissiveArena(joint, graph, safe))
     if not _wins_somewhere(joint, region):
         if bound is None:
             raise ValueError(

@@ -21,7 +21,7 @@ from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.sparse.rows import concatenated_ranges
 
 
-class Explored(NamedTuple):
+class ReachedNodes(NamedTuple):
     """The N nodes that are reached under a strategy, with a state of the world and a memory each."""
 
     game: Game  # with successor lists, and the moves that the strategy allows
@@ -76,7 +76,7 @@ def strategy_policy(
     return policy_of_nodes(part, count, task=task, actions=actions)
 
 
-def explored(strategy: Winning | Permissive, player: str = "system") -> Explored:
+def explored(strategy: Winning | Permissive, player: str = "system") -> ReachedNodes:
     """The part of a game that a player's strategy reaches from the initial states that it wins."""
     validation.choice("player", player, ("system", "environment"))
     if isinstance(strategy, Permissive):
@@ -93,7 +93,7 @@ def explored(strategy: Winning | Permissive, player: str = "system") -> Explored
     part = restrict(game, initial / initial.sum(), allowed=allowed)
     at, memory = np.asarray(part.base_state), np.asarray(part.memory)
     _, key = np.unique(np.stack([old[at], memory]), axis=1, return_inverse=True)
-    return Explored(part.model, base[at], memory if not old.any() else key.ravel())
+    return ReachedNodes(part.model, base[at], memory if not old.any() else key.ravel())
 
 
 def _moves(winning: Winning, system: bool) -> tuple[Game, Booleans, Booleans, Integers, Integers]:
@@ -120,7 +120,7 @@ def _moves(winning: Winning, system: bool) -> tuple[Game, Booleans, Booleans, In
 
 
 def policy_of_nodes(
-    part: Explored,
+    part: ReachedNodes,
     num_states: int,
     *,
     skipped: Booleans | None = None,

@@ -89,7 +89,7 @@ def verify(winning: Winning) -> Verification:
     return Verification(not system, not environment, reason)
 
 
-class _Moves(NamedTuple):
+class _GameMoves(NamedTuple):
     """The moves of a game over flat states, in order of states and actions."""
 
     state: Integers  # of each move
@@ -102,7 +102,7 @@ class _Claim(NamedTuple):
     """A ``Winning`` with flat states: ``[S]``, actions ``[S, memories]``, sets ``[n, S]``."""
 
     shape: tuple[int, ...]  # of the game's states
-    moves: _Moves
+    moves: _GameMoves
     system: Booleans
     region: Booleans
     won: Booleans
@@ -295,12 +295,12 @@ def _induced_mdp(claim: _Claim, owner: Booleans, action: Integers, goals: Boolea
     return _InducedMDP(source, pair, target, pair[order], start, of_pair, nodes, memories)
 
 
-def _moves(game: Game) -> _Moves:
+def _moves(game: Game) -> _GameMoves:
     """All moves of a game; the actions of a sparse one are its rows."""
     model = to_sparse(game.mdp)
     host, row = model.host, np.arange(model.num_rows)
     action = row if is_sparse(game.mdp) else np.asarray(model.action)
-    return _Moves(*(x.astype(int) for x in (host.state, action, host.row, host.successor)))
+    return _GameMoves(*(x.astype(int) for x in (host.state, action, host.row, host.successor)))
 
 
 def _component(play: _InducedMDP, inside: Booleans, meet: Booleans) -> int | None:

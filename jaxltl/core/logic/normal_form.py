@@ -213,14 +213,14 @@ class Rewriter:
 
 
 @dataclass(frozen=True)
-class Part:
+class LimitPart:
     """A leaf of a combination; its kind is `"sigma2"`, `"pi2"` or `"limit"`, joined `G F` or `F G`."""
 
     kind: str
     formula: Formula
 
 
-Combination = Part | tuple[Any, ...]  # ("&" | "|", combination, ...)
+Combination = LimitPart | tuple[Any, ...]  # ("&" | "|", combination, ...)
 
 
 def limit_parts(formula: Formula) -> tuple[Formula, ...]:
@@ -241,9 +241,11 @@ def combination(
     return parts
 
 
-def leaves(parts: Combination) -> list[Part]:
+def leaves(parts: Combination) -> list[LimitPart]:
     """The parts of a combination."""
-    return [parts] if isinstance(parts, Part) else [x for part in parts[1:] for x in leaves(part)]
+    return (
+        [parts] if isinstance(parts, LimitPart) else [x for part in parts[1:] for x in leaves(part)]
+    )
 
 
 def extent(parts: Combination) -> int:
@@ -255,13 +257,13 @@ def _combine(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) ->
     if is_limit(formula):
         normal = rewriter.map_limits(formula)
         if is_limit(normal):
-            return Part("limit", normal)
+            return LimitPart("limit", normal)
         return _combine(normal, grouped, dual, rewriter)
     if formula.operator in ("&", "|"):
         return _join(formula, grouped, dual, rewriter)
     kind = _kind(formula)
     if kind:
-        return Part(kind, formula)
+        return LimitPart(kind, formula)
     if formula.operator == "X" and formula.operands[0].operator in ("&", "|"):
         below = formula.operands[0]
         distributed = Formula(below.operator, tuple(next_step(f) for f in below.operands))
@@ -294,7 +296,7 @@ def _join(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Co
     for kind, formulas in together.items():
         if formulas:
             whole = rebuild(formula.operator, formulas)
-            one = Part(kind, whole) if _kind(whole) else None
+            one = LimitPart(kind, whole) if _kind(whole) else None
             parts.append(one or _combine(whole, grouped, dual, rewriter))
     flat = [p for part in parts for p in _same(formula.operator, part)]
     parts = _joined_limits(formula.operator, flat, grouped)
@@ -302,7 +304,7 @@ def _join(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Co
 
 
 def _same(operator: str, parts: Combination) -> tuple[Combination, ...]:
-    return parts[1:] if not isinstance(parts, Part) and parts[0] == operator else (parts,)
+    return parts[1:] if not isinstance(parts, LimitPart) and parts[0] == operator else (parts,)
 
 
 def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> list[Combination]:
@@ -312,7 +314,7 @@ def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> li
     """
     outer, turning = ("F", "G") if operator == "&" else ("G", "F")
     inner = "G" if outer == "F" else "F"
-    limits = [p.formula for p in parts if isinstance(p, Part) and p.kind == "limit"]
+    limits = [p.formula for p in parts if isinstance(p, LimitPart) and p.kind == "limit"]
     single = [f for f in limits if is_limit(f)]
     plain = [f for f in single if f.operator == outer and _is_propositional_limit(f)]
     moving = [f for f in single if f.operator == turning]
@@ -324,9 +326,9 @@ def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> li
     if grouped and len(moving) > 1 and not all(map(_is_propositional_limit, moving)):
         joined.append(rebuild(operator, moving))
         limits = [f for f in limits if f not in moving]
-    others = [p for p in parts if not (isinstance(p, Part) and p.kind == "limit")]
+    others = [p for p in parts if not (isinstance(p, LimitPart) and p.kind == "limit")]
     constant = (TRUE, FALSE)
-    return others + [Part("sigma2" if f in constant else "limit", f) for f in limits + joined]
+    return others + [LimitPart("sigma2" if f in constant else "limit", f) for f in limits + joined]
 
 
 def _is_propositional_limit(formula: Formula) -> bool:

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from jaxltl.core.models.number_source import NumberSource, Part, Rationals
+from jaxltl.core.models.number_source import NumberSource, Part, RationalNumbers
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 
@@ -15,7 +15,7 @@ _DENOMINATOR = 10**6  # of fractions as which doubles are read; chance agreement
 _CLOSE = 1e-12  # relative difference of a number and its double, after products
 
 
-def exact_numbers(model: SparseMDP) -> Rationals:
+def exact_numbers(model: SparseMDP) -> RationalNumbers:
     """The rational numbers of a model: those of its source, where they round to its doubles.
 
     Otherwise they are the doubles, as rows that are divided by their sums.
@@ -33,11 +33,13 @@ def exact_numbers(model: SparseMDP) -> Rationals:
     return written
 
 
-def _doubles_of(model: SparseMDP) -> Rationals:
-    return Rationals(_normalised(model, [Fraction(x) for x in model.host.probability.tolist()]), {})
+def _doubles_of(model: SparseMDP) -> RationalNumbers:
+    return RationalNumbers(
+        _normalised(model, [Fraction(x) for x in model.host.probability.tolist()]), {}
+    )
 
 
-def decimal_numbers(model: SparseMDP) -> Rationals:
+def decimal_numbers(model: SparseMDP) -> RationalNumbers:
     """Rows and rewards of a text file, read as fractions and decimals.
 
     A double stands for the fraction with a denominator of at most 10^6 that rounds to it, else for
@@ -52,7 +54,7 @@ def decimal_numbers(model: SparseMDP) -> Rationals:
         name: (_written(reward.state), _written(reward.choice), _written(reward.transition))
         for name, reward in model.rewards.items()
     }
-    return Rationals(_normalised(model, probability), rewards)
+    return RationalNumbers(_normalised(model, probability), rewards)
 
 
 def written_number(x: float) -> Fraction:
@@ -62,7 +64,7 @@ def written_number(x: float) -> Fraction:
 
 
 def exact_reward(
-    model: SparseMDP, numbers: Rationals, reward: Rewards, name: str | None
+    model: SparseMDP, numbers: RationalNumbers, reward: Rewards, name: str | None
 ) -> list[Fraction]:
     """Expected rewards of choices; ValueError if some are not finite."""
     state, choice, transition = numbers.rewards.get(name or "", (None, None, None))
@@ -80,7 +82,9 @@ def exact_reward(
     return total
 
 
-def exact_state_reward(numbers: Rationals, reward: Rewards, name: str | None) -> list[Fraction]:
+def exact_state_reward(
+    numbers: RationalNumbers, reward: Rewards, name: str | None
+) -> list[Fraction]:
     """Rewards of states."""
     state = _agreeing(numbers.rewards.get(name or "", (None,))[0], reward.state)
     assert state is not None

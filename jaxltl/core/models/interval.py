@@ -307,7 +307,7 @@ def interval_rows(
             f"rewards is {validation.shorten(rewards)}; give a dict of Rewards by name."
         )
     rows, rewards = _merged(
-        _Rows(starts, entry_start, successor, lower, upper, *ball_rows), dict(rewards or {})
+        _IntervalRows(starts, entry_start, successor, lower, upper, *ball_rows), dict(rewards or {})
     )
     rows = _collapse_empty_rows(_tightened_by_balls(_scaled(rows)))
     ball = None if rows.center is None else Ball(rows.center, rows.radius / 2)
@@ -322,7 +322,7 @@ def interval_rows(
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _IntervalRows:
     """Rows of interval models under construction."""
 
     row_start: np.ndarray
@@ -376,7 +376,9 @@ def _ball(
     return center, radius
 
 
-def _merged(rows: _Rows, rewards: dict[str, Rewards]) -> tuple[_Rows, dict[str, Rewards]]:
+def _merged(
+    rows: _IntervalRows, rewards: dict[str, Rewards]
+) -> tuple[_IntervalRows, dict[str, Rewards]]:
     """Checked ends, with those of repeated successors of a row added up."""
     rows.require(
         (rows.lower >= 0) & (rows.lower <= rows.upper) & (rows.upper <= 1 + ROW_SUM_TOLERANCE),
@@ -407,7 +409,7 @@ def _merged(rows: _Rows, rewards: dict[str, Rewards]) -> tuple[_Rows, dict[str, 
         rewards = rewards | {name: replace(reward, transition=earned[first])}
     lower, upper = np.bincount(group, rows.lower), np.bincount(group, rows.upper)
     count = np.bincount(rows.row[first], minlength=rows.entry_start.size - 1)
-    merged = _Rows(
+    merged = _IntervalRows(
         rows.row_start,
         offsets_from_counts(count),
         rows.successor[first],
@@ -419,7 +421,7 @@ def _merged(rows: _Rows, rewards: dict[str, Rewards]) -> tuple[_Rows, dict[str, 
     return merged, rewards
 
 
-def _scaled(rows: _Rows) -> _Rows:
+def _scaled(rows: _IntervalRows) -> _IntervalRows:
     """Ends scaled where they miss a distribution by little."""
     low, high = rows.sums(rows.lower), rows.sums(rows.upper)
     rows.require(
@@ -442,7 +444,7 @@ def _scaled(rows: _Rows) -> _Rows:
     return replace(rows, lower=lower, upper=np.clip(np.maximum(upper, lower), 0, 1))
 
 
-def _tightened_by_balls(rows: _Rows) -> _Rows:
+def _tightened_by_balls(rows: _IntervalRows) -> _IntervalRows:
     """Checked L1 balls, and intervals tightened by them."""
     lower, upper, center, radius = rows.ends.values()
     if center is None:
@@ -492,7 +494,7 @@ def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
     return np.where(side * rest > 0, np.nextafter(total, side * np.inf), total)
 
 
-def _collapse_empty_rows(rows: _Rows) -> _Rows:
+def _collapse_empty_rows(rows: _IntervalRows) -> _IntervalRows:
     """Ends made equal in rows that hold no distribution because of rounding."""
     # To the upper ends where these sum to less than one, to the lower ones where these sum to more,
     # and to the center of a ball that is farther from all distributions than its radius.

@@ -13,7 +13,7 @@ from jaxltl.core.sparse.exact.model import ExactMDP
 Part = Sequence[Fraction] | None  # of states, of choices or of transitions
 
 
-class Rationals(NamedTuple):
+class RationalNumbers(NamedTuple):
     """Rational numbers of a model."""
 
     mdp: ExactMDP
@@ -27,9 +27,9 @@ class NumberSource:
     All sources are equal, so that models share compiled programs.
     """
 
-    read: Callable[[PyTree], Rationals | None] | None = None  # None: doubles mean themselves
+    read: Callable[[PyTree], RationalNumbers | None] | None = None  # None: doubles mean themselves
     # The last model's arrays of successors and probabilities, and their numbers.
-    known: list[tuple[object, object, Rationals]] = field(default_factory=list, repr=False)
+    known: list[tuple[object, object, RationalNumbers]] = field(default_factory=list, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, NumberSource)

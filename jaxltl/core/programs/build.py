@@ -20,10 +20,16 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.exact import rational_numbers
-from jaxltl.core.programs.explore import Explored, Progress, RewardParts, Search
-from jaxltl.core.programs.packed_states import Layout, Reader, Words, initial_columns, make_layout
+from jaxltl.core.programs.explore import Explored, Progress, RewardParts, BreadthFirstSearch
+from jaxltl.core.programs.packed_states import (
+    Layout,
+    StateReader,
+    Words,
+    initial_columns,
+    make_layout,
+)
 from jaxltl.core.programs.local_choices import Functions, Intervals, Numbers, state_text
-from jaxltl.core.programs.rows import Rows as Rows
+from jaxltl.core.programs.rows import ProgramRows as ProgramRows
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 MAX_STATES = 10_000_000
@@ -93,7 +99,7 @@ def build_rows(
     max_states: int = MAX_STATES,
     progress: Progress | None = None,
     weights: Numbers | None = None,
-) -> Rows:
+) -> ProgramRows:
     """Rows of the model of a program, also of one with parameters; see :func:`build_model`."""
     max_states = validation.integer("max_states", max_states, least=1, limit=2**31 - 2)
     layout = make_layout(program.variables)
@@ -102,13 +108,13 @@ def build_rows(
         weights = Functions() if program.parameters else intervals
     try:
         initial = layout.packed(*initial_columns(program, max_states))
-        explored = Search(program, layout, weights, max_states).run(initial, progress)
+        explored = BreadthFirstSearch(program, layout, weights, max_states).run(initial, progress)
         return _rows(program, explored, weights)
     except LanguageError as error:
         raise program.source.located(error) from None
 
 
-def _rows(program: Program, explored: Explored, weights: Numbers) -> Rows:
+def _rows(program: Program, explored: Explored, weights: Numbers) -> ProgramRows:
     size = explored.words[0].size
     explored.rewards.update(
         (r.name, _reward_parts(explored, weights, r.items)) for r in program.rewards
@@ -134,7 +140,7 @@ def _rows(program: Program, explored: Explored, weights: Numbers) -> Rows:
             v.name: _column(explored.layout, explored.words, v.name) for v in program.variables
         },
     }
-    return Rows(
+    return ProgramRows(
         offsets_from_counts(explored.row_count),
         offsets_from_counts(explored.entry_count),
         explored.successor,
@@ -168,7 +174,7 @@ def on_states(
     parts: list[list[NDArray[Any]]] = [[] for _ in expressions]
     for begin in range(0, size, _PART):
         some = tuple(w[begin : begin + _PART] for w in words)
-        values = compiled(Reader(layout, some))
+        values = compiled(StateReader(layout, some))
         for part, value in zip(parts, values, strict=True):
             part.append(np.broadcast_to(value, (some[0].size,)))
     return [np.concatenate(part) for part in parts]
@@ -220,7 +226,7 @@ def _earned(
     if isinstance(weights, Functions):
         terms = [Expression("?:", (i.guard, i.value, literal(0))) for i in items]
         total = Expression("+", (literal(0), *terms))
-        return weights.numbers(total, Reader(explored.layout, words), states.size)
+        return weights.numbers(total, StateReader(explored.layout, words), states.size)
     values = on_states(explored.layout, words, [e for i in items for e in (i.guard, i.value)])
     earned = np.zeros(states.size)
     for item, guard, value in zip(items, values[::2], values[1::2], strict=True):
@@ -315,7 +321,9 @@ def _owners(program: Program, explored: Explored) -> Integers:
     several = (owner[state] != of_row) | ((of_row < 0) & (explored.row_count[state] > 1))
     if several.any():
         i = int(state[np.argmax(several)])
-        text = state_text(Reader(explored.layout, tuple(w[i : i + 1] for w in explored.words)), 0)
+        text = state_text(
+            StateReader(explored.layout, tuple(w[i : i + 1] for w in explored.words)), 0
+        )
         raise LanguageError(
             0,
             f"the choices of the state {text} belong to several players or to none; in a "

@@ -11,16 +11,16 @@ import numpy as np
 from jaxltl.core.language.exact import exact_program, exact_tree, exact_value
 from jaxltl.core.language.expressions import Expression
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.models.number_source import Part, Rationals
+from jaxltl.core.models.number_source import Part, RationalNumbers
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.programs.local_choices import Functions, Weight
-from jaxltl.core.programs.rows import Rows
+from jaxltl.core.programs.rows import ProgramRows
 from jaxltl.core.sparse.exact.model import ZERO, ExactMDP, pairs
 
 
 def rational_numbers(
-    program: Program, build_rows: Callable[..., Rows], model: SparseMDP
-) -> Rationals | None:
+    program: Program, build_rows: Callable[..., ProgramRows], model: SparseMDP
+) -> RationalNumbers | None:
     """The numbers of the model of a program in rational arithmetic; None if some are irrational."""
     exact = exact_program(program)
     if exact is None:
@@ -54,7 +54,7 @@ def rational_numbers(
         total = sum(row.values())
         distributions.append({t: p / total for t, p in row.items()})
     states, order = _order(rows, distributions, model, place)
-    return Rationals(
+    return RationalNumbers(
         ExactMDP(model.host.row_start.tolist(), [distributions[r] for r in order]),
         {
             name: (
@@ -67,7 +67,7 @@ def rational_numbers(
     )
 
 
-def _places(rows: Rows, model: SparseMDP) -> list[int] | None:
+def _places(rows: ProgramRows, model: SparseMDP) -> list[int] | None:
     """The state of the model with the valuation of each state; searches differ in their order."""
     valuation = rows.annotations["valuation"]
     columns = [np.asarray(model.valuation[name]).tolist() for name in valuation]
@@ -78,7 +78,7 @@ def _places(rows: Rows, model: SparseMDP) -> list[int] | None:
 
 
 def _order(
-    rows: Rows, distributions: list[dict[int, Fraction]], model: SparseMDP, place: list[int]
+    rows: ProgramRows, distributions: list[dict[int, Fraction]], model: SparseMDP, place: list[int]
 ) -> tuple[list[int], list[int]]:
     """The state and the row of the exact model for each of a model, by actions and numbers."""
     states = np.argsort(place).tolist()

@@ -16,7 +16,7 @@ from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.language.expressions import Expression, LanguageError, SCALAR
 from jaxltl.core.language.syntax import Command, Module, Program
 from jaxltl.core.programs.local_choices import (
-    Choices,
+    EnabledCommands,
     LocalTable,
     ModuleCode,
     Numbers,
@@ -169,7 +169,7 @@ def search_narrow(
     narrow = Narrow(keys, {k: i for i, k in enumerate(keys)})
     try:
         modules = [
-            _Module(generate(m, code.actions, layout), i, code, parts)
+            _ModuleChoices(generate(m, code.actions, layout), i, code, parts)
             for i, (m, code) in enumerate(zip(program.modules, codes, strict=True))
         ]
     except Unsupported:
@@ -191,7 +191,7 @@ def search_narrow(
     return narrow
 
 
-class _Module:
+class _ModuleChoices:
     """Choices of a module by the bits of the variables that it uses."""
 
     def __init__(
@@ -223,7 +223,10 @@ class _Module:
 
 
 def _expand(
-    key: int, modules: list[_Module], parts: Sequence[tuple[tuple[int, int], ...]], narrow: Narrow
+    key: int,
+    modules: list[_ModuleChoices],
+    parts: Sequence[tuple[tuple[int, int], ...]],
+    narrow: Narrow,
 ) -> None:
     """Adds the choices and the new successors of a state."""
     local = [m.choices(key) for m in modules]
@@ -309,7 +312,7 @@ class Explored:
 
 
 @dataclass(frozen=True)
-class _Column:
+class _ActionColumn:
     """A synchronisation: an action, or the commands without an action of a module."""
 
     action: int
@@ -317,7 +320,7 @@ class _Column:
     parts: tuple[tuple[int, int], ...]  # modules, and the column of the action in each
 
 
-class Search:
+class BreadthFirstSearch:
     """Breadth-first search from the initial states.
 
     Its methods raise LanguageError: more than `max_states` states, or an update that is no
@@ -407,7 +410,7 @@ class Search:
         total_of = total[state, cell].astype(np.int64)
         place = concatenated_ranges(np.zeros(total_of.size, np.int64), total_of)
         cells = np.arange(state.size).repeat(total_of)
-        rows = _Rows(state[cells], cell[cells], place, [None] * len(self.tables))
+        rows = _JointChoices(state[cells], cell[cells], place, [None] * len(self.tables))
         self._choose(rows, local, counts)
         self._add(
             row_count=total.sum(1),
@@ -417,7 +420,10 @@ class Search:
         self._expand_rows(rows, [table for table, _ in local], words)
 
     def _choose(
-        self, rows: _Rows, local: list[tuple[Choices, Integers]], counts: Sequence[Integers]
+        self,
+        rows: _JointChoices,
+        local: list[tuple[EnabledCommands, Integers]],
+        counts: Sequence[Integers],
     ) -> None:
         """The command of each module in each joint choice: digits of its number in mixed radix."""
         rest = rows.place
@@ -434,7 +440,9 @@ class Search:
                 rest[part] //= number
                 rows.chosen[m] = part, table.first[index[state], chosen] + digit
 
-    def _expand_rows(self, rows: _Rows, tables: list[Choices], words: Words) -> None:
+    def _expand_rows(
+        self, rows: _JointChoices, tables: list[EnabledCommands], words: Words
+    ) -> None:
         """Joint updates of the choices: sums of changes and products of probabilities."""
         count = np.ones(rows.state.size)
         for table, chosen in zip(tables, rows.chosen, strict=True):
@@ -462,7 +470,12 @@ class Search:
             begin = stop
 
     def _entries(
-        self, rows: _Rows, tables: list[Choices], words: Words, begin: int, stop: int
+        self,
+        rows: _JointChoices,
+        tables: list[EnabledCommands],
+        words: Words,
+        begin: int,
+        stop: int,
     ) -> None:
         """Successors of the rows from `begin` to `stop`: products of one module after the other."""
         size = stop - begin
@@ -502,7 +515,7 @@ class Search:
 
 
 @dataclass
-class _Rows:
+class _JointChoices:
     """Joint choices of some states."""
 
     state: Integers  # of each choice, ascending
@@ -512,15 +525,15 @@ class _Rows:
     chosen: list[tuple[Integers, Integers] | None]
 
 
-def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_Column]:
+def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_ActionColumn]:
     """The synchronisations of a program."""
     columns = [
-        _Column(0, m, ((m, code.actions.index("")),))
+        _ActionColumn(0, m, ((m, code.actions.index("")),))
         for m, code in enumerate(codes)
         if "" in code.actions
     ]
     for i, action in enumerate(actions[1:], 1):
         users = [(m, code) for m, code in enumerate(codes) if action in code.actions]
         parts = tuple((m, code.actions.index(action)) for m, code in users)
-        columns.append(_Column(i, -1, parts))
+        columns.append(_ActionColumn(i, -1, parts))
     return columns

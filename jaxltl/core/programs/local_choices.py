@@ -22,7 +22,7 @@ from jaxltl.core.language.expressions import (
     substitute,
 )
 from jaxltl.core.language.syntax import Command, Module, Program, Variable
-from jaxltl.core.programs.packed_states import Field, HashTable, Layout, Reader, Words
+from jaxltl.core.programs.packed_states import Field, HashTable, Layout, StateReader, Words
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
 
 
@@ -39,7 +39,7 @@ class Numbers:
         """The probabilities of a command as an argument of :meth:`of`."""
         return compile_expressions([o.probability for o in command.outcomes])
 
-    def of(self, compiled: Any, read: Reader, size: int) -> list[Weight]:
+    def of(self, compiled: Any, read: StateReader, size: int) -> list[Weight]:
         """The weight of each outcome of a command in N states."""
         return [np.broadcast_to(np.asarray(w, np.float64), (size,)) for w in compiled(read)]
 
@@ -71,7 +71,7 @@ class Intervals(Numbers):
             [e for o in command.outcomes for e in (o.probability, o.upper or o.probability)]
         )
 
-    def of(self, compiled: object, read: Reader, size: int) -> list[Weight]:
+    def of(self, compiled: object, read: StateReader, size: int) -> list[Weight]:
         ends = super().of(compiled, read, size)
         return [np.stack(pair, 1) for pair in zip(ends[::2], ends[1::2], strict=True)]
 
@@ -96,10 +96,10 @@ class Functions(Numbers):
     def compiled(self, command: Command) -> Any:
         return command.outcomes
 
-    def of(self, compiled: Any, read: Reader, size: int) -> list[Weight]:
+    def of(self, compiled: Any, read: StateReader, size: int) -> list[Weight]:
         return [self.numbers(o.probability, read, size) for o in compiled]
 
-    def numbers(self, e: Expression, read: Reader, size: int) -> NDArray[np.int64]:
+    def numbers(self, e: Expression, read: StateReader, size: int) -> NDArray[np.int64]:
         """The number of the function that an expression is in each of N states."""
         fields = read.layout.fields
         names = sorted(names_in(e) & fields.keys())
@@ -145,7 +145,7 @@ class Functions(Numbers):
 
 
 @dataclass(frozen=True)
-class Choices:
+class EnabledCommands:
     """Enabled commands of a module in N states, by state and action.
 
     A row is an enabled command. Rows of state s and action a are ``first[s, a]`` to
@@ -206,10 +206,10 @@ class ModuleCode:
         )
 
     @np.errstate(all="ignore")
-    def choices(self, words: Words) -> Choices:
+    def choices(self, words: Words) -> EnabledCommands:
         """Choices of the module in N states; raises LanguageError for an invalid update."""
         size, width = words[0].size, len(self.actions)
-        read = Reader(self.layout, words)
+        read = StateReader(self.layout, words)
         count = np.zeros(size * width, np.int32)
         enabled: list[tuple[_Code, Integers]] = []
         met = self.conditions(read)
@@ -235,7 +235,7 @@ class ModuleCode:
             fill[cell] += 1
             part = read
             if states.size < size:
-                part = Reader(self.layout, tuple(w[states] for w in words))
+                part = StateReader(self.layout, tuple(w[states] for w in words))
             number, change, weight = self._updates(code, part, states.size)
             start[row] = end + np.cumsum(number) - number
             widths[row] = number
@@ -243,7 +243,7 @@ class ModuleCode:
             weights.append(weight)
             for parts, one in zip(changes, change, strict=True):
                 parts.append(one)
-        return Choices(
+        return EnabledCommands(
             count.reshape(size, width),
             first.reshape(size, width),
             start,
@@ -253,7 +253,7 @@ class ModuleCode:
         )
 
     def _updates(
-        self, code: _Code, read: Reader, size: int
+        self, code: _Code, read: StateReader, size: int
     ) -> tuple[Integers, tuple[NDArray[np.uint64], ...], Weight]:
         """Number of updates of each row, and changes and weights of all, row by row."""
         outcomes = len(code.targets)
@@ -279,7 +279,7 @@ class ModuleCode:
             return np.full(size, outcomes), flat, table.reshape(-1, *table.shape[2:])
         return possible.sum(1), tuple(x[possible] for x in change), table[possible]
 
-    def _check_weights(self, command: Command, weights: list[Weight], read: Reader) -> None:
+    def _check_weights(self, command: Command, weights: list[Weight], read: StateReader) -> None:
         """Raises LanguageError if some probabilities are negative or do not sum to one."""
         if self.weights.dtype is np.int64:
             return
@@ -300,7 +300,7 @@ class ModuleCode:
             )
 
     def _check_range(
-        self, command: Command, field: Field, new: Integers, possible: Booleans, read: Reader
+        self, command: Command, field: Field, new: Integers, possible: Booleans, read: StateReader
     ) -> None:
         """Raises LanguageError if an update that is possible leaves the range of a variable."""
         v = field.variable
@@ -333,7 +333,7 @@ def _shown(command: Command) -> str:
     return f"[{command.action}] {guard if len(guard) < 60 else guard[:57] + '...'}"
 
 
-def state_text(read: Reader, i: int) -> str:
+def state_text(read: StateReader, i: int) -> str:
     """The values of all variables in a state, for messages."""
     parts = []
     for name in read.layout.fields:
@@ -363,9 +363,9 @@ class LocalTable:
         self.number = np.full(1 << bits, -1, np.int32) if bits <= _DENSE_BITS else None
         self.known = HashTable(len(code.support))
         self.num_requested = self.size = 0
-        self.table: Choices | None = None
+        self.table: EnabledCommands | None = None
 
-    def choices(self, words: Words) -> tuple[Choices, Integers]:
+    def choices(self, words: Words) -> tuple[EnabledCommands, Integers]:
         """Choices, and the index of each state among those that they are of."""
         self.num_requested += words[0].size
         if self.number is not None:
@@ -402,9 +402,9 @@ class LocalTable:
         return index
 
 
-def _joined(old: Choices, more: Choices) -> Choices:
+def _joined(old: EnabledCommands, more: EnabledCommands) -> EnabledCommands:
     """The choices of two sets of states."""
-    return Choices(
+    return EnabledCommands(
         np.concatenate([old.count, more.count]),
         np.concatenate([old.first, more.first + old.start.size]),
         np.concatenate([old.start, more.start + len(old.weight)]),

@@ -68,7 +68,7 @@ class Layout:
         return tuple(words)
 
 
-class Reader:
+class StateReader:
     """Values of variables in some states, unpacked on first use."""
 
     def __init__(self, layout: Layout, words: Words) -> None:

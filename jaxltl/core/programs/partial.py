@@ -20,8 +20,8 @@ from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
-from jaxltl.core.programs.explore import Search
-from jaxltl.core.programs.packed_states import Reader, initial_columns, make_layout
+from jaxltl.core.programs.explore import BreadthFirstSearch
+from jaxltl.core.programs.packed_states import StateReader, initial_columns, make_layout
 from jaxltl.core.programs.symmetry import find_orbits
 from jaxltl.core.programs.local_choices import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
@@ -111,7 +111,7 @@ def solve_program(
             "explored in part; build the model."
         )
     try:
-        part = _Part(program, _event(program, prop), prop, max_states)
+        part = _ExpandedPart(program, _event(program, prop), prop, max_states)
         answer = _narrowed(part, prop, tolerance, report)
         if prop.relation is not None and not part.frontier.any() and part.num_states <= _SMALL:
             # All states are known: thresholds that are met with equality need fractions.
@@ -132,7 +132,9 @@ class _Event(NamedTuple):
     objective: Literal["max", "min"]
 
 
-def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | None) -> Answer:
+def _narrowed(
+    part: _ExpandedPart, prop: Property, tolerance: float, report: Report | None
+) -> Answer:
     """Expands states until the bounds are within the tolerance or decide the threshold."""
     lower, upper = np.zeros(part.num_initial), np.ones(part.num_initial)
     size = _FIRST
@@ -148,7 +150,9 @@ def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | No
         size = max(_FIRST, int(_GROWTH[part.program.kind] * part.num_expanded) + 1)
 
 
-def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
+def _answer(
+    part: _ExpandedPart, prop: Property, lower: Floats, upper: Floats, tolerance: float
+) -> Answer:
     narrow = bool((upper - lower <= tolerance).all())
     status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
     arrays: dict[str, Any] = {
@@ -206,7 +210,7 @@ def _unsupported(prop: Property) -> ValueError:
 # --- the explored part ----------------------------------------------------------------------------
 
 
-class _Conditions:
+class _StateConditions:
     """State formulas on states that need not be expanded."""
 
     def __init__(self, program: Program, formulas: Sequence[Formula], prop: Property) -> None:
@@ -229,7 +233,7 @@ class _Conditions:
         self.expressions = [program.labels[n] for n in labels]
         self.expressions += [c.expression for c in self.comparisons.values()]
 
-    def holds(self, read: Reader, size: int, initial: bool) -> list[Booleans]:
+    def holds(self, read: StateReader, size: int, initial: bool) -> list[Booleans]:
         """The truth ``bool[N]`` of each formula in N states."""
         columns = np.full((size, len(self.names)), initial)
         for i, name in enumerate(self.names):
@@ -240,7 +244,7 @@ class _Conditions:
         return [satisfying(columns, self.names, f, self.text) for f in self.formulas]
 
 
-class _Part:
+class _ExpandedPart:
     """The known states of a program, in the order in which they are found, and their choices.
 
     States where the event is decided need no expansion; the frontier has the others that are not
@@ -249,9 +253,9 @@ class _Part:
 
     def __init__(self, program: Program, event: _Event, prop: Property, max_states: int) -> None:
         self.program, self.event, self.max_states = program, event, max_states
-        self.conditions = _Conditions(program, (event.stay, event.goal), prop)
+        self.conditions = _StateConditions(program, (event.stay, event.goal), prop)
         self.layout = make_layout(program.variables)
-        self.search = Search(program, self.layout, Numbers(), 2**31 - 2)
+        self.search = BreadthFirstSearch(program, self.layout, Numbers(), 2**31 - 2)
         if "init" not in self.conditions.names:
             self.search.orbits = find_orbits(program, self.conditions.expressions)
         initial = self.layout.packed(*initial_columns(program, max_states))
@@ -323,7 +327,7 @@ class _Part:
             self.truths = np.pad(self.truths, ((0, 0), (0, 2 * size - self.truths.shape[1])))
             self.weights = np.pad(self.weights, (0, 2 * size - self.weights.size))
         words = self.search.known.words(before, size)
-        truths = self.conditions.holds(Reader(self.layout, words), size - before, before == 0)
+        truths = self.conditions.holds(StateReader(self.layout, words), size - before, before == 0)
         self.truths[:2, before:size] = truths
         self.weights[before:size] = weight
         self.size = size

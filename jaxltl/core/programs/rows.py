@@ -12,7 +12,7 @@ from jaxltl.core.programs.local_choices import Weight
 
 
 @dataclass(frozen=True)
-class Rows:
+class ProgramRows:
     """Arrays of a model before its probabilities are numbers."""
 
     # as of `~jaxltl.core.models.sparse.make_sparse`; `weight` has probabilities, their

@@ -45,7 +45,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Synchronization:
     """A group of each module that takes part in a synchronisation."""
 
     name: str
@@ -53,14 +53,14 @@ class Choice:
     groups: tuple[int, ...]
 
 
-def list_choices(program: Program) -> tuple[tuple[Group, ...], tuple[Choice, ...]]:
+def list_choices(program: Program) -> tuple[tuple[Group, ...], tuple[Synchronization, ...]]:
     """Groups of commands, and the choices that they form; ValueError for more than 4096 choices.
 
     Two commands are in one group if their guards exclude each other, by the values of at most a few
     variables. Choices without an action come first, by module, then those of each action.
     """
     groups: list[Group] = []
-    choices: list[Choice] = []
+    choices: list[Synchronization] = []
     variables = {v.name: v for v in program.variables}
     actions = sorted({c.action for m in program.modules for c in m.commands if c.action})
     everywhere = range(len(program.modules))
@@ -89,7 +89,9 @@ def list_choices(program: Program) -> tuple[tuple[Group, ...], tuple[Choice, ...
                 )
             )
         for k, joint in enumerate(product(*parts) if parts else ()):
-            choices.append(Choice(name if number == 1 else f"{name} {k + 1}", action, joint))
+            choices.append(
+                Synchronization(name if number == 1 else f"{name} {k + 1}", action, joint)
+            )
     if not choices:
         raise program.source.located(LanguageError(0, "the program has no commands to simulate."))
     return tuple(groups), tuple(choices)

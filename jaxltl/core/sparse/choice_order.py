@@ -15,7 +15,7 @@ from jaxltl.core.sparse.rows import concatenated_ranges
 _SLICE, _ENTRY, _REDUCTION, _SPAN, _REDUCED = 1000, 0.25, 2000, 20, 0.15
 
 
-class Choices(NamedTuple):
+class ChoiceOrder(NamedTuple):
     """The choices of N states, states with the most choices first, for reductions over slices.
 
     The first choices of all states come first, in order, then the second ones of states that have
@@ -58,7 +58,7 @@ class Choices(NamedTuple):
         return choice
 
 
-def choices_of(count: Integers) -> Choices:
+def choices_of(count: Integers) -> ChoiceOrder:
     """The order of choices, from the number of choices of each state ``int[N]``, at least one."""
     states = np.argsort(-count, kind="stable")
     base, sizes = (count.cumsum() - count)[states], count[states]
@@ -73,7 +73,7 @@ def choices_of(count: Integers) -> Choices:
     remaining = sizes[:wide] - ranks
     owner = np.concatenate([owner, np.repeat(np.arange(wide), remaining)])
     rank = np.concatenate([rank, ranks + concatenated_ranges(np.zeros(wide, np.int64), remaining)])
-    return Choices(states, base[owner] + rank, owner, starts, remaining.cumsum() - remaining)
+    return ChoiceOrder(states, base[owner] + rank, owner, starts, remaining.cumsum() - remaining)
 
 
 def _ranks(having: Integers) -> int:

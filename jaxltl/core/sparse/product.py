@@ -66,7 +66,7 @@ def sparse_product(
         )
     step = delta.T.astype(np.int64)  # [L, Q], so that one letter's column is together
     still = np.zeros(num_memory, bool) if still is None else still
-    world = _World(host, step, np.asarray(letter), still, on_entry)
+    world = _ProductSource(host, step, np.asarray(letter), still, on_entry)
     first = np.asarray(start[0], np.int64) * num_memory + np.asarray(start[1])
     seen = _reached(world, first)
     code = np.flatnonzero(seen)
@@ -89,7 +89,7 @@ def product_without_memory(host: HostMDP, state: Integers) -> SparseProduct:
     )
 
 
-class _World(NamedTuple):
+class _ProductSource(NamedTuple):
     host: HostMDP
     step: NDArray[np.int64]
     letter: Integers
@@ -107,7 +107,7 @@ class _World(NamedTuple):
         return target.astype(np.int64) * self.num_memory + self.step[read, memory]
 
 
-def _reached(world: _World, start: Integers) -> Booleans:
+def _reached(world: _ProductSource, start: Integers) -> Booleans:
     """The reachable pairs, ``bool[S * Q]``, by breadth-first search."""
     host = world.host
     seen = mask_of(start, host.num_states * world.num_memory)
@@ -138,7 +138,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
     return seen
 
 
-def _searched(world: _World, start: Integers) -> Booleans:
+def _searched(world: _ProductSource, start: Integers) -> Booleans:
     """The same by SciPy's search of the whole product, in time independent of its depth."""
     from scipy.sparse import csgraph, csr_array
 
@@ -164,7 +164,7 @@ def _searched(world: _World, start: Integers) -> Booleans:
 
 
 def _written(
-    world: _World, code: Integers, number: Callable[[Integers], Integers], start: Integers
+    world: _ProductSource, code: Integers, number: Callable[[Integers], Integers], start: Integers
 ) -> SparseProduct:
     """The rows of the reachable pairs."""
     host = world.host

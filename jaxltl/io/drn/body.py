@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaxltl.io.intervals import intervals, point_rewards, joined_brackets
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.io.tokens import (
-    Block,
+    TokenBlock,
     Text,
     decoded,
     label_matrix,
@@ -24,7 +24,7 @@ from jaxltl.io.tokens import (
 )
 
 Numbers = NDArray[np.generic]  # doubles, or indices of rational functions
-Values = Callable[[Block, Integers], Numbers]  # parser of the tokens of a block
+Values = Callable[[TokenBlock, Integers], Numbers]  # parser of the tokens of a block
 
 NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
 INTERVALS = ("double-interval", "rational-interval")  # types of values
@@ -37,7 +37,7 @@ _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
 
 @dataclass(frozen=True)
-class Header:
+class DrnHeader:
     """Header of a DRN file, up to ``@model``."""
 
     kind: str  # "DTMC" or "MDP"
@@ -80,7 +80,7 @@ class Body:
 # --- the header -----------------------------------------------------------------------------
 
 
-def read_header(text: Text) -> Header:
+def read_header(text: Text) -> DrnHeader:
     """Parses the header, up to ``@model``; ValueError with the line for other model types."""
     model_line = _MODEL.search(text.data)
     if model_line is None:
@@ -118,7 +118,7 @@ def read_header(text: Text) -> Header:
     num_states = _count(text, entries, "@nr_states")
     if num_states is None:
         raise text.error(at, "expected the number of states, '@nr_states', before '@model'.")
-    return Header(
+    return DrnHeader(
         _kind(text, entries, at),
         _value_type(text, entries),
         tuple(entries.get("@parameters", (0, ""))[1].split()),
@@ -173,7 +173,7 @@ def _count(text: Text, entries: dict[str, tuple[int, str]], key: str) -> int | N
 # --- the body -------------------------------------------------------------------------------
 
 
-def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
+def read_body(header: DrnHeader, probabilities: Values, numbers: Values) -> Body:
     """Parses states, actions and transitions, with number parsers for probabilities and rewards."""
     body, text = Body(), header.body
     is_interval = header.value_type in INTERVALS
@@ -209,7 +209,7 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
     return body
 
 
-def _begins(block: Block, at: Integers, word: bytes) -> Booleans:
+def _begins(block: TokenBlock, at: Integers, word: bytes) -> Booleans:
     """Mask of the tokens that equal a word."""
     matches = block.end[at] - block.start[at] == len(word)
     for i, letter in enumerate(word):
@@ -217,7 +217,7 @@ def _begins(block: Block, at: Integers, word: bytes) -> Booleans:
     return matches
 
 
-def _order(block: Block, body: Body, is_state: Booleans, is_action: Booleans) -> Integers:
+def _order(block: TokenBlock, body: Body, is_state: Booleans, is_action: Booleans) -> Integers:
     """Index of the last state or action line up to each line of the block, or -1."""
     last = np.maximum.accumulate(np.where(is_state | is_action, np.arange(is_state.size), -1))
     within = np.where(last >= 0, is_action[last], body.after_action)
@@ -229,7 +229,7 @@ def _order(block: Block, body: Body, is_state: Booleans, is_action: Booleans) ->
 
 
 def _read_states(
-    header: Header, block: Block, body: Body, lines: Integers, numbers: Values
+    header: DrnHeader, block: TokenBlock, body: Body, lines: Integers, numbers: Values
 ) -> None:
     if not lines.size:
         return
@@ -260,7 +260,7 @@ def _read_states(
 
 
 def _read_actions(
-    block: Block, body: Body, lines: Integers, state: Integers, numbers: Values
+    block: TokenBlock, body: Body, lines: Integers, state: Integers, numbers: Values
 ) -> None:
     if not lines.size:
         return
@@ -279,7 +279,7 @@ def _read_actions(
 
 
 def _rewards(
-    block: Block, body: Body, lines: Integers, numbers: Values, form: str
+    block: TokenBlock, body: Body, lines: Integers, numbers: Values, form: str
 ) -> tuple[Numbers | None, Integers, dict[int, bytes]]:
     """Rewards ``[n, rewards]`` or None, next token index, and the rest of irregular lines."""
     at, count = block.first[:-1][lines], block.count[lines]
@@ -324,7 +324,9 @@ def _rewards(
     return reward, at + 2 + np.where(has, width, 0), rest
 
 
-def _odd_line(block: Block, line: int, width: int, form: str) -> tuple[Block | None, bytes]:
+def _odd_line(
+    block: TokenBlock, line: int, width: int, form: str
+) -> tuple[TokenBlock | None, bytes]:
     """Parses the rewards of one irregular line; returns them (or None) and the rest of the line."""
     match = _LINE.fullmatch(block.whole(line))
     if match is None:
@@ -338,10 +340,10 @@ def _odd_line(block: Block, line: int, width: int, form: str) -> tuple[Block | N
     length = np.array([len(x) for x in texts])
     end = np.cumsum(length + 1) - 1
     first, number = np.array([0, width]), block.line[line : line + 1]
-    return Block(block.text, data, end - length, end, first, number), match[2]
+    return TokenBlock(block.text, data, end - length, end, first, number), match[2]
 
 
-def _check_counts(header: Header, body: Body) -> None:
+def _check_counts(header: DrnHeader, body: Body) -> None:
     name = header.body.name
     if body.num_states != header.num_states:
         refuse(name, truncated(header.num_states, body.num_states, "states"))
@@ -385,7 +387,7 @@ class Names(TypedDict):
     valuation: NotRequired[dict[str, NDArray[np.generic]]]
 
 
-def names_of(header: Header, body: Body) -> Names:
+def names_of(header: DrnHeader, body: Body) -> Names:
     """Labels, initial states and names of actions of a DRN file."""
     text = header.body
     holds = label_matrix(text, body.num_states, len(body.label_names))
@@ -412,7 +414,7 @@ def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
     return action, tuple("" if name == NO_LABEL.decode() else name for name in names)
 
 
-def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, Numbers, Numbers]]:
+def rewards_of(header: DrnHeader, body: Body) -> Iterator[tuple[str, Numbers, Numbers]]:
     """Yields the name, state rewards ``[S]`` and choice rewards ``[R]`` (or empty arrays)."""
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:

@@ -17,7 +17,7 @@ from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,
     Body,
-    Header,
+    DrnHeader,
     names_of,
     read_body,
     read_header,
@@ -80,7 +80,7 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
         refuse(name, "it is too large for the memory.")
 
 
-def _placeholders(header: Header) -> dict[bytes, float]:
+def _placeholders(header: DrnHeader) -> dict[bytes, float]:
     values: dict[bytes, float] = {}
     for name, text in header.placeholders.items():
         number = values.get(text, as_double(text))
@@ -94,7 +94,7 @@ def _placeholders(header: Header) -> dict[bytes, float]:
     return values
 
 
-def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
+def _model(header: DrnHeader, body: Body) -> SparseMDP | IntervalMDP:
     text = header.body
     state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
     probability = np.concatenate(body.value)
@@ -113,7 +113,7 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     return replace(model, numbers=NumberSource(decimal_numbers))
 
 
-def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
+def _rewards(header: DrnHeader, body: Body) -> dict[str, Rewards]:
     """Rewards by name; all-zero arrays become None."""
     return {
         name: Rewards(state=state if state.any() else None, choice=choice if choice.any() else None)

@@ -27,7 +27,7 @@ from jaxltl.io.parametric_model import (
     parameter,
 )
 from jaxltl.io.prism.program import Constants, is_program, read_program
-from jaxltl.io.tokens import Block, Text, as_fraction, numbered, refuse
+from jaxltl.io.tokens import TokenBlock, Text, as_fraction, numbered, refuse
 
 
 def read_parametric(
@@ -86,7 +86,7 @@ def read_parametric(
                 f"which is {error}.",
             )
 
-    def values(block: Block, token: Integers) -> Integers:
+    def values(block: TokenBlock, token: Integers) -> Integers:
         texts = block.texts(token)
         indices = numbered(texts, index_of_text)
         for text in list(index_of_text)[len(functions) :]:
@@ -178,7 +178,7 @@ def _parsed(
     try:
         string = text.decode()
         if not string.startswith("$"):
-            return _Functions(parameters).function(_FunctionParser(string).whole())
+            return _RationalFunctions(parameters).function(_FunctionParser(string).whole())
     except UnicodeDecodeError:
         raise Malformed("not UTF-8") from None
     except LanguageError as error:
@@ -202,7 +202,7 @@ def _of_program(
     if program.kind == "smg" or program.has_intervals:
         raise ValueError(f"{name}: games and intervals with parameters are not supported.")
     rows = build_rows(program, max_states=MAX_STATES if max_states is None else max_states)
-    reader = _Functions(program.parameters)
+    reader = _RationalFunctions(program.parameters)
     functions = []
     for e in rows.functions:
         try:
@@ -240,7 +240,7 @@ _OPERATORS: dict[str, Callable[..., RationalFunction]] = {
 }  # fmt: skip
 
 
-class _Functions:
+class _RationalFunctions:
     """Rational functions of expressions over some parameters."""
 
     def __init__(self, parameters: Sequence[str]) -> None:

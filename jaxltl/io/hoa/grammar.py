@@ -150,7 +150,7 @@ marks: _BEGIN INT* _FINISH
 
 
 @dataclass(frozen=True)
-class Edge:
+class ParsedEdge:
     """An edge of an automaton, as parsed."""
 
     label: Tree | None
@@ -160,14 +160,14 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class State:
+class ParsedState:
     """Parsed state with its edges."""
 
     label: Tree | None
     number: Token
     name: str | None
     marks: list[Token]
-    edges: list[Edge]
+    edges: list[ParsedEdge]
     line: int
 
 
@@ -190,8 +190,10 @@ def _parser() -> Lark:
         item=list,
         property=lambda c: "".join(filter(None, c)),
         body=list,
-        state=lambda c: State(c[1], c[2], c[3] and unquoted(c[3]), c[4] or [], c[5:], c[0].line),
-        edge=lambda c: Edge(c[0], c[1], c[2] or [], c[1][0].line),
+        state=lambda c: ParsedState(
+            c[1], c[2], c[3] and unquoted(c[3]), c[4] or [], c[5:], c[0].line
+        ),
+        edge=lambda c: ParsedEdge(c[0], c[1], c[2] or [], c[1][0].line),
         guard=lambda c: c[0],
         targets=list,
         marks=list,
@@ -206,7 +208,7 @@ def _parser() -> Lark:
     return Lark(_GRAMMAR, parser="lalr", lexer=Ready, transformer=actions)
 
 
-def parse_tokens(tokens: list[Token]) -> tuple[tuple[Token, list[Item]], list[State]]:
+def parse_tokens(tokens: list[Token]) -> tuple[tuple[Token, list[Item]], list[ParsedState]]:
     """Parses version, header items and states."""
     from lark.exceptions import UnexpectedToken
 

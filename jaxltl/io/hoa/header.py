@@ -23,7 +23,7 @@ MAX_PRIORITIES = 256  # nesting depth of the acceptance formula
 
 
 @dataclass(frozen=True)
-class Header:
+class HoaHeader:
     """Header fields; `states` may be None, for a header without ``States:``."""
 
     states: int | None
@@ -39,7 +39,7 @@ class Header:
     line: int
 
 
-def read_header(version: Token, items: list[Item]) -> Header:
+def read_header(version: Token, items: list[Item]) -> HoaHeader:
     """Validates the header items and their consistency."""
     if version not in ("v1", "v1.1"):
         raise error_at(version.line, f"version {version} is unknown. Write the automaton as v1.")
@@ -76,7 +76,7 @@ def read_header(version: Token, items: list[Item]) -> Header:
                 version.line, f"the header {missing} is missing. Add it, such as '{fix}'."
             )
     _, sets, condition = headers["ACCEPTANCE"]
-    return Header(
+    return HoaHeader(
         states=int(headers["STATES"][1]) if "STATES" in headers else None,
         start=only_target(headers["START"][1], "Start:"),
         propositions=_proposition_names(headers.get("AP")),
@@ -142,7 +142,7 @@ def set_number(number: Token, sets: int) -> int:
 # --- acceptance ------------------------------------------------------------------------------
 
 
-def acceptance_of(header: Header, delta: Integers, priority: Integers) -> str:
+def acceptance_of(header: HoaHeader, delta: Integers, priority: Integers) -> str:
     """Acceptance type that the priorities allow and the `write_hoa` header names."""
     own = header.tool == "jaxltl"
     if own and header.acceptance_name == "parity":
@@ -198,7 +198,7 @@ def _belongs(marks: frozenset[int], number: int, sets: int) -> bool:
 
 
 def colors_of(
-    condition: Tree, marks: list[frozenset[int]], header: Header
+    condition: Tree, marks: list[frozenset[int]], header: HoaHeader
 ) -> tuple[NDArray[np.int64], Tree]:
     """Acceptance sets of each edge as bit masks, and the condition over bit numbers."""
     condition = residual(condition, 0, 0)

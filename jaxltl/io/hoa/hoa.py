@@ -19,13 +19,13 @@ from jaxltl.core.logic.diagram import Cube
 from jaxltl.core.logic.ltl import Letter, as_letters
 from jaxltl.io.hoa.header import (
     MAX_PRIORITIES,
-    Header,
+    HoaHeader,
     acceptance_of,
     colors_of,
     decisive_sets,
     edge_priority,
 )
-from jaxltl.io.hoa.grammar import State, split_texts
+from jaxltl.io.hoa.grammar import ParsedState, split_texts
 from jaxltl.io.hoa.table import EdgeTable, only_text, parsed, read_table
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def quoted(text: str) -> str:
 
 
 def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
-    def make(header: Header, states: list[State]) -> Automaton:
+    def make(header: HoaHeader, states: list[ParsedState]) -> Automaton:
         names = tuple(sorted(header.propositions))
         alphabet = make_alphabet(names, letters, f"read_hoa: line {header.line}")
         # Columns of the sorted alphabet in the order of AP.
@@ -218,7 +218,7 @@ def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
 
 
 def _automaton(
-    header: Header, table: EdgeTable, alphabet: NDArray[np.bool_], names: tuple[str, ...]
+    header: HoaHeader, table: EdgeTable, alphabet: NDArray[np.bool_], names: tuple[str, ...]
 ) -> Automaton:
     """Automaton with min-even priorities."""
     delta: Integers = table.target[table.edge_of]

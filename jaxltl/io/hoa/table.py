@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import letter_text
-from jaxltl.io.hoa.grammar import Edge, State, Tree, error_at, parse_tokens, split_texts
-from jaxltl.io.hoa.header import Header, only_target, read_header, set_number
+from jaxltl.io.hoa.grammar import ParsedEdge, ParsedState, Tree, error_at, parse_tokens, split_texts
+from jaxltl.io.hoa.header import HoaHeader, only_target, read_header, set_number
 
 if TYPE_CHECKING:
     from lark import Token
@@ -32,7 +32,7 @@ def only_text(text: str, hint: str = "") -> list[Token]:
     return automata[0]
 
 
-def parsed(tokens: list[Token], make: Callable[[Header, list[State]], Made]) -> Made:
+def parsed(tokens: list[Token], make: Callable[[HoaHeader, list[ParsedState]], Made]) -> Made:
     """Table of an automaton in the Hanoi format, from its header and states."""
     try:
         (version, items), states = parse_tokens(tokens)
@@ -46,9 +46,9 @@ def parsed(tokens: list[Token], make: Callable[[Header, list[State]], Made]) -> 
         ) from None
 
 
-def _by_number(header: Header, states: list[State]) -> list[State]:
+def _by_number(header: HoaHeader, states: list[ParsedState]) -> list[ParsedState]:
     """States sorted by number; validates unique definitions, the initial state and all targets."""
-    defined: dict[int, State] = {}
+    defined: dict[int, ParsedState] = {}
     for state in states:
         number = int(state.number)
         if header.states is not None and number >= header.states:
@@ -137,12 +137,14 @@ class _Letters:
         return self._numbers == number
 
 
-def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> EdgeTable:
+def read_table(
+    header: HoaHeader, states: list[ParsedState], columns: NDArray[np.bool_]
+) -> EdgeTable:
     """Transition table of the body over explicit letters."""
     algebra = _Letters(columns)
     truth = label_reader(header, algebra)
     edge_of = np.full((len(states), len(columns)), -1, np.int64)
-    edges: list[Edge] = []
+    edges: list[ParsedEdge] = []
     marks: list[frozenset[int]] = []
     for q, state in enumerate(states):
         for edge, taken in guarded_edges(header, state, algebra, truth):
@@ -167,13 +169,13 @@ def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) 
     )
 
 
-def marks_of(header: Header, state: State, edge: Edge) -> frozenset[int]:
+def marks_of(header: HoaHeader, state: ParsedState, edge: ParsedEdge) -> frozenset[int]:
     """Acceptance sets of an edge and its source state."""
     return frozenset(set_number(number, header.sets) for number in [*state.marks, *edge.marks])
 
 
 def nondeterminism(
-    header: Header, q: int, edge: Edge, other: Edge, letter: NDArray[np.bool_]
+    header: HoaHeader, q: int, edge: ParsedEdge, other: ParsedEdge, letter: NDArray[np.bool_]
 ) -> ValueError:
     """ValueError for two edges that share a letter."""
     return error_at(
@@ -185,8 +187,11 @@ def nondeterminism(
 
 
 def guarded_edges(
-    header: Header, state: State, algebra: Algebra[LetterSet], truth: Callable[[Tree], LetterSet]
-) -> Iterator[tuple[Edge, LetterSet]]:
+    header: HoaHeader,
+    state: ParsedState,
+    algebra: Algebra[LetterSet],
+    truth: Callable[[Tree], LetterSet],
+) -> Iterator[tuple[ParsedEdge, LetterSet]]:
     """Edges of a state, each with its set of letters."""
     labelled = sum(edge.label is not None for edge in state.edges)
     if state.label is not None:
@@ -219,7 +224,7 @@ def guarded_edges(
         yield from ((edge, algebra.letter(i)) for i, edge in enumerate(state.edges))
 
 
-def label_reader(header: Header, algebra: Algebra[LetterSet]) -> Callable[[Tree], LetterSet]:
+def label_reader(header: HoaHeader, algebra: Algebra[LetterSet]) -> Callable[[Tree], LetterSet]:
     """Evaluator of labels: maps a parse tree to its set of letters."""
     aliases: dict[str, LetterSet] = {}
     width = len(header.propositions)

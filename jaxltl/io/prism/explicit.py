@@ -31,7 +31,7 @@ from jaxltl.io.prism.sections import (
     written_sections,
 )
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.io.tokens import Block, Text, decoded, numbered, refuse, truncated
+from jaxltl.io.tokens import TokenBlock, Text, decoded, numbered, refuse, truncated
 
 _NAME = re.compile(
     r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL | re.IGNORECASE
@@ -218,7 +218,7 @@ def _in_one(path: Path) -> list[Section]:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _TransitionColumns:
     """Transitions as columns."""
 
     num_states: int  # S
@@ -268,7 +268,7 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
     return len(sizes) == 2, numbers, rest
 
 
-def _read_rows(text: Text) -> _Rows:
+def _read_rows(text: Text) -> _TransitionColumns:
     is_chain, sizes, rest = _sizes(text)
     width, form = (
         (3, "'state successor probability'")
@@ -303,7 +303,9 @@ def _read_rows(text: Text) -> _Rows:
             rest.line - 1,
             f"{num_states} states are announced, which {state.size} transitions cannot reach.",
         )
-    rows = _Rows(num_states, is_chain, state, choice, target, probability, action, lines, names)
+    rows = _TransitionColumns(
+        num_states, is_chain, state, choice, target, probability, action, lines, names
+    )
     new = _new_rows(text, rows, form)
     if len(sizes) == 3 and sizes[1] != new.sum():
         raise text.error(rest.line - 1, truncated(sizes[1], int(new.sum()), "choices"))
@@ -311,9 +313,14 @@ def _read_rows(text: Text) -> _Rows:
 
 
 def _columns(
-    block: Block, at: NDArray, width: int, below: int, names: dict[bytes, int], is_interval: bool
+    block: TokenBlock,
+    at: NDArray,
+    width: int,
+    below: int,
+    names: dict[bytes, int],
+    is_interval: bool,
 ) -> tuple[NDArray, ...]:
-    """Columns of :class:`_Rows` for lines with first tokens `at`."""
+    """Columns of :class:`_TransitionColumns` for lines with first tokens `at`."""
     action = np.full(at.size, -1, np.int32)
     named = block.count > width
     action[named] = numbered(block.texts(at[named] + width), names)
@@ -331,7 +338,7 @@ def _columns(
     )
 
 
-def _new_rows(text: Text, rows: _Rows, form: str) -> Booleans:
+def _new_rows(text: Text, rows: _TransitionColumns, form: str) -> Booleans:
     """Mask of the first transition of each choice, ``bool[T]``; choices must ascend."""
     state, choice = rows.state, rows.choice
     other = np.ones(state.size, bool)
@@ -351,7 +358,7 @@ def _new_rows(text: Text, rows: _Rows, form: str) -> Booleans:
     return new
 
 
-def _with_loops(rows: _Rows) -> _Rows:
+def _with_loops(rows: _TransitionColumns) -> _TransitionColumns:
     has = np.zeros(rows.num_states, bool)
     has[rows.state] = True
     missing = np.flatnonzero(~has).astype(np.int32)
@@ -404,7 +411,9 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
     return model if interval is None else replace(interval, nominal=model)
 
 
-def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None, tuple[str, ...]]:
+def _actions(
+    text: Text, rows: _TransitionColumns, start: Integers
+) -> tuple[Integers | None, tuple[str, ...]]:
     if not rows.names:
         return None, ()
     action = rows.action[start]

@@ -13,7 +13,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP
 from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
 from jaxltl.io.tokens import (
-    Block,
+    TokenBlock,
     Text,
     as_double,
     bytes_of,
@@ -138,7 +138,7 @@ def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArra
     return {name: np.concatenate(parts) for name, parts in zip(names, columns_of, strict=True)}
 
 
-def _fields(block: Block, width: int) -> list[list[bytes]]:
+def _fields(block: TokenBlock, width: int) -> list[list[bytes]]:
     """Columns of lines such as ``0:(1,true)``: the state and `width` values."""
     block.columns(1, 0, form := "'state:(value,value)' without blanks")
     joined = block.joined(block.first[:-1])
@@ -159,7 +159,7 @@ def _fields(block: Block, width: int) -> list[list[bytes]]:
     return [fields[i :: width + 1] for i in range(width + 1)]
 
 
-def _values(block: Block, name: str, texts: list[bytes]) -> NDArray:
+def _values(block: TokenBlock, name: str, texts: list[bytes]) -> NDArray:
     """Values of a column as bool, int64 or float64."""
     if set(texts) <= {b"true", b"false"}:
         return np.fromiter((x == b"true" for x in texts), bool, len(texts))
@@ -290,7 +290,7 @@ _STEP = 2**17  # lines per piece
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenSection:
     """A section of an explicit file to be written."""
 
     kind: str  # "tra", "lab", "sta", "srew" or "trew"
@@ -299,7 +299,7 @@ class Written:
     lines: Callable[[], Iterator[bytes]]  # generator of the lines, in pieces
 
 
-def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:
+def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[WrittenSection]:
     """Sections of a model's files, in order; ValueError if the format cannot represent it."""
     storm, model = dialect == "storm", exact_part(source)
     chances = value_texts(source, ",")
@@ -315,12 +315,16 @@ def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Writ
     action = (
         None if storm and model.is_chain else _action_texts(model)
     )  # Storm reads no actions of chains
-    sections = [Written("tra", "", [kind], lambda: _transitions(model, chances, action, storm))]
+    sections = [
+        WrittenSection("tra", "", [kind], lambda: _transitions(model, chances, action, storm))
+    ]
     if model.valuation and not storm:
         values = [_value_texts(name, x) for name, x in model.valuation.items()]
         names = _plain(model.valuation, "variable", ' "(),')
-        sections.append(Written("sta", "", [b"# States\n"], lambda: _states(names, values)))
-    sections.append(Written("lab", "", [b"# Labels\n"], lambda: _label_lines(labels, holds, storm)))
+        sections.append(WrittenSection("sta", "", [b"# States\n"], lambda: _states(names, values)))
+    sections.append(
+        WrittenSection("lab", "", [b"# Labels\n"], lambda: _label_lines(labels, holds, storm))
+    )
     several = len(model.rewards) > 1
     for i, (name, reward) in enumerate(model.rewards.items()):
         _plain([name], "reward", '"')
@@ -425,14 +429,14 @@ def _states(names: list[str], values: list[Callable[[slice], list[str]]]) -> Ite
 
 def _rewards(
     model: SparseMDP, name: str, reward: Rewards, number: str, storm: bool
-) -> Iterator[Written]:
+) -> Iterator[WrittenSection]:
     title = f'# Reward structure "{name}"\n' if name else "# Reward structure\n"
     earned = _on_entries(model, reward)
     if reward.state is not None or earned is None:
         none = np.zeros(model.num_states)
         state = none if reward.state is None else np.asarray(reward.state, np.float64)
         header = [title.encode(), b"# State rewards\n"]
-        yield Written(
+        yield WrittenSection(
             "srew",
             number,
             header,
@@ -441,7 +445,7 @@ def _rewards(
     if earned is not None:
         header = [title.encode(), b"# Transition rewards\n"]
         sizes = [model.num_states] if model.is_chain else [model.num_states, model.num_rows]
-        yield Written(
+        yield WrittenSection(
             "trew", number, header, lambda: _nonzero(earned, sizes, _entry_columns(model), storm)
         )
 

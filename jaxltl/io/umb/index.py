@@ -66,7 +66,7 @@ class Annotation:
 
 
 @dataclass(frozen=True)
-class Variable:
+class RecordVariable:
     """A variable of a state's record."""
 
     name: str  # name, type: as in the file
@@ -81,7 +81,7 @@ class Variable:
 class Record:
     """Record layout of one class of states; `size` is in bytes."""
 
-    variables: tuple[Variable, ...]
+    variables: tuple[RecordVariable, ...]
     size: int
 
 
@@ -177,7 +177,7 @@ def parse_index(content: bytes) -> Index:
         data = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"this is not JSON: {error}.") from None
-    index = _Table(data, "the index")
+    index = _IndexTable(data, "the index")
     if (version := index.count("format-version")) != 1:
         raise ValueError(f"format-version is {version}; version 1 is read.")
     system = index.table("transition-system")
@@ -204,7 +204,7 @@ def parse_index(content: bytes) -> Index:
     )
 
 
-class _Table:
+class _IndexTable:
     """An object of the index."""
 
     def __init__(self, data: object, name: str) -> None:
@@ -223,8 +223,8 @@ class _Table:
             raise ValueError(f"{key} is {_shown(value)}; expected {expected}.")
         return value
 
-    def table(self, key: str, default: object = None) -> _Table:
-        return _Table(self.get(key, "", lambda _: True, default), key)
+    def table(self, key: str, default: object = None) -> _IndexTable:
+        return _IndexTable(self.get(key, "", lambda _: True, default), key)
 
     def count(self, key: str, default: int | None = None, below: int = 2**64) -> int:
         expected = "a whole number from 0 to 2^64 - 1"
@@ -267,7 +267,7 @@ def _check_type(kind: Type, names: Sequence[str]) -> None:
         )
 
 
-def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
+def _check_kind(system: _IndexTable, counts: Mapping[str, int]) -> None:
     system.get("time", "discrete, models with rates are not supported", lambda x: x == "discrete")
     if counts["observations"]:
         raise ValueError(
@@ -280,7 +280,7 @@ def _check_kind(system: _Table, counts: Mapping[str, int]) -> None:
     system.count("#branches", below=2**60)
 
 
-def _annotations(groups: _Table) -> tuple[Annotation, ...]:
+def _annotations(groups: _IndexTable) -> tuple[Annotation, ...]:
     """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
     annotations: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
@@ -301,7 +301,7 @@ def _annotation(group: str, key: str, data: object) -> Annotation:
     parts = list(PARTS) if group == "rewards" else ["states"]
     types = {"rewards": (*_REALS, "int", "uint"), INITIAL: ("double",)}.get(group, ("bool",))
     with errors_in(f"{path}: "):
-        table = _Table(data, "it")
+        table = _IndexTable(data, "it")
         name = table.text("alias", key)
         applies = table.get(
             "applies-to",
@@ -315,7 +315,7 @@ def _annotation(group: str, key: str, data: object) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
+def _records(index: _IndexTable) -> tuple[tuple[Record, ...], int]:
     """Record layouts of the classes of states, and the number of strings."""
     valuations = index.table("valuations", {})
     if "states" not in valuations.data:
@@ -332,11 +332,13 @@ def _records(index: _Table) -> tuple[tuple[Record, ...], int]:
 
 
 def _record(data: object, names_of_texts: Sequence[object]) -> Record:
-    variables = _Table(data, "a class").get("variables", "a list", lambda x: isinstance(x, list))
-    variable_of_name: dict[str, Variable] = {}
+    variables = _IndexTable(data, "a class").get(
+        "variables", "a list", lambda x: isinstance(x, list)
+    )
+    variable_of_name: dict[str, RecordVariable] = {}
     start = 0
     for each in variables:
-        one = _Table(each, "a variable")
+        one = _IndexTable(each, "a variable")
         if "padding" in one.data:
             start += one.count("padding")
         else:
@@ -349,7 +351,7 @@ def _record(data: object, names_of_texts: Sequence[object]) -> Record:
                 optional = one.get("is-optional", "true or false", lambda x: type(x) is bool, False)
             presence, start = (start, start + 1) if optional else (None, start)
             is_text = kind.name == "uint" and name in names_of_texts
-            variable_of_name[name] = Variable(name, kind, offset, start, presence, is_text)
+            variable_of_name[name] = RecordVariable(name, kind, offset, start, presence, is_text)
             start += kind.size
         if start > 8 * _MAX_RECORD:
             raise ValueError(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.validation import errors_in
-from jaxltl.io.umb.index import Record, Type, Variable, bit_bytes
+from jaxltl.io.umb.index import Record, Type, RecordVariable, bit_bytes
 
 Bytes = NDArray[np.uint8]
 Values = NDArray[np.generic]  # of a state variable: bool, integers, doubles or strings
@@ -166,7 +166,7 @@ def read_variables(
 _Part = tuple[NDArray[np.intp], Values]  # some states, and the values there
 
 
-def _read_variable(raw: Bytes, variable: Variable, texts: Sequence[str]) -> Values | None:
+def _read_variable(raw: Bytes, variable: RecordVariable, texts: Sequence[str]) -> Values | None:
     """Value of a variable in each record, or None if it is unsupported."""
     kind = variable.type
     if kind.name.endswith("-interval"):
@@ -217,7 +217,7 @@ def _field(raw: Bytes, start: int, size: int) -> Bytes:
     return field
 
 
-def _whole_numbers(field: Bytes, variable: Variable) -> Values:
+def _whole_numbers(field: Bytes, variable: RecordVariable) -> Values:
     """Integers with offset, in the smallest of int32, int64 and uint64 that fits the type."""
     size, offset, signed = variable.type.size, variable.offset, variable.type.name == "int"
     wide = np.zeros((len(field), 8), np.uint8)
@@ -262,7 +262,7 @@ def _joined(parts: Sequence[_Part], count: int) -> Values:
 
 
 @dataclass(frozen=True)
-class Written:
+class EncodedVariables:
     """Encoded state variables."""
 
     variables: list[dict[str, object]]  # their descriptions in the index
@@ -271,7 +271,7 @@ class Written:
     named: list[str]  # names of the variables that hold strings
 
 
-def write_variables(valuation: Mapping[str, ArrayLike]) -> Written:
+def write_variables(valuation: Mapping[str, ArrayLike]) -> EncodedVariables:
     """Encodes state variables; each starts at a byte boundary of the record."""
     described: list[dict[str, object]] = []
     fields: list[Values] = []
@@ -306,7 +306,7 @@ def write_variables(valuation: Mapping[str, ArrayLike]) -> Written:
     records = np.zeros(fields[0].size, layout)
     for i, field in enumerate(fields):
         records[f"v{i}"] = field
-    return Written(described, records.view(np.uint8), texts, named)
+    return EncodedVariables(described, records.view(np.uint8), texts, named)
 
 
 def write_texts(texts: Sequence[str]) -> tuple[Bytes, bytes]:

@@ -8,7 +8,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.games.permissive import permissive_strategy
-from jaxltl.core.games.strategy_policy import Explored, policy_of_nodes, strategy_policy
+from jaxltl.core.games.strategy_policy import ReachedNodes, policy_of_nodes, strategy_policy
 from jaxltl.core.games.winning import winning_region
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import make_mdp
@@ -139,4 +139,4 @@ def test_memory_that_depends_on_an_adversarys_choice_is_refused():
     mdp = make_mdp([[[1], [2]], [[1], [1]], [[2], [2]]], [[[1.0], [1.0]]] * 3, initial=[1, 0, 0])
     game = make_game(mdp, np.ones(3, bool))
     with pytest.raises(ValueError, match="depends on more than the states"):
-        policy_of_nodes(Explored(game, np.array([0, 1, 1]), np.array([0, 0, 1])), 2)
+        policy_of_nodes(ReachedNodes(game, np.array([0, 1, 1]), np.array([0, 0, 1])), 2)

@@ -5,7 +5,14 @@ import random
 import pytest
 
 from jaxltl.core.logic.ltl import holds_on_lasso, negation_normal_form, parse_ltl
-from jaxltl.core.logic.normal_form import Part, combination, is_pi2, is_pure, is_sigma2, limit_parts
+from jaxltl.core.logic.normal_form import (
+    LimitPart,
+    combination,
+    is_pi2,
+    is_pure,
+    is_sigma2,
+    limit_parts,
+)
 from jaxltl.core.logic.simplify import (
     GREATEST,
     LEAST,
@@ -21,14 +28,14 @@ WAYS = [(True, False), (True, True), (False, False), (False, True)]
 
 
 def truth(parts, lasso):
-    if isinstance(parts, Part):
+    if isinstance(parts, LimitPart):
         return holds_on_lasso(parts.formula, *lasso)
     join = all if parts[0] == "&" else any
     return join(truth(part, lasso) for part in parts[1:])
 
 
 def leaves(parts):
-    if isinstance(parts, Part):
+    if isinstance(parts, LimitPart):
         return [parts]
     assert parts[0] in ("&", "|") and len(parts) > 2
     return [leaf for part in parts[1:] for leaf in leaves(part)]
@@ -150,7 +157,7 @@ def test_ways_of_one_class():
     together = combination(simplify(parse_ltl("F a & X b & F G c")), True)
     assert {part.kind for part in leaves(together)} == {"sigma2", "limit"}
     turns = combination(simplify(parse_ltl("G F (a & X b) & G F (b & X c)")), True)
-    assert isinstance(turns, Part) and len(limit_parts(turns.formula)) == 2
+    assert isinstance(turns, LimitPart) and len(limit_parts(turns.formula)) == 2
     apart = combination(simplify(parse_ltl("G F (a & X b) & G F (b & X c)")), False)
     assert len(leaves(apart)) == 2
 

@@ -17,7 +17,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP, StateLayout, state_layout
+from jaxltl.core.models.mesh.sharded import ShardedRowTable, ShardedMDP, StateLayout, state_layout
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import (
@@ -440,7 +440,7 @@ def _halo(layout: StateLayout, parts: Mapping[int, SparseMDP]) -> _Halo:
 
 def _tables(
     layout: StateLayout, halo: _Halo, facts: np.ndarray, d: int, part: SparseMDP
-) -> tuple[tuple[RowTable, ...], np.ndarray | None]:
+) -> tuple[tuple[ShardedRowTable, ...], np.ndarray | None]:
     """Rows by width, and the row of each choice; padded states have self-loops."""
     num_actions, widest = (int(x) for x in facts[:, [_ACTIONS, _WIDEST]].max(0))
     host, action = part.host, row_actions(part)
@@ -470,8 +470,8 @@ def _tables(
     return tuple(tables), place
 
 
-def _empty_table(rows: int, width: int, dtype: np.dtype) -> RowTable:
-    return RowTable(np.zeros((rows, width), np.int32), np.zeros((rows, width), dtype))
+def _empty_table(rows: int, width: int, dtype: np.dtype) -> ShardedRowTable:
+    return ShardedRowTable(np.zeros((rows, width), np.int32), np.zeros((rows, width), dtype))
 
 
 def _of_states(

@@ -125,7 +125,7 @@ def state_layout(num_states: int, mesh: Mesh, axis: str | None) -> StateLayout:
     return StateLayout(automatic(mesh), axis, num_states)
 
 
-class RowTable(NamedTuple):
+class ShardedRowTable(NamedTuple):
     """Rows of one width, by local places."""
 
     successor: Array  # int32[M, W]
@@ -180,7 +180,7 @@ class ShardedMDP:
     (2, 1, 0)
     """
 
-    tables: tuple[RowTable, ...]
+    tables: tuple[ShardedRowTable, ...]
     place: jax.Array | None
     available: jax.Array
     sent: tuple[jax.Array, ...]
@@ -299,7 +299,9 @@ def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.
     )
 
 
-def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+def _rows(
+    table: ShardedRowTable, seen: jax.Array, term: kernels.Term, combine: kernels.Term
+) -> jax.Array:
     successor, weight = table
     width = successor.shape[1]
     if width > kernels.UNROLL:
@@ -378,7 +380,7 @@ def _(model: ShardedMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
             shape = (*available.shape, -1)
             pick = policy[:, None, None]
             chosen = (jnp.take_along_axis(x.reshape(shape), pick, 1)[:, 0] for x in tables[0])
-            return _rows(RowTable(*chosen), seen, jnp.multiply, jnp.add)
+            return _rows(ShardedRowTable(*chosen), seen, jnp.multiply, jnp.add)
         rows = [_rows(table, seen, jnp.multiply, jnp.add) for table in tables]
         row = jnp.take_along_axis(place, policy[:, None], 1)[:, 0]
         return kernels.gather(jnp.concatenate(rows), row)

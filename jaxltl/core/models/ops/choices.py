@@ -1,6 +1,6 @@
 """Choices of a model's states, and reductions over them.
 
-:class:`Actions` (padded models, ``[S, A]``) and :class:`Rows` (sparse models, ``[R]``) have the same
+:class:`Actions` (padded models, ``[S, A]``) and :class:`ChoiceRows` (sparse models, ``[R]``) have the same
 methods.
 """
 
@@ -174,7 +174,7 @@ def _unchanged(quantity: jax.Array) -> jax.Array:
 
 
 @struct.dataclass
-class Rows:
+class ChoiceRows:
     """Choices without padding, grouped by state; quantities have the shape ``[R, ...]`` in every layout."""
 
     state: jax.Array  # int32[R], ascending
@@ -185,7 +185,7 @@ class Rows:
         return self.state.shape
 
     @property
-    def layout(self) -> Rows:
+    def layout(self) -> ChoiceRows:
         return self
 
     @property
@@ -266,7 +266,7 @@ class Rows:
     columns = whole = packed = unpacked = staticmethod(_unchanged)
 
 
-Layout: TypeAlias = Columns | Rows
+Layout: TypeAlias = Columns | ChoiceRows
 Quantity: TypeAlias = PyTree  # on choices: columns ``[N, ...]``, of a sparse model ``[R, ...]``
 
 
@@ -282,7 +282,7 @@ class SweepOperator(Protocol):
 
 
 @singledispatch
-def choices(model: Model) -> Actions | Rows:
+def choices(model: Model) -> Actions | ChoiceRows:
     """The choices of a model; a new representation has `available`."""
     if not hasattr(model, "available"):
         raise ValueError(validation.unsupported_model(model))
@@ -290,15 +290,17 @@ def choices(model: Model) -> Actions | Rows:
 
 
 @choices.register(SparseMDP)
-def row_choices(model: SparseMDP) -> Rows:
+def row_choices(model: SparseMDP) -> ChoiceRows:
     """Choices of a sparse model, by rows."""
-    return Rows(kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start))
+    return ChoiceRows(
+        kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start)
+    )
 
 
 class RowEntries(NamedTuple):
     """The transitions of a sparse model for compiled sweeps."""
 
-    choices: Rows
+    choices: ChoiceRows
     row: jax.Array  # int32[T]
     successor: jax.Array  # int32[T]
     probability: jax.Array  # float[T]

@@ -127,7 +127,7 @@ def best(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Arra
     return jnp.where(top == -jnp.inf, top, action_mean(action, quantity)), action
 
 
-class Rows(NamedTuple):
+class DoubleWordRows(NamedTuple):
     """The normalised rows of a padded model, and of a policy: backups in double words."""
 
     model: ActionModel
@@ -161,7 +161,7 @@ class Rows(NamedTuple):
         return 32 * (self.terms + 8) * float(jnp.finfo(self.model.dtype).tiny) * (1 + size)
 
 
-def normalised_rows(model: ActionModel, policy: jax.Array | None = None) -> Rows:
+def normalised_rows(model: ActionModel, policy: jax.Array | None = None) -> DoubleWordRows:
     """The rows of a model, and of a policy ``float[S, A]``, each divided by its sum."""
     one = double_word(jnp.ones(model.state_shape, model.dtype))
     total = combined(model, one, times, plus)
@@ -172,4 +172,4 @@ def normalised_rows(model: ActionModel, policy: jax.Array | None = None) -> Rows
         whole = kernels.reduced(plus, weight, -1)[..., None]
         scale = reciprocal(jnp.concatenate([total, whole], -1))
         scale, policy = scale[..., :-1], product(weight, scale[..., -1:])
-    return lax.stop_gradient(Rows(model, scale, policy))
+    return lax.stop_gradient(DoubleWordRows(model, scale, policy))

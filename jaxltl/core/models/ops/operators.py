@@ -393,7 +393,7 @@ def policy_distribution(model: Model, policy: Array) -> jax.Array:
     return cast(jax.Array, policy)
 
 
-class Policy(NamedTuple):
+class CheckedPolicy(NamedTuple):
     """A validated policy."""
 
     distribution: jax.Array  # float[S, A], uniform in invalid rows
@@ -402,7 +402,7 @@ class Policy(NamedTuple):
     representable: jax.Array  # bool[], of the model, see is_representable
 
 
-def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
+def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> CheckedPolicy:
     """A policy with its validity in the states `where`; differentiable in a stochastic policy."""
     policy, over = policy_distribution(model, policy), choices(model)
     available = over.available
@@ -415,7 +415,7 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
         over.broadcast(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
     )
     valid = jnp.all(row) & ~jnp.any(is_subnormal(policy))
-    return Policy(used, lax.stop_gradient(masked), valid, is_representable(model))
+    return CheckedPolicy(used, lax.stop_gradient(masked), valid, is_representable(model))
 
 
 def require_policy(model: Model, policy: Array, where: Array = True) -> None:

@@ -42,7 +42,7 @@ def attracted(
     rule = np.broadcast_to(exists, goal.shape)
     lacking = None if chance == "some" else np.diff(graph.entry_start).astype(np.int32)
     first = graph.row_start[:-1].astype(np.int32)
-    search = _Search(
+    search = _AttractorSearch(
         graph,
         waiting,
         lacking,
@@ -73,7 +73,7 @@ def attracted(
     return Attraction(search.region, search.row, search.rank)
 
 
-class _Search(NamedTuple):
+class _AttractorSearch(NamedTuple):
     """A growing region; region, row and rank as of :class:`Attraction`."""
 
     graph: HostGraph

@@ -54,7 +54,7 @@ def shortest_path_rows(mdp: HostGraph, goal: Booleans, rows: Booleans) -> Intege
     return attracted(mdp, goal, rows).row
 
 
-class EndComponents(NamedTuple):
+class SparseEndComponents(NamedTuple):
     """Maximal end components."""
 
     component: Integers  # int64[S], least state of the component; own number elsewhere
@@ -67,7 +67,7 @@ class EndComponents(NamedTuple):
 
 def end_components(
     mdp: HostGraph, states: Booleans | None = None, rows: Booleans | None = None
-) -> EndComponents:
+) -> SparseEndComponents:
     """Maximal end components within some states and rows (Baier and Katoen 2008, section 10.6.3).
 
     Self-loops connect nothing and are added at the end; otherwise each state at the rim of a
@@ -81,7 +81,7 @@ def end_components(
     return components._replace(inside=components.inside | still)
 
 
-def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
+def _moving_components(mdp: HostGraph, kept: Booleans) -> SparseEndComponents:
     """End components of rows without self-loops."""
     component = np.arange(mdp.num_states)
     inside = np.zeros(mdp.num_rows, bool)
@@ -90,7 +90,7 @@ def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
         candidates &= ~positive_under_all_policies(mdp, ~candidates, kept)
         row = np.flatnonzero(kept & candidates[mdp.state])
         if not row.size:
-            return EndComponents(component, inside)
+            return SparseEndComponents(component, inside)
         entry, count = row_entries(mdp.entry_start, row)
         of, target = np.repeat(np.arange(row.size), count), mdp.successor[entry]
         leaves = np.bincount(of[~candidates[target]], minlength=row.size) > 0

@@ -132,7 +132,7 @@ class PathBounds:
 
 def enclose_paths(problem: PathProblem, accuracy: Accuracy) -> PathBounds:
     """Bounds of a :class:`PathProblem` from both sides."""
-    search = _Search(problem.operator(), accuracy, problem.may_stay)
+    search = _PolicySearch(problem.operator(), accuracy, problem.may_stay)
     operator = search.operator
     if problem.first is not None:
         chosen = operator.rows_of_nodes(problem.first)
@@ -150,7 +150,10 @@ def enclose_paths(problem: PathProblem, accuracy: Accuracy) -> PathBounds:
 
 
 def _path_bounds(
-    problem: PathProblem, search: _Search, beyond: PolicyPair | None, attained: PolicyPair | None
+    problem: PathProblem,
+    search: _PolicySearch,
+    beyond: PolicyPair | None,
+    attained: PolicyPair | None,
 ) -> PathBounds:
     operator = search.operator
     states = np.flatnonzero(problem.interior)
@@ -178,7 +181,7 @@ def _path_bounds(
 
 
 @dataclass
-class _Search:
+class _PolicySearch:
     """State of a policy iteration."""
 
     operator: RowOperator

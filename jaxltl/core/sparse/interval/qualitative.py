@@ -14,7 +14,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
-    EndComponents,
+    SparseEndComponents,
     positive_under_all_policies,
     backward_reachable,
     shortest_path_rows,
@@ -138,7 +138,7 @@ def almost_sure_states(
 
 def joint_end_components(
     model: UncertainMDP, states: Booleans | None = None, entries: Booleans | None = None
-) -> tuple[EndComponents, Booleans]:
+) -> tuple[SparseEndComponents, Booleans]:
     """Maximal end components of policy and nature together."""
     mdp = model.mdp
     used = np.ones(mdp.num_transitions, bool) if entries is None else entries.copy()
@@ -149,7 +149,7 @@ def joint_end_components(
         kept = model.can_stay_on(used)
         used &= kept[mdp.row]
         if not kept.any():
-            return EndComponents(np.arange(mdp.num_states), kept), used
+            return SparseEndComponents(np.arange(mdp.num_states), kept), used
         alive = mdp.states_of(kept)
         stays = ~_attractor(model, ~alive, True, kept)[0]
         now = used & stays[mdp.successor] & stays[source]
@@ -159,7 +159,7 @@ def joint_end_components(
             break
         used = now
     component = np.where(alive, label, np.arange(mdp.num_states))
-    return EndComponents(component, kept), used
+    return SparseEndComponents(component, kept), used
 
 
 class RobustRegion(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxltl.core.sparse.rows import mask_of
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import EndComponents, shortest_path_rows
+from jaxltl.core.sparse.graph.qualitative import SparseEndComponents, shortest_path_rows
 from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
 from jaxltl.core.sparse.interval.qualitative import (
     attracting_rows,
@@ -134,7 +134,7 @@ def _joint(
 def joint_optimum(
     problem: PathProblem,
     accuracy: Accuracy,
-    components: tuple[EndComponents, Booleans] | None,
+    components: tuple[SparseEndComponents, Booleans] | None,
     pair: tuple[Integers, Floats],
     fixed_nature: MDPSolver,
 ) -> RobustValues:

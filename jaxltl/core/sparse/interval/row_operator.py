@@ -60,7 +60,7 @@ class TargetValues(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Block:
+class TableBlock:
     """A table of rows."""
 
     table: RowTable
@@ -118,7 +118,7 @@ class RowOperator:
         return int(np.diff(self.part.mdp.entry_start).max()) + self.depth
 
     @cached_property
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[TableBlock]:
         mdp, blocks = self.part.mdp, []
         target = self.node[mdp.successor]
         index = np.where(target < 0, self.size + mdp.successor, target).astype(np.int32)
@@ -127,7 +127,7 @@ class RowOperator:
             if table.used is not None:
                 to = np.where(table.used, to, owner)
             leaves = to != owner
-            blocks.append(Block(table, to, owner, None if leaves.all() else leaves))
+            blocks.append(TableBlock(table, to, owner, None if leaves.all() else leaves))
         return blocks
 
     @cached_property
@@ -160,7 +160,7 @@ class RowOperator:
         low = np.concatenate([z.low, np.zeros(self.known.size)])
         return TargetValues(np.concatenate([z.high, self.known]), low)
 
-    def answer(self, block: Block, gain: Floats) -> Floats:
+    def answer(self, block: TableBlock, gain: Floats) -> Floats:
         """Nature's optimal distributions for the gains of entries."""
         return block.table.extreme(gain if self.adversarial else -gain)
 
@@ -321,7 +321,7 @@ class RowOperator:
         return True
 
     def gain_bound(
-        self, block: Block, gain: Floats, p: Floats, side: int, *, over_all: bool
+        self, block: TableBlock, gain: Floats, p: Floats, side: int, *, over_all: bool
     ) -> Floats:
         """Certified upper (side 1) or lower (-1) bound of the gains of rows, ``float64[N]``.
 

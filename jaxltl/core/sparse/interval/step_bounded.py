@@ -15,7 +15,7 @@ from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distr
 from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.solvers.step_bounded import (
-    Steps,
+    StepBoundedValues,
     UnboundedLimit,
     narrowed,
     reached_within,
@@ -43,7 +43,7 @@ def backup_error(model: UncertainMDP) -> float:
 
 def until(
     model: UncertainMDP, target: Booleans, stay: Booleans, num_steps: int, query: Query
-) -> Steps:
+) -> StepBoundedValues:
     """Probability of reaching a target within `num_steps` through states of `stay`."""
     mdp, open_, one = model.mdp, stay & ~target, backup_error(model)
     value, done, is_fixed, check = target.astype(np.float64), 0, False, _LONG
@@ -73,7 +73,7 @@ def until(
             region = reached_within(mdp, (target, open_), num_steps, _any_or_all(query), entering)
             known = open_ & (region if surely else ~region)
             value, error = np.where(known, surely, value), np.where(known, 0, error)
-    return Steps(value, error, row, done, chance)
+    return StepBoundedValues(value, error, row, done, chance)
 
 
 def _most_backups(model: UncertainMDP) -> int:
@@ -131,7 +131,7 @@ class _Limit:
         return value - unfinished(time, self.num_steps)
 
 
-def next_step(model: UncertainMDP, target: Booleans, query: Query) -> Steps:
+def next_step(model: UncertainMDP, target: Booleans, query: Query) -> StepBoundedValues:
     """Probability that the next state is a target."""
     ahead = target.astype(np.float64)[model.mdp.successor]
     value, row, chance = _backup(model, ahead, query)
@@ -141,12 +141,12 @@ def next_step(model: UncertainMDP, target: Booleans, query: Query) -> Steps:
         states = model.mdp.over_choices(_any_or_all(query), rows)
         known = states if surely else ~states
         value, error = np.where(known, surely, value), np.where(known, 0, error)
-    return Steps(value, error, row, 1, chance)
+    return StepBoundedValues(value, error, row, 1, chance)
 
 
 def total(
     model: UncertainMDP, earned: Floats, start: Floats, num_steps: int, query: Query
-) -> Steps:
+) -> StepBoundedValues:
     """Expected reward of `num_steps` steps plus a final reward."""
     mdp, one = model.mdp, backup_error(model)
     value, error, done, check = start, 0.0, 0, _LONG
@@ -180,7 +180,7 @@ def total(
     # Without a reward ahead the value is exactly 0, also where the remaining steps are bounded.
     some = backward_reachable(mdp, some)
     value, off = np.where(some, value, 0), np.where(some & (num_steps > 0), width + error, 0)
-    return Steps(value, off, row, done, chance)
+    return StepBoundedValues(value, off, row, done, chance)
 
 
 def _backup(model: UncertainMDP, ahead: Floats, query: Query) -> tuple[Floats, Integers, Floats]:

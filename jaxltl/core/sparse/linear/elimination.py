@@ -45,7 +45,7 @@ _MAX_OLD_STEPS = 10  # steps after which old factors are given up
 _MAX_STEPS = 200  # of BiCGSTAB without factors
 
 
-class _Block(NamedTuple):
+class _EliminationBlock(NamedTuple):
     """Some components, on which no earlier block depends."""
 
     order: Integers  # int[B], states in elimination order; ascending for a Krylov method
@@ -61,7 +61,7 @@ class Factors(NamedTuple):
 
     rows: SparseMatrix  # SciPy's float64[R, M], all rows
     label: Integers  # int[M], components in topological order
-    blocks: tuple[_Block, ...]  # in the order of solution
+    blocks: tuple[_EliminationBlock, ...]  # in the order of solution
 
     @property
     def method(self) -> str:
@@ -206,7 +206,7 @@ def _block(
     *,
     swept: bool = False,
     min_degree: bool = False,
-) -> _Block | None:
+) -> _EliminationBlock | None:
     """Some states of a policy, factored unless that fills too much; None if singular."""
     from scipy.sparse import linalg
 
@@ -222,7 +222,7 @@ def _block(
         outer.eliminate_zeros()
         inner = inner[:, order]
     if swept or _too_much(inner, label[order]):
-        return _Block(order, inner, outer, None, 0)
+        return _EliminationBlock(order, inner, outer, None, 0)
     # In one large component minimum degree fills less (Liu 1985).
     largest = np.bincount(label[order]).max(initial=0)
     wide = (
@@ -241,7 +241,7 @@ def _block(
         )
     except (RuntimeError, MemoryError):
         return None
-    return _Block(order, inner, outer, factor, int(factor.nnz), min_degree)
+    return _EliminationBlock(order, inner, outer, factor, int(factor.nnz), min_degree)
 
 
 def _bandwidth(matrix: SparseMatrix) -> float:

@@ -114,7 +114,7 @@ def refined_optimum(
     tolerance: float,
 ) -> RefinedOptimum | None:
     """Optimum by policy iteration on two-float values; None if it is not found."""
-    rows = _Rows(equation)
+    rows = _RowFlows(equation)
 
     def residual_of_policy(x: TwoFloats) -> Floats:
         return rows.balance(x.high, x.low)[0][policy]
@@ -172,7 +172,7 @@ def _leaves(equation: OptimalityEquation, policy: Integers) -> bool:
     return bool(forward_search(back.start, back.target, equation.leaving[policy] > 0).all())
 
 
-class _Rows:
+class _RowFlows:
     """Inflow and outflow of each row."""
 
     def __init__(self, equation: OptimalityEquation) -> None:

@@ -131,11 +131,11 @@ def solve_by_sweeps(
         return None
     with ThreadPoolExecutor(1) as pool:
         parallel = problem.blocks.matrix.nnz >= _THREADS
-        search = _Search(problem, settings, pool if parallel else None)
+        search = _SweepSearch(problem, settings, pool if parallel else None)
         return _solve(search, start, None if settings.relative else time)
 
 
-def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBounds | None:
+def _solve(search: _SweepSearch, start: Floats | None, time: float | None) -> SweptBounds | None:
     problem = search.problem
     value: Values = problem.outer.astype(np.float32)
     live = np.flatnonzero(problem.live)
@@ -164,7 +164,7 @@ def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBo
 
 
 @dataclass(frozen=True)
-class _Block:
+class _SweepBlock:
     """Nodes a to b: where the rows of each begin, their costs, and the rows that are not allowed."""
 
     a: int
@@ -175,14 +175,14 @@ class _Block:
 
 
 @dataclass
-class _Search:
+class _SweepSearch:
     """Counted sweeps; two blocks at a time read the same values and then are written."""
 
     problem: BlockProblem
     settings: SweepSettings
     pool: Executor | None = None
     sweeps: int = 0
-    parts: list[_Block] = field(default_factory=list)
+    parts: list[_SweepBlock] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         problem, row_start = self.problem, self.problem.blocks.row_start
@@ -190,7 +190,7 @@ class _Search:
             rows = slice(int(row_start[a]), int(row_start[b]))
             cost = None if problem.cost is None else problem.cost[rows]
             barred = None if problem.allowed is None else ~problem.allowed[rows]
-            self.parts.append(_Block(a, b, row_start[a:b] - rows.start, cost, barred))
+            self.parts.append(_SweepBlock(a, b, row_start[a:b] - rows.start, cost, barred))
 
     @property
     def sign(self) -> int:

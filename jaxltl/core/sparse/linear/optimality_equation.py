@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers, SparseMatrix
-from jaxltl.core.sparse.choice_order import Choices
+from jaxltl.core.sparse.choice_order import ChoiceOrder
 from jaxltl.core.sparse.rows import concatenated_ranges, group_starts
 
 # Rounds of improvements: their overhead in entries, the work allowed relative to the entries of the
@@ -24,7 +24,7 @@ class OptimalityEquation:
     matrix: SparseMatrix  # SciPy's float64[R, M], without self-loops
     cost: Floats  # float64[R], at least 0, with the share of terminal states
     leaving: Floats  # float64[R], the probability of leaving the unknowns
-    choices: Choices  # the order of the unknowns and of their rows
+    choices: ChoiceOrder  # the order of the unknowns and of their rows
     sign: int  # 1 to maximise, -1 to minimise
 
     @property

@@ -45,7 +45,7 @@ class ExactModel(NamedTuple):
     start: dict[int, Fraction]  # the initial distribution
 
 
-class _TooLarge(Exception):
+class _ProgramTooLarge(Exception):
     """The work exceeds its limit."""
 
 
@@ -96,11 +96,11 @@ def solve_exactly(
             if goal.least is not None
         ]
         basis = _proper_columns(mdp, states, columns)
-        simplex = _connected(_Program(columns, basis, model.start, constraints), endless)
+        simplex = _connected(_LinearProgram(columns, basis, model.start, constraints), endless)
         if simplex is None:
             return ExactAnswer(False, None)
         return ExactAnswer(True, None if index is None else simplex.largest_goal(index))
-    except _TooLarge:
+    except _ProgramTooLarge:
         return None
 
 
@@ -140,7 +140,7 @@ class _Constraint(NamedTuple):
     least: Fraction
 
 
-class _Program(NamedTuple):
+class _LinearProgram(NamedTuple):
     """Flow equations of states, and constraints."""
 
     columns: list[_Column]
@@ -149,7 +149,7 @@ class _Program(NamedTuple):
     constraints: list[_Constraint]
 
 
-def _connected(program: _Program, endless: bool) -> _Simplex | None:
+def _connected(program: _LinearProgram, endless: bool) -> _Simplex | None:
     """The program without circulations that no policy reaches; None if it has no solution."""
     count = len(program.columns)
     unreached: set[int] = set()
@@ -179,7 +179,7 @@ def _proper_columns(mdp: HostMDP, states: Integers, columns: list[_Column]) -> d
     return {s: stops[s] if s in stops else number[int(policy[s])] for s in states.tolist()}
 
 
-def _visited(program: _Program, positive: set[int]) -> set[int]:
+def _visited(program: _LinearProgram, positive: set[int]) -> set[int]:
     """The positive columns whose states are reachable by positive columns."""
     columns = program.columns
     states = {s for s, p in program.start.items() if p}
@@ -200,7 +200,7 @@ class _Simplex:
     A pivot divides exactly by the one before (Edmonds 1967; Bareiss 1968).
     """
 
-    def __init__(self, program: _Program) -> None:
+    def __init__(self, program: _LinearProgram) -> None:
         columns, basis, start, constraints = program
         self.columns = columns
         count, zero, one = len(columns), Fraction(0), Fraction(1)
@@ -279,13 +279,13 @@ class _Simplex:
                 key=lambda i: (Fraction(self.table[i, -1], self.table[i, c]), self.basis[i]),
             )
             self._pivot(r, c)
-        raise _TooLarge
+        raise _ProgramTooLarge
 
     def _pivot(self, r: int, c: int) -> None:
         table = self.table
         self.work += table.size * (1 + int(self.unit).bit_length() // 256)
         if self.work > _MAX_WORK:
-            raise _TooLarge
+            raise _ProgramTooLarge
         if table[r, c] < 0:
             table[r] = -table[r]
         pivot, column, row = table[r, c], table[:, c].copy(), table[r].copy()

@@ -17,7 +17,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.qualitative import (
-    EndComponents,
+    SparseEndComponents,
     end_components,
     almost_sure_reachability,
     shortest_path_rows,
@@ -135,7 +135,7 @@ class _Quotient(NamedTuple):
 
 
 def _quotient(
-    mdp: HostMDP, rows: Booleans, free: EndComponents, best: Integers, worth: Floats
+    mdp: HostMDP, rows: Booleans, free: SparseEndComponents, best: Integers, worth: Floats
 ) -> _Quotient:
     used = mdp.states_of(rows)
     heads = np.unique(free.component[used])
@@ -227,7 +227,7 @@ def _signed(
 def _policy(
     mdp: HostMDP,
     where: FinalComponents,
-    free: EndComponents,
+    free: SparseEndComponents,
     best: Integers,
     quotient: _Quotient,
     row: Integers,

@@ -18,7 +18,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
-    EndComponents,
+    SparseEndComponents,
     almost_sure_reachability,
     backward_reachable,
     end_components,
@@ -106,7 +106,7 @@ def average(
     )
 
 
-class Range(NamedTuple):
+class RewardRange(NamedTuple):
     """The least and the largest reward of a row, and whether sums of rewards equal them exactly."""
 
     least: float
@@ -114,11 +114,13 @@ class Range(NamedTuple):
     is_exact: tuple[bool, bool]
 
     @property
-    def negated(self) -> Range:
-        return Range(-self.largest, -self.least, (self.is_exact[1], self.is_exact[0]))
+    def negated(self) -> RewardRange:
+        return RewardRange(-self.largest, -self.least, (self.is_exact[1], self.is_exact[0]))
 
 
-def within_range(mdp: HostMDP, reward: Floats, enclosure: Enclosure, ends: Range) -> Enclosure:
+def within_range(
+    mdp: HostMDP, reward: Floats, enclosure: Enclosure, ends: RewardRange
+) -> Enclosure:
     """The enclosure of a largest average, clipped to the range of the rewards.
 
     The graph decides where it is an end of the range: the least reward where no end component with
@@ -173,7 +175,9 @@ class _Stopping:
         return low, high, self.origin[enclosure.row[self.node]], enclosure.rounds
 
 
-def _stopping_problem(mdp: HostMDP, components: EndComponents, leaders: Integers) -> _Stopping:
+def _stopping_problem(
+    mdp: HostMDP, components: SparseEndComponents, leaders: Integers
+) -> _Stopping:
     heads = np.flatnonzero(components.component == np.arange(mdp.num_states))
     node = np.searchsorted(heads, components.component)
     stops = np.arange(leaders.size) + heads.size

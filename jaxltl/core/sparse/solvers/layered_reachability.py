@@ -51,7 +51,7 @@ class PaddedProduct(NamedTuple):
     allowed: Booleans | None = None  # bool[S, Q, A], or None for all
 
 
-class _Rows:
+class _LayeredRows:
     """The model's rows, their actions, and their blocks."""
 
     def __init__(self, world: PaddedProduct) -> None:
@@ -102,7 +102,7 @@ def layered_reachability(
     del graph
     if sets is None:
         return None
-    search = _Search(world, sets, 1 if maximize else -1, tolerance)
+    search = _LayeredSearch(world, sets, 1 if maximize else -1, tolerance)
     return search.bounds() if search.solve() else None
 
 
@@ -118,7 +118,7 @@ def _mixes(world: PaddedProduct) -> bool:
     )
 
 
-class _Search:
+class _LayeredSearch:
     """Bounds by automaton state, ``float64[Q, S]``, filled in component after component."""
 
     def __init__(self, world: PaddedProduct, sets: BitSets, sign: int, tolerance: float) -> None:
@@ -130,9 +130,9 @@ class _Search:
         self.guess: tuple[Floats, float] | None = None  # of values, and of how long runs stay
 
     @cached_property
-    def rows(self) -> _Rows:
+    def rows(self) -> _LayeredRows:
         """The world's rows."""
-        return _Rows(self.world)
+        return _LayeredRows(self.world)
 
     @staticmethod
     def has(words: Integers, q: int) -> Booleans:
@@ -208,7 +208,7 @@ class _Search:
         )
 
 
-class _Problem(NamedTuple):
+class _LayeredProblem(NamedTuple):
     """Problem of a component: :class:`BlockProblem`, and where end components may be."""
 
     host: HostMDP  # as many states as columns; the first ones are nodes
@@ -222,14 +222,14 @@ class _Problem(NamedTuple):
     inner: Booleans  # bool[M], the columns that are read as nodes
 
 
-def _alone(search: _Search, q: int) -> _Problem:
+def _alone(search: _LayeredSearch, q: int) -> _LayeredProblem:
     """The problem of one automaton state: entering a state stays in it, or leads to another one."""
     world, rows = search.world, search.rows
     after = world.delta[q][world.letter]
     place = np.arange(after.size)
     inner, open_ = after == q, search.undecided(q)
     mask = None if world.allowed is None else rows.of(world.allowed[:, q])
-    return _Problem(
+    return _LayeredProblem(
         rows.host,
         rows.cut,
         open_,
@@ -242,7 +242,7 @@ def _alone(search: _Search, q: int) -> _Problem:
     )
 
 
-def _together(search: _Search, part: Integers) -> _Problem:
+def _together(search: _LayeredSearch, part: Integers) -> _LayeredProblem:
     """The problem of several automaton states: their rows written out, with a state for each exit."""
     world, host = search.world, search.rows.host
     size = host.num_states
@@ -274,13 +274,17 @@ def _together(search: _Search, part: Integers) -> _Problem:
         mask = np.concatenate(
             [*(search.rows.of(world.allowed[:, q]) for q in part), np.ones(ends, bool)]
         )
-    return _Problem(
+    return _LayeredProblem(
         written, None, open_, open_, attained, outer, mask, stays, np.arange(nodes + ends) < nodes
     )
 
 
 def _solved(
-    problem: _Problem, sign: int, budget: float, unit: float, guess: tuple[Floats, float] | None
+    problem: _LayeredProblem,
+    sign: int,
+    budget: float,
+    unit: float,
+    guess: tuple[Floats, float] | None,
 ) -> SweptBounds | None:
     """Bounds of the nodes, and their rows."""
     host, cut, allowed, part = problem.host, problem.cut, problem.rows, None

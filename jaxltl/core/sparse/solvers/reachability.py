@@ -16,7 +16,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.contraction import Contraction, contract_chains, identity, quotient
 from jaxltl.core.sparse.graph.qualitative import (
-    EndComponents,
+    SparseEndComponents,
     almost_sure_reachability,
     backward_reachable,
     end_components,
@@ -57,7 +57,7 @@ class ReducedProblem:
     problem: ShortestPathProblem | None = None
     # of `contraction.mdp`, the model with end components as states; None without any
     quotient: Contraction | None = None
-    components: EndComponents | None = None
+    components: SparseEndComponents | None = None
     # nodes of `contraction` with rows known in advance (fixed, fixed_row)
     fixed: Booleans | None = None
     fixed_row: Integers | None = None
@@ -387,7 +387,7 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
 
 
 def quotient_policy(
-    mdp: HostMDP, components: EndComponents, row: Integers, otherwise: Integers | None = None
+    mdp: HostMDP, components: SparseEndComponents, row: Integers, otherwise: Integers | None = None
 ) -> Integers:
     """The policy that leaves end components by some rows; `otherwise` where `row` is -1."""
     policy: Integers = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise

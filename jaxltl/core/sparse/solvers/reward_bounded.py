@@ -37,7 +37,7 @@ _ROUNDS = 100
 _DEPTH = 64  # steps without cost, up to which a level is solved by substitution
 
 
-class Level(NamedTuple):
+class BudgetLevel(NamedTuple):
     """Probabilities with the whole budget left."""
 
     value: Floats  # float64[S]
@@ -94,13 +94,13 @@ def bounded_cost(
     budget: tuple[Integers, int],
     maximal: bool,
     by_level: bool = False,
-) -> Level:
+) -> BudgetLevel:
     """Optimal probability of a target through `stay`, within a budget of :func:`in_units`."""
     cost, limit = budget
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
     parts = _parts(mdp, shape, target, cost, limit)
-    system = _System(shape, parts[0][1], maximal)
+    system = _LayerSystem(shape, parts[0][1], maximal)
     size = parts[-1][0] + 1
     if 8.0 * size * shape.starts.size > _LARGEST:
         raise ValueError(
@@ -123,7 +123,7 @@ def bounded_cost(
             every.append(_policy(mdp, shape, system.policy(b, value)))
     probability = target.astype(np.float64)
     probability[shape.member] = ring[limit % size][shape.node[shape.member]]
-    return Level(probability, shape.member, error, np.stack(every) if by_level else every[-1])
+    return BudgetLevel(probability, shape.member, error, np.stack(every) if by_level else every[-1])
 
 
 class _Shape(NamedTuple):
@@ -203,7 +203,7 @@ class _Layer(NamedTuple):
 
 
 @dataclass
-class _System:
+class _LayerSystem:
     """``x = opt (b + P x)``, which every policy leaves.
 
     `longest` bounds the expected number of consecutive steps without cost. Without cycles of such

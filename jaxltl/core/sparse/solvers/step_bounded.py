@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, TYPE_CHECKING
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.choice_order import Choices, choices_of
+from jaxltl.core.sparse.choice_order import ChoiceOrder, choices_of
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, row_entries, sorted_unique
@@ -36,7 +36,7 @@ _OVERHEAD = 10_000  # multiplications in the time that NumPy's calls of one back
 _MANY = 32  # steps from which states that cannot reach the target in time are left out
 
 
-class Steps(NamedTuple):
+class StepBoundedValues(NamedTuple):
     """Result of backward induction."""
 
     value: Floats  # float64[S]
@@ -58,12 +58,12 @@ def relative_error(unit: float, num_steps: int) -> float:
     return total / (1 - total) if total < 0.5 else _HUGE
 
 
-class Backup(NamedTuple):
+class RowBackup(NamedTuple):
     """``x -> opt (cost + P x)`` over the choices of N states, with zero on all other states."""
 
     matrix: csr_array  # SciPy's float64[R', N]
     taken: csr_array  # the same with the columns of all states, float64[R', S]
-    choices: Choices  # the order of the states and of their choices
+    choices: ChoiceOrder  # the order of the states and of their choices
     row: Integers  # int[R'], the model's rows, in that order
     places: Integers  # int[N], the states
     operation: np.ufunc  # np.maximum or np.minimum
@@ -150,8 +150,8 @@ def _power(matrix: Floats, cost: Floats, value: Floats, num_steps: int) -> Float
     return value
 
 
-def backup_on(mdp: HostMDP, places: Integers, operation: np.ufunc) -> Backup:
-    """The :class:`Backup` of some states, ascending."""
+def backup_on(mdp: HostMDP, places: Integers, operation: np.ufunc) -> RowBackup:
+    """The :class:`RowBackup` of some states, ascending."""
     count = np.diff(mdp.row_start)[places]
     choices = choices_of(count)
     row = concatenated_ranges(mdp.row_start[places], count)[choices.order]
@@ -159,17 +159,17 @@ def backup_on(mdp: HostMDP, places: Integers, operation: np.ufunc) -> Backup:
     taken = mdp.matrix if whole else mdp.matrix[row]
     places = places[choices.states]
     matrix = taken if whole else taken[:, places]
-    return Backup(matrix, taken, choices, row, places, operation)
+    return RowBackup(matrix, taken, choices, row, places, operation)
 
 
-def _policy(mdp: HostMDP, backup: Backup, row: Integers) -> Integers:
+def _policy(mdp: HostMDP, backup: RowBackup, row: Integers) -> Integers:
     """The choices of some states, and the first rows of the others: ``int32[S]``."""
     policy = mdp.row_start[:-1].astype(np.int32)
     policy[backup.places] = row
     return policy
 
 
-def _policies(mdp: HostMDP, backup: Backup, every: list[Integers], num_steps: int) -> Integers:
+def _policies(mdp: HostMDP, backup: RowBackup, every: list[Integers], num_steps: int) -> Integers:
     """The choices of all steps, the first step first: ``int32[n, S]``; constant after a fixed point."""
     policies = np.tile(mdp.row_start[:-1].astype(np.int32), (num_steps, 1))
     for i in range(num_steps):
@@ -184,7 +184,7 @@ def until(
     num_steps: int,
     operation: np.ufunc,
     by_step: bool = False,
-) -> Steps:
+) -> StepBoundedValues:
     """Optimal probability of a target within n steps, through states where one may stay."""
     _require_memory(mdp, num_steps, by_step)
     open_ = stay & ~target
@@ -220,14 +220,16 @@ def until(
         one = open_ & reached_within(mdp, sets, num_steps, choose, lambda x: ~leads(~x))
         value[one], error[one] = 1, 0
     if every is not None:
-        return Steps(value, error, _policies(mdp, backup, every, num_steps), iterate.num_steps)
+        return StepBoundedValues(
+            value, error, _policies(mdp, backup, every, num_steps), iterate.num_steps
+        )
     row = backup.greedy(cost, iterate.before)
-    return Steps(value, error, _policy(mdp, backup, row), iterate.num_steps)
+    return StepBoundedValues(value, error, _policy(mdp, backup, row), iterate.num_steps)
 
 
 def avoidance(
     mdp: HostMDP, target: Booleans, stay: Booleans, num_steps: int, operation: np.ufunc
-) -> Steps | None:
+) -> StepBoundedValues | None:
     """Optimal complement of :func:`until`, with small relative errors; None for many steps."""
     if num_steps > _LONG:
         return None
@@ -252,10 +254,10 @@ def avoidance(
         zero = open_ & reached_within(mdp, sets, num_steps, choose, lambda x: ~leads(~x))
         value, error = np.where(one, 1, np.where(zero, 0, value)), np.where(one | zero, 0, error)
     row = backup.greedy(cost, iterate.before)
-    return Steps(value, error, _policy(mdp, backup, row), iterate.num_steps)
+    return StepBoundedValues(value, error, _policy(mdp, backup, row), iterate.num_steps)
 
 
-class Limit(Protocol):
+class LimitBounds(Protocol):
     """Bounds ``float64[S]`` of a step-bounded probability that hold for many steps."""
 
     @property
@@ -320,7 +322,7 @@ def unfinished(time: Floats, num_steps: int) -> float:
 
 
 def narrowed(
-    limit: Limit, value: Floats, error: Floats, open_: Booleans, complete: bool
+    limit: LimitBounds, value: Floats, error: Floats, open_: Booleans, complete: bool
 ) -> tuple[Floats, Floats]:
     """Values of open states within their limit; of incomplete backups they are a lower bound."""
     low, high = np.maximum(limit.lower, value - error), limit.upper
@@ -331,7 +333,7 @@ def narrowed(
     )
 
 
-def _unit(mdp: HostMDP, backup: Backup, num_steps: int) -> float:
+def _unit(mdp: HostMDP, backup: RowBackup, num_steps: int) -> float:
     """The relative rounding of a backup, also where powers of the matrix fill its rows."""
     if backup.small_chain and num_steps > _LONG:
         return max(backup_unit(mdp), (2 * backup.places.size + 6) * float(np.finfo(float).eps))
@@ -386,7 +388,7 @@ def total(
     num_steps: int,
     operation: np.ufunc,
     by_step: bool = False,
-) -> Steps:
+) -> StepBoundedValues:
     """Optimal expected reward of n steps; `rewards` are of rows, their magnitudes, and terminal."""
     reward, magnitude, start = rewards
     _require_memory(mdp, num_steps, by_step)
@@ -452,9 +454,11 @@ def total(
         zero = ~_earning(mdp, reward > 0, start > 0, num_steps, operation is np.maximum)
         value[zero] = off[zero] = 0
     if every is not None:
-        return Steps(value, off, _policies(mdp, backup, every, num_steps), iterate.num_steps)
+        return StepBoundedValues(
+            value, off, _policies(mdp, backup, every, num_steps), iterate.num_steps
+        )
     row = backup.greedy(cost, iterate.before)
-    return Steps(value, off, _policy(mdp, backup, row), iterate.num_steps)
+    return StepBoundedValues(value, off, _policy(mdp, backup, row), iterate.num_steps)
 
 
 def _earning(

@@ -21,7 +21,7 @@ from jaxltl.core.models.ops.array_namespace import jit, is_traced
 from jaxltl.core.models.ops.operators import induced_chain
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
-from jaxltl.core.sparse.solvers.average_reward import Range, average, within_range
+from jaxltl.core.sparse.solvers.average_reward import RewardRange, average, within_range
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.discounted import expected_reward
 from jaxltl.core.values.engine.state_quantities import (
@@ -106,14 +106,14 @@ def average_reward(
     return replace(solution, residual=residual)
 
 
-def _range(rewards: Rewards) -> Range:
+def _range(rewards: Rewards) -> RewardRange:
     """The range of a step's reward; ends are exact if nothing is added, or nothing but zeros."""
     least, largest = reward_span(rewards)
     parts = [x for x in (rewards.state, rewards.choice, rewards.transition) if x is not None]
     alone = rewards.transition is None and len(parts) <= 1
     least_zero = not any(np.min(x) for x in parts)
     largest_zero = not any(np.max(x) for x in parts)
-    return Range(least, largest, (alone or least_zero, alone or largest_zero))
+    return RewardRange(least, largest, (alone or least_zero, alone or largest_zero))
 
 
 @validated(games=True)

@@ -41,7 +41,7 @@ from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import (
-    Enclosure,
+    RelativeEnclosure,
     backup_error,
     enclose,
     refuse,
@@ -112,7 +112,7 @@ def judge(value: jax.Array, image: jax.Array, problem: Parameters) -> tuple[jax.
     return enclosure.ended, enclosure.half
 
 
-def _enclosed(value: jax.Array, image: jax.Array, problem: Parameters) -> Enclosure:
+def _enclosed(value: jax.Array, image: jax.Array, problem: Parameters) -> RelativeEnclosure:
     rounding = backup_error(problem.unit, problem.size, jnp.max(jnp.abs(image), axis=0))
     return enclose(value, image, problem.discount, rounding, problem.tolerance)
 
@@ -443,7 +443,7 @@ def _newton_steps(
             image, action = rows.mean(ahead), jnp.zeros(value.shape, jnp.int32)
         return value, image, action, dw.minus(image, value)
 
-    def bounds(image: jax.Array, change: jax.Array) -> Enclosure:
+    def bounds(image: jax.Array, change: jax.Array) -> RelativeEnclosure:
         size = problem.size + 2 * jnp.max(jnp.abs(dw.words(image)[0]))
         # A bound is computed from the change with some roundings.
         rounding = rows.unit * size + rows.underflow(size) + 16 * eps * jnp.max(jnp.abs(change))

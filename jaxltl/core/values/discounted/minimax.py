@@ -25,7 +25,7 @@ from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import jit, namespace, to_jax
 from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices
 from jaxltl.core.models.ops.operators import (
-    Policy,
+    CheckedPolicy,
     expectation,
     is_deterministic,
     require_policy,
@@ -38,7 +38,7 @@ from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import best_action, expected_reward
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import (
-    Enclosure,
+    RelativeEnclosure,
     backup_error,
     make_enclosure,
     refuse,
@@ -121,7 +121,7 @@ def minimax_value(
     moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    problem = _Problem(form, None, moves, live, defined, reward, discount)
+    problem = _MinimaxProblem(form, None, moves, live, defined, reward, discount)
     return reshape_solution(
         game_model, _solve(problem, tolerance, max_steps, per=per, method=method)
     )
@@ -199,7 +199,7 @@ def strategy_value(
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
     checked = checked._replace(used=drawn)
-    problem = _Problem(form, checked, moves, live, defined, reward, discount)
+    problem = _MinimaxProblem(form, checked, moves, live, defined, reward, discount)
     return reshape_solution(
         game_model, _solve(problem, tolerance, max_steps, per=per, method=method)
     )
@@ -213,18 +213,18 @@ def _read(game: Game, states: Array) -> Array:
     return states & xp.any(available, axis=-1)
 
 
-class _Drawn(NamedTuple):
+class _FixedPolicies(NamedTuple):
     """Policies of the players that do not optimise."""
 
-    policy: Policy
+    policy: CheckedPolicy
     used: jax.Array  # bool[S, A], the moves of positive weight; later bool[S], where they count
 
 
-class _Problem(NamedTuple):
+class _MinimaxProblem(NamedTuple):
     """A discounted game with its graph's preprocessing."""
 
     game: Game
-    drawn: _Drawn | None  # policies of the players that do not optimise
+    drawn: _FixedPolicies | None  # policies of the players that do not optimise
     moves: jax.Array  # that may be made
     live: jax.Array  # states from which play does not get stuck
     defined: jax.Array  # whether values exist
@@ -233,7 +233,7 @@ class _Problem(NamedTuple):
 
 
 @jit()
-def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
+def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _FixedPolicies:
     """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
     weight, joint, valid, representable = valid_policy(game, jnp.asarray(strategy), read)
@@ -244,7 +244,9 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
         weight = jnp.where(over.broadcast(read), other.distribution, weight)
         joint = jnp.where(over.broadcast(read), other.masked, joint)
         valid &= other.valid
-    return _Drawn(Policy(weight, joint, valid, representable), lax.stop_gradient(weight) > 0)
+    return _FixedPolicies(
+        CheckedPolicy(weight, joint, valid, representable), lax.stop_gradient(weight) > 0
+    )
 
 
 def _returns(graph: Graph, per: str, goal: Array, moves: Array, drawn: Array) -> Array:
@@ -263,7 +265,7 @@ def _returns(graph: Graph, per: str, goal: Array, moves: Array, drawn: Array) ->
     return back.all()
 
 
-class _Play(NamedTuple):
+class _DiscountedGame(NamedTuple):
     """Numbers of a discounted game over flat states; lanes may differ in all of them."""
 
     system: jax.Array
@@ -276,7 +278,7 @@ class _Play(NamedTuple):
     tolerance: jax.Array | None
 
 
-def _chosen(over: Layout, q: Quantity, play: _Play) -> tuple[jax.Array, Quantity]:
+def _chosen(over: Layout, q: Quantity, play: _DiscountedGame) -> tuple[jax.Array, Quantity]:
     """Values and weights of both players' best moves."""
     own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.broadcast(play.system, q), q)
     best, weight = best_action(over, own, play)
@@ -293,7 +295,7 @@ def _mean(over: Layout, weight: Quantity, q: Quantity) -> jax.Array:
 
 
 def _gains(
-    rows: SweepOperator, play: _Play, reward: Quantity, moves: Quantity, live: jax.Array
+    rows: SweepOperator, play: _DiscountedGame, reward: Quantity, moves: Quantity, live: jax.Array
 ) -> Quantity:
     """Columns of a reward: infinitely bad for the owner at moves that are not allowed."""
     never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
@@ -311,8 +313,8 @@ def _gains(
 
 def _horizon(
     rows: SweepOperator,
-    play: _Play,
-    problem: _Problem,
+    play: _DiscountedGame,
+    problem: _MinimaxProblem,
     moves: Quantity,
     per: str,
     max_steps: chex.Numeric,
@@ -328,7 +330,7 @@ def _horizon(
         slow = play._replace(system=jnp.ones_like(live))
 
         def judge(
-            tau: jax.Array, after: jax.Array, parameters: tuple[_Play, jax.Array]
+            tau: jax.Array, after: jax.Array, parameters: tuple[_DiscountedGame, jax.Array]
         ) -> tuple[jax.Array, jax.Array]:
             growth = jnp.max(after - tau, axis=0)
             # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
@@ -356,7 +358,7 @@ def _horizon(
     return jnp.where(valid, horizon, jnp.nan)
 
 
-def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
+def _certify(play: _DiscountedGame, value: jax.Array, image: jax.Array) -> RelativeEnclosure:
     """``T v + [down, up]`` encloses the fixed point of T; `horizon` for each state or its largest.
 
     With ``c = max(T v - v)``: if c >= 0, ``u = v + c h`` has ``T u <= u``, so the fixed point
@@ -375,7 +377,9 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
     return make_enclosure(down, up, unit * horizon, play.tolerance)._replace(finite=finite)
 
 
-def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
+def _judge(
+    value: jax.Array, image: jax.Array, play: _DiscountedGame
+) -> tuple[jax.Array, jax.Array]:
     enclosure = _certify(play, value, image)
     # Without a finite horizon no number of sweeps gives a bound.
     return enclosure.converged | enclosure.exhausted | ~jnp.isfinite(enclosure.half), enclosure.half
@@ -386,7 +390,7 @@ _FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far fr
 
 @jit("per", "method")
 def _solve(
-    problem: _Problem,
+    problem: _MinimaxProblem,
     tolerance: chex.Numeric | None,
     max_steps: chex.Numeric,
     *,
@@ -409,7 +413,7 @@ def _solve(
         return jnp.where(live, best, 0)
 
     flat = live.ravel()
-    play = _Play(
+    play = _DiscountedGame(
         game.system.ravel(),
         None if drawn is None else drawn.used.ravel(),
         None if drawn is None else over.columns(drawn.policy.distribution),

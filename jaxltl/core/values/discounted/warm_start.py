@@ -20,7 +20,7 @@ _FEWEST = 16  # lanes of the last sweeps
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
-class _Graph(NamedTuple):
+class _WarmStartGraph(NamedTuple):
     """Data shared by all lanes."""
 
     successor: jax.Array  # [S, A, K]
@@ -58,14 +58,16 @@ def span_iteration(
     discount) * [min, max](T v - v)``. A constant changes no choice, so only their width matters.
     """
     dtype = game.dtype
-    graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
+    graph = _WarmStartGraph(
+        game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype)
+    )
     discount, enough = (jnp.asarray(x, dtype) for x in (models.discount, models.enough))
     active = jnp.asarray(models.active)
     models = models._replace(discount=discount, enough=enough, active=active)
     return side_by_side(_solved, graph, models)
 
 
-def _solved(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _solved(graph: _WarmStartGraph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
     lanes = models.active.shape
     # Most models need few sweeps and some need many, which then continue with a quarter of the lanes.
     few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
@@ -89,7 +91,7 @@ def _is_active(models: Models, sweeps: _Sweeps) -> jax.Array:
     return models.active & (sweeps.error > models.enough) & (sweeps.number < _MAX_SWEEPS)
 
 
-def _swept(graph: _Graph, models: Models, start: _Sweeps, few: int) -> _Sweeps:
+def _swept(graph: _WarmStartGraph, models: Models, start: _Sweeps, few: int) -> _Sweeps:
     """Sweeps until at most `few` lanes are active."""
     live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
@@ -111,7 +113,7 @@ def _beside(models: Models, x: jax.Array) -> jax.Array:
     return x.reshape(x.shape + (1,) * models.active.ndim)
 
 
-def _change(graph: _Graph, models: Models, value: jax.Array) -> jax.Array:
+def _change(graph: _WarmStartGraph, models: Models, value: jax.Array) -> jax.Array:
     """``T v - v``; zero where there is no move."""
     allowed, sign = _beside(models, graph.allowed), _beside(models, graph.sign)
     best = jnp.full_like(value, -jnp.inf)
@@ -120,7 +122,7 @@ def _change(graph: _Graph, models: Models, value: jax.Array) -> jax.Array:
     return jnp.where(_beside(models, graph.allowed.any(-1)), sign * best - value, 0)
 
 
-def _quantities(graph: _Graph, models: Models, value: jax.Array) -> list[jax.Array]:
+def _quantities(graph: _WarmStartGraph, models: Models, value: jax.Array) -> list[jax.Array]:
     """``gain + discount * P v``, one column per action for contiguous reads."""
     num_actions, width = graph.successor.shape[1:]
 

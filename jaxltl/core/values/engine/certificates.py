@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.ops import double_word as dw
-from jaxltl.core.models.ops.operators import Policy
+from jaxltl.core.models.ops.operators import CheckedPolicy
 from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
@@ -61,7 +61,7 @@ Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 Pair = tuple[jax.Array, jax.Array]  # a double word, and a residual
 
 
-class Enclosure(NamedTuple):
+class RelativeEnclosure(NamedTuple):
     """An enclosure relative to an image; a field may have a last axis of lanes."""
 
     shift: jax.Array  # the middle of the enclosure minus the image
@@ -84,7 +84,7 @@ def enclose(
     rounding: jax.Array,
     tolerance: jax.Array | None,
     low: jax.Array | float = 0,
-) -> Enclosure:
+) -> RelativeEnclosure:
     """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``."""
     # ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g, and its low word.
     change = image - value
@@ -97,14 +97,14 @@ def enclose(
 
 def make_enclosure(
     down: jax.Array, up: jax.Array, rounding: jax.Array, tolerance: jax.Array | None
-) -> Enclosure:
+) -> RelativeEnclosure:
     """The enclosure between two ends, relative to the image; `rounding` is included in both."""
     # A quarter of `rounding` on each side pays for rounding in ``middle - half`` and ``middle +
     # half``, so that the width is at most the tolerance as computed.
     half = (up - down) / 2
     finite = jnp.isfinite(half)
     goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
-    return Enclosure(
+    return RelativeEnclosure(
         shift=jnp.where(finite, (up + down) / 2, 0),
         half=jnp.where(finite, half, jnp.inf),
         converged=finite & (half <= goal),
@@ -117,7 +117,7 @@ _REFINEMENTS = 9  # of an approximate solution; each multiplies its error by tha
 
 
 def m_matrix_error(
-    rows: dw.Rows, solve: Operator, start: jax.Array, one: jax.Array, undecided: jax.Array
+    rows: dw.DoubleWordRows, solve: Operator, start: jax.Array, one: jax.Array, undecided: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Bounds on the solution of ``y = one + P y`` from its approximation, its value and residual."""
     # If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
@@ -182,7 +182,7 @@ def m_matrix_error(
     return value, lower, upper, jnp.max(residual)
 
 
-def refuse(solution: Solution, checked: Policy | None) -> Solution:
+def refuse(solution: Solution, checked: CheckedPolicy | None) -> Solution:
     """The solution, without value and bounds if the given policy or the model is invalid."""
     # The status is INVALID_POLICY, or INVALID for a model with probabilities that are not
     # representable.

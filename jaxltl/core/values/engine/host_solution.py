@@ -105,7 +105,7 @@ def complement(
 
 
 @brief
-class Chain(NamedTuple):
+class PolicyChain(NamedTuple):
     """Markov chain of a policy."""
 
     mdp: HostMDP  # the chain
@@ -118,7 +118,7 @@ class Chain(NamedTuple):
         return np.add.reduceat(taken, row_start[:-1])
 
 
-def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
+def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> PolicyChain:
     """Markov chain induced by a policy."""
     host = sparse.host
     if is_sparse(model):
@@ -141,7 +141,7 @@ def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
         2 * num_terms + 4 if num_terms > 1 else 0
     )  # two sums of that many terms, one to divide by
     states = np.arange(host.num_states + 1)
-    return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
+    return PolicyChain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
 
 def _weights(model: ActionModel, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:

@@ -180,7 +180,7 @@ class ChainSystem(NamedTuple):
         return _unless(jnp.all(jnp.isfinite(x)), x, lambda: solve_linear(matvec, b, patient=True))
 
 
-class _Chain(NamedTuple):
+class _TransientChain(NamedTuple):
     """The system of a chain's transient states, for :func:`with_derivative`; no derivatives."""
 
     # Decided states lead to decided ones only, so the system is block triangular. Its decided part
@@ -277,9 +277,11 @@ def with_derivative(
     # target x is 0 as long as the support stays, and its derivative too. That of an optimum is the
     # derivative of the policy that attains it (Danskin). Where the target is reached almost surely,
     # the equation is that of ``1 - x``, so that entries within the support do not count.
-    known: _Chain = lax.stop_gradient(_Chain(chain, target, one, inverse))
+    known: _TransientChain = lax.stop_gradient(_TransientChain(chain, target, one, inverse))
 
-    def image(parameters: tuple[ActionModel, jax.Array], v: jax.Array, system: _Chain) -> jax.Array:
+    def image(
+        parameters: tuple[ActionModel, jax.Array], v: jax.Array, system: _TransientChain
+    ) -> jax.Array:
         (model, policy), one = parameters, system.one
         ahead = expectation(model, v) - one[..., None] * expectation(model, jnp.ones_like(v))
         return jnp.where(system.target, one, one + action_mean(policy, ahead))

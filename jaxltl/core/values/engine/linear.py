@@ -316,7 +316,7 @@ def random_shadow(b: jax.Array) -> jax.Array:
     return jax.random.normal(jax.random.key(0), b.shape, b.dtype)
 
 
-class _Progress(NamedTuple):
+class _CountedSearch(NamedTuple):
     """State of :func:`counted_solution`."""
 
     x: jax.Array
@@ -361,7 +361,7 @@ def counted_solution(
     size = norm(b)
     target = size * (float(jnp.finfo(b.dtype).eps) ** 0.8 if tolerance is None else tolerance)
 
-    def body(k: _Progress) -> _Progress:
+    def body(k: _CountedSearch) -> _CountedSearch:
         products = jnp.minimum(stretch, max_steps - k.num_steps)
         inner, n = bicgstab(
             matvec, k.r, tolerance=target / 2, max_steps=products, plain=k.plain, shadow=shadow
@@ -377,12 +377,12 @@ def counted_solution(
         # The rate means nothing before information has passed from every state.
         hopeless = (n > 4 * b.size) & (rest * stretch > max_steps - n)
         ended = (error <= target) | (k.plain & (~better | hopeless)) | (n >= max_steps)
-        return _Progress(x, r, error, ~(error <= k.error / 2), n, ended)
+        return _CountedSearch(x, r, error, ~(error <= k.error / 2), n, ended)
 
     zero = jnp.where(jnp.isfinite(size), jnp.zeros_like(b), jnp.nan)
     no = jnp.bool_(False)
     last = lax.while_loop(
-        lambda k: ~k.ended, body, _Progress(zero, b, size, no, jnp.int32(0), ~(size > 0))
+        lambda k: ~k.ended, body, _CountedSearch(zero, b, size, no, jnp.int32(0), ~(size > 0))
     )
     return last.x, last.num_steps
 

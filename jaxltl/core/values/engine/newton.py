@@ -54,7 +54,7 @@ class Method(NamedTuple):
     monotone: bool = True
 
 
-class _Search(NamedTuple):
+class _NewtonSearch(NamedTuple):
     """State of the search of a lane."""
 
     z: jax.Array  # the value to be judged next
@@ -89,7 +89,7 @@ def solve(
     zero = jnp.zeros_like(value)
     weight: Quantity = table.choices.broadcast(zero, backup.reward)
     over, none, no = table.choices, jnp.int32(0), jnp.bool_(False)
-    start = _Search(
+    start = _NewtonSearch(
         z=value,
         value=value,
         image=value,
@@ -118,7 +118,7 @@ _Parameters = tuple[Backup, jax.Array]
 
 
 def _judged(
-    method: Method, table: SweepOperator, k: _Search, backup: Backup
+    method: Method, table: SweepOperator, k: _NewtonSearch, backup: Backup
 ) -> tuple[jax.Array, Quantity, jax.Array, jax.Array]:
     """The image of z, the weights of its derivative, and the judgement."""
     values = action_values(table.choices, backup, table.expectation(k.z))
@@ -126,15 +126,17 @@ def _judged(
     return image, weight, *method.judge(k.z, image, backup.extra)
 
 
-def _sweep(method: Method, table: SweepOperator, k: _Search, parameters: _Parameters) -> _Search:
+def _sweep(
+    method: Method, table: SweepOperator, k: _NewtonSearch, parameters: _Parameters
+) -> _NewtonSearch:
     image, _, done, error = _judged(method, table, k, parameters[0])
     z = k.z + (1 - parameters[0].damping) * (image - k.z)
     return k._replace(z=z, value=k.z, image=image, error=error, done=done)
 
 
 def _newton_step(
-    method: Method, table: SweepOperator, k: _Search, parameters: _Parameters
-) -> _Search:
+    method: Method, table: SweepOperator, k: _NewtonSearch, parameters: _Parameters
+) -> _NewtonSearch:
     """Judges z, and makes a step of Newton's method or a sweep."""
     (backup, limit), over = parameters, table.choices
     image, weight, done, error = _judged(method, table, k, backup)
@@ -167,7 +169,7 @@ def _newton_step(
         return x, enough, num_steps + n
 
     step, enough, num_steps = lax.cond(sweeps, swept, solved)
-    return _Search(
+    return _NewtonSearch(
         z=value + step,
         value=value,
         image=image,

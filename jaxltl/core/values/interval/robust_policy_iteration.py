@@ -91,7 +91,7 @@ class RobustProblem:
         )
 
 
-class Bounds(NamedTuple):
+class NodeBounds(NamedTuple):
     """Bounds of the nodes, and a pair of policy and nature."""
 
     lower: jax.Array  # float[N], with the sign: the bound that the leader attains
@@ -167,7 +167,7 @@ class _Iteration(NamedTuple):
     proven: jax.Array
 
 
-def enclose(problem: RobustProblem, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
+def enclose(problem: RobustProblem, tolerance: jax.Array, max_rounds: jax.Array) -> NodeBounds:
     """Certified lower and upper bounds."""
     every = jnp.sum(problem.upper - problem.lower, axis=1, keepdims=True)
     rest = jnp.maximum(1 - jnp.sum(problem.lower, axis=1, keepdims=True), 0)
@@ -199,7 +199,7 @@ def enclose(problem: RobustProblem, tolerance: jax.Array, max_rounds: jax.Array)
     # The leader's choices attain the one bound, those of the opponent the other.
     row = problem.best(lows if problem.policy_leads else highs)[1]
     middle = jnp.where(lower.proven & upper.proven, (lower.z + upper.z) / 2, lower.base)
-    return Bounds(
+    return NodeBounds(
         lower.z,
         upper.z,
         lower.proven,

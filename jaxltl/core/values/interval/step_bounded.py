@@ -11,7 +11,7 @@ from jaxltl.core.models.interval import IntervalMDP, require_interval
 from jaxltl.core.models.refusals import on_host
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.robust_values import Query
-from jaxltl.core.sparse.solvers.step_bounded import Steps
+from jaxltl.core.sparse.solvers.step_bounded import StepBoundedValues
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.array_types import Floats
@@ -147,7 +147,7 @@ def robust_cumulative_reward(
     rewards = reward_structure(world, reward)
     count = validation.integer("num_steps", num_steps)
     earned = transition_reward(world, rewards)
-    steps = _Steps(count, reward_span(rewards, count))
+    steps = _StepSpan(count, reward_span(rewards, count))
     return _earned(model, earned, np.zeros(world.num_states), steps, objective, nature)
 
 
@@ -185,11 +185,11 @@ def robust_instantaneous_reward(
     start = state_reward(require_interval(model).nominal, reward)
     zero = np.zeros(model.num_transitions)
     span = float(start.min()), float(start.max())
-    steps = _Steps(validation.integer("num_steps", num_step), span)
+    steps = _StepSpan(validation.integer("num_steps", num_step), span)
     return _earned(model, zero, start, steps, objective, nature)
 
 
-class _Steps(NamedTuple):
+class _StepSpan(NamedTuple):
     """A number of steps, and the span of what they earn."""
 
     number: int
@@ -200,7 +200,7 @@ def _earned(
     model: IntervalMDP,
     earned: Floats,
     start: Floats,
-    steps: _Steps,
+    steps: _StepSpan,
     objective: str,
     nature: str | None,
 ) -> Solution:
@@ -209,7 +209,7 @@ def _earned(
     return _solution(values, steps.span)
 
 
-def _solution(values: Steps, span: Span = PROBABILITY) -> Solution:
+def _solution(values: StepBoundedValues, span: Span = PROBABILITY) -> Solution:
     """The :class:`Solution` of step-bounded values."""
     nature: Array | None = values.probability
     solution = solution_from_error(

@@ -20,14 +20,18 @@ from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Status
 from jaxltl.core.values.engine.host_solution import induced_chain
-from jaxltl.core.values.multi_objective.objectives import Part
+from jaxltl.core.values.multi_objective.objectives import ObjectivePart
 from jaxltl.core.values.multi_objective.answers import (
     ConstrainedOptimum,
     Front,
     NearestMixture,
     impossible,
 )
-from jaxltl.core.values.multi_objective.query import Query, bounds_of, multi_objective_query
+from jaxltl.core.values.multi_objective.query import (
+    ObjectivesQuery,
+    bounds_of,
+    multi_objective_query,
+)
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 
 
@@ -57,7 +61,7 @@ class _Sum(NamedTuple):
 class FrontSearch:
     """Known points and half-spaces, all objectives maximised: `signs` is -1 for minimised ones."""
 
-    def __init__(self, query: Query, tolerance: float) -> None:
+    def __init__(self, query: ObjectivesQuery, tolerance: float) -> None:
         ends, endless = query.ends, query.infinite_reward()
         if ends is None:
             raise ValueError(query.infinite_costs())
@@ -128,7 +132,7 @@ class FrontSearch:
             values.append(self._expected(part, x))
         return np.array(values).T
 
-    def _expected(self, part: Part, enclosure: Enclosure) -> tuple[float, float, float]:
+    def _expected(self, part: ObjectivePart, enclosure: Enclosure) -> tuple[float, float, float]:
         """Value, lower and upper bound from the initial distribution."""
         first = np.flatnonzero(self.problem.start)
         share = self.problem.start[first]

@@ -73,7 +73,7 @@ class Objective:
 
 
 @brief
-class Part(NamedTuple):
+class ObjectivePart(NamedTuple):
     """Place of an objective in a weighted problem."""
 
     number: int  # of the objective, from 0
@@ -83,7 +83,7 @@ class Part(NamedTuple):
     pending: np.ndarray | None  # bool[N], of a reward with a target, where that is not reached yet
 
 
-class _Tracker(NamedTuple):
+class _ObjectiveMonitor(NamedTuple):
     """Deterministic monitor of an objective."""
 
     delta: np.ndarray  # int[Q, L]
@@ -97,7 +97,7 @@ class _Tracker(NamedTuple):
 
 def weighted_problem(
     model: SparseMDP, objectives: Sequence[Objective]
-) -> tuple[WeightedProblem, list[Part], SparseProduct]:
+) -> tuple[WeightedProblem, list[ObjectivePart], SparseProduct]:
     """The objectives on the reachable product of the model and their monitors."""
     rewards = [_checked(model, i, o) for i, o in enumerate(objectives)]
     trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
@@ -117,7 +117,7 @@ def weighted_problem(
     mdp = product.host
     state = members[product.memory]  # int[N, trackers]
     still = product.still
-    parts: list[Part] = []
+    parts: list[ObjectivePart] = []
     rows: dict[str, list[np.ndarray]] = {"sure": [], "gain": [], "cost": []}
     ended = np.ones(mdp.num_states, bool)
     for i, (objective, reward) in enumerate(zip(objectives, rewards, strict=True)):
@@ -135,7 +135,7 @@ def weighted_problem(
         else:
             assert tracker is not None and memory is not None
             kind, counted = "sure", _priorities(product, tracker, memory, still)
-        parts.append(Part(i, kind, len(rows[kind]), sign, pending))
+        parts.append(ObjectivePart(i, kind, len(rows[kind]), sign, pending))
         rows[kind].append(counted)
     initial = np.asarray(model.initial, np.float64)
     start = np.zeros(mdp.num_states)
@@ -176,12 +176,12 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
     return nonnegative_reward(model, objective.reward, use, f"{name}: the reward")
 
 
-def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracker | None:
+def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _ObjectiveMonitor | None:
     opposite = objective.direction == "min"
     if objective.formula is not None:
         automaton, letter = automaton_and_letters(model, objective.formula)
         yes, no = universal_states(automaton), ~live_states(automaton)
-        return _Tracker(
+        return _ObjectiveMonitor(
             automaton.delta,
             letter,
             int(automaton.initial),
@@ -202,8 +202,8 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
     delta = np.array([[0, 1, 2], [1, 1, 1], [2, 2, 2]])
     decided = np.array([False, True, True])
     if is_reward:
-        return _Tracker(delta, letter, 0, decided, None, None)
-    return _Tracker(
+        return _ObjectiveMonitor(delta, letter, 0, decided, None, None)
+    return _ObjectiveMonitor(
         delta,
         letter,
         0,
@@ -214,7 +214,7 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
 
 
 def _product(
-    model: SparseMDP, trackers: list[_Tracker], all_end: bool
+    model: SparseMDP, trackers: list[_ObjectiveMonitor], all_end: bool
 ) -> tuple[SparseProduct, np.ndarray]:
     """The product with all monitors, and the state of each in each joint one, ``int[J, n]``."""
     letters: Integers = np.zeros((model.num_states, len(trackers)), np.int64)
@@ -240,7 +240,7 @@ def _product(
 
 
 def _priorities(
-    product: SparseProduct, tracker: _Tracker, memory: np.ndarray, still: np.ndarray
+    product: SparseProduct, tracker: _ObjectiveMonitor, memory: np.ndarray, still: np.ndarray
 ) -> np.ndarray:
     """The least priority that each row reads, ``int[R']``."""
     mdp = product.host

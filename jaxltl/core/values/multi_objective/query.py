@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward
-from jaxltl.core.models.number_source import Rationals
+from jaxltl.core.models.number_source import RationalNumbers
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.sparse.exact.model import double_bounds
@@ -30,18 +30,18 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import (
 )
 from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.values.multi_objective.answers import Front
-from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
+from jaxltl.core.values.multi_objective.objectives import Objective, ObjectivePart, weighted_problem
 
 MAX_ROWS = 5000  # of models whose numbers are read as fractions, before it is known what is used
 
 
-class Query(NamedTuple):
+class ObjectivesQuery(NamedTuple):
     """Objectives of a model and its policies with finite minimised rewards."""
 
     model: SparseMDP
     objectives: Sequence[Objective]
     problem: WeightedProblem
-    parts: list[Part]
+    parts: list[ObjectivePart]
     product: SparseProduct
     ends: FinalComponents | None  # None if no policy has finite minimised rewards
 
@@ -121,7 +121,7 @@ class Query(NamedTuple):
         value = part.sign * answer.value + (part.kind == "sure" and part.sign < 0)
         return answer._replace(value=value)
 
-    def _distribution(self, numbers: Rationals, row: int) -> dict[int, Fraction]:
+    def _distribution(self, numbers: RationalNumbers, row: int) -> dict[int, Fraction]:
         """The successors of a row of the product, with their probabilities."""
         mdp, base = self.problem.mdp, numbers.mdp.rows[int(self.product.base_row[row])]
         s = int(mdp.state[row])
@@ -130,7 +130,7 @@ class Query(NamedTuple):
         successors = mdp.successor[mdp.entry_start[row] : mdp.entry_start[row + 1]].tolist()
         return {t: base[int(self.product.base_state[t])] for t in successors}
 
-    def _rewards(self, part: Part, numbers: Rationals) -> list[Fraction] | None:
+    def _rewards(self, part: ObjectivePart, numbers: RationalNumbers) -> list[Fraction] | None:
         """The rewards of the product's rows, negative if minimised; None of a probability."""
         if part.kind == "sure":
             return None
@@ -150,7 +150,7 @@ def multi_objective_query(
     model: Model,
     objectives: Sequence[Objective],
     limits: Sequence[float | Fraction | None] | None = None,
-) -> Query:
+) -> ObjectivesQuery:
     """The query for objectives of a model; rewards of at most zero remove the rows that earn them."""
     if not objectives:
         raise ValueError("there is no objective; give at least one.")
@@ -161,7 +161,9 @@ def multi_objective_query(
         if part.kind == "cost" and limit is not None and limit <= 0:
             unpaid = problem.cost[part.place] == 0
             rows = unpaid if rows is None else rows & unpaid
-    return Query(sparse, objectives, problem, parts, product, final_components(problem, rows))
+    return ObjectivesQuery(
+        sparse, objectives, problem, parts, product, final_components(problem, rows)
+    )
 
 
 def bounds_of(value: Fraction | None) -> tuple[float, float]:

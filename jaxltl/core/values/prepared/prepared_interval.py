@@ -33,7 +33,7 @@ from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import row_system
 from jaxltl.core.values.interval.robust_policy_iteration import (
-    Bounds,
+    NodeBounds,
     RobustProblem,
     greedy_distributions,
     enclose,
@@ -283,7 +283,7 @@ def _solve(
         bounds = sequential_vmap(enclose, problem, tolerance, jnp.asarray(max_steps, jnp.int32))
     else:
         none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
-        bounds = Bounds(
+        bounds = NodeBounds(
             none, none, proven, proven, none, problem.first, problem.lower, jnp.int32(0)
         )
     return _answer(prepared, problem, bounds, (lower, upper), tolerance, (finite, valid))
@@ -357,7 +357,7 @@ def _robust_problem(
 def _answer(
     prepared: PreparedInterval,
     problem: RobustProblem,
-    bounds: Bounds,
+    bounds: NodeBounds,
     ends: tuple[jax.Array, jax.Array],
     tolerance: jax.Array,
     checks: tuple[jax.Array, jax.Array],
@@ -422,7 +422,7 @@ def _image(problem: RobustProblem, x: jax.Array, sign: int) -> jax.Array:
     return lax.stop_gradient(x + sign * best)
 
 
-def _attached(problem: RobustProblem, bounds: Bounds, value: jax.Array, sign: int) -> jax.Array:
+def _attached(problem: RobustProblem, bounds: NodeBounds, value: jax.Array, sign: int) -> jax.Array:
     """Values with implicit derivatives, policy and order of successors held fixed."""
     row, target = bounds.row, problem.target[bounds.row]
     value = lax.stop_gradient(value)

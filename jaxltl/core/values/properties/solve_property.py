@@ -179,7 +179,7 @@ def solve_property(
     states = starting_states(model, states)
     tolerance = requested_width(tolerance)
     aim = _aim(model, prop)
-    solve = partial(_solved, _Query(model, states, prop.text), prop, aim)
+    solve = partial(_solved, _ModelQuery(model, states, prop.text), prop, aim)
     exact = partial(exact_values, model, prop, states, maximize=aim.policy == "max")
     result = solve(width(tolerance))
     if prop.relation is None:
@@ -378,7 +378,7 @@ def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
 # --- which solver -----------------------------------------------------------------------------
 
 
-def _solved(query: _Query, prop: Property, aim: _Aim, tolerance: float) -> _Result:
+def _solved(query: _ModelQuery, prop: Property, aim: _Aim, tolerance: float) -> _Result:
     """The solution of a property at some states."""
     model, path = query.model, prop.path
     if prop.operator == "P":
@@ -426,7 +426,7 @@ def _without_intervals(
     )
 
 
-class _Query(NamedTuple):
+class _ModelQuery(NamedTuple):
     """A model and the states at which a property is asked for."""
 
     model: SparseMDP | IntervalMDP

@@ -39,7 +39,7 @@ from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, round
 from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
 from jaxltl.core.values.engine.iterate import sequential_vmap, iterate
 from jaxltl.core.values.engine.linear import System, is_small, most_products, solver
-from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
+from jaxltl.core.values.undiscounted.traced_total_reward import TotalRewardProblem, solve_problem
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FINER = 8  # factor by which a guess is narrower than the bounds, once these meet the goal
@@ -158,7 +158,7 @@ def _qualitative(
     return sets, components_within(graph, ~(sets.one | sets.zero))
 
 
-class _Search(NamedTuple):
+class _ReachabilitySearch(NamedTuple):
     """An optimal reachability problem, as the maximum of ``y = sign * probability``."""
 
     # A policy attains the lower bound of y. Both bounds are rounded outwards: sums of terms of one
@@ -197,7 +197,7 @@ class _Search(NamedTuple):
         return jnp.clip(y, jnp.minimum(self.sign, 0), jnp.maximum(self.sign, 0))
 
 
-class _Bounds(NamedTuple):
+class _ReachabilityBounds(NamedTuple):
     lower: jax.Array
     upper: jax.Array
     failed: jax.Array  # whether the last guess was no bound
@@ -208,7 +208,9 @@ class _Bounds(NamedTuple):
         return jnp.max(self.upper - self.lower) / 2
 
 
-def _tighter(finest: bool, table: None, bounds: _Bounds, search: _Search) -> _Bounds:
+def _tighter(
+    finest: bool, table: None, bounds: _ReachabilityBounds, search: _ReachabilitySearch
+) -> _ReachabilityBounds:
     """One round: a sweep, and some under the greedy policy, for `lower`; some for `upper`."""
     # A value that the operator does not carry away from the optimum is a bound, because the fixed
     # point is unique where end components are collapsed; so `upper` is guessed, and where the guess
@@ -245,13 +247,13 @@ def _tighter(finest: bool, table: None, bounds: _Bounds, search: _Search) -> _Bo
     drop = jnp.max(upper - new)
     rests &= ~failed & (drop <= search.slack / 8)
     moved = (gain > 0) | (drop > 0) | failed
-    bounds_after = _Bounds(raised, new, failed, ~moved)
+    bounds_after = _ReachabilityBounds(raised, new, failed, ~moved)
     return bounds_after._replace(
         ended=~moved | (rests if finest else bounds_after.half <= search.goal)
     )
 
 
-def _followed(search: _Search, lower: jax.Array, action: jax.Array) -> jax.Array:
+def _followed(search: _ReachabilitySearch, lower: jax.Array, action: jax.Array) -> jax.Array:
     onward = policy_operator(search.model, action)
 
     def sweep(_: int, y: jax.Array) -> jax.Array:
@@ -307,7 +309,7 @@ def _by_policy_iteration(
     leaving = model.available if components is None else model.available & ~components.inside
     sign, gain = 1 if objective == "max" else -1, rows.expectation(double_word(one))
     open_, finite = ~(sets.one | sets.zero), sets.one | True
-    problem = Problem(
+    problem = TotalRewardProblem(
         rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
     )
     finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
@@ -326,7 +328,7 @@ def _by_intervals(
     (tolerance, max_steps, start), sign = options, 1 if objective == "max" else -1
     undecided, one = ~(sets.one | sets.zero), sets.one.astype(model.dtype)
     goal = _half_width(model, tolerance)
-    search = _Search(model, undecided, sign * one, components, goal, sign)
+    search = _ReachabilitySearch(model, undecided, sign * one, components, goal, sign)
     ends = (0, 1) if start is None else (jnp.clip(x, 0, 1) for x in start)
     low, high = (jnp.where(undecided, x, one) for x in ends)
     lower, upper = (low, high) if sign > 0 else (-high, -low)
@@ -334,7 +336,7 @@ def _by_intervals(
     bounds, n = iterate(
         partial(_tighter, tolerance is None),
         lambda bounds, _: bounds.ended,
-        (None, _Bounds(lower, upper, no, no), search),
+        (None, _ReachabilityBounds(lower, upper, no, no), search),
         max_steps=_SWEEPS if max_steps is None else max_steps,
     )
     lower, upper = bounds.lower, bounds.upper

@@ -219,7 +219,7 @@ def _reach(
     return value, lower, upper
 
 
-class _Blocks(NamedTuple):
+class _UndecidedSystem(NamedTuple):
     """The system ``x - P x`` on the undecided states, x elsewhere, for ``[S, Q]``."""
 
     # Block Jacobi with a block for each memory state. If the automaton's only cycles are
@@ -281,10 +281,10 @@ def _stays(model: Product) -> jax.Array:
     return model.next_memory == jnp.arange(model.num_memory)
 
 
-def _blocks(model: Product, policy: jax.Array, undecided: jax.Array) -> _Blocks:
+def _blocks(model: Product, policy: jax.Array, undecided: jax.Array) -> _UndecidedSystem:
     inside = jnp.where(undecided.T[:, :, None], _within(model, policy, _stays(model)), 0)
     inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
-    return _Blocks(model, policy, undecided, inverses)
+    return _UndecidedSystem(model, policy, undecided, inverses)
 
 
 def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:

@@ -28,7 +28,7 @@ from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.sparse.solvers.shortest_path import with_exits
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, RelativeTolerance
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.engine.host_solution import Chain, induced_chain, status_between
+from jaxltl.core.values.engine.host_solution import PolicyChain, induced_chain, status_between
 from jaxltl.core.values.engine.state_quantities import safe_ends
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.undiscounted.fastest import possibly_optimal_rows, tied_rows
@@ -292,7 +292,7 @@ class StepAnalysis:
         priority: Integers = np.asarray(self.model.automaton.priority)[source % count, letter]
         return priority
 
-    def _between_rounds(self, chain: Chain) -> tuple[float, float, float]:
+    def _between_rounds(self, chain: PolicyChain) -> tuple[float, float, float]:
         """Steps between two rounds of a policy: value, lower and upper bound."""
         mdp, size = chain.mdp, chain.mdp.num_states
         components = end_components(mdp)
@@ -417,7 +417,7 @@ def steps_front(
       >>> [(round(v.probability[0], 6), round(v.steps[0], 6)) for v in front]
       [(1.0, 4.0), (0.5, 1.0)]
     """
-    front = _Front.of(as_product(model), quickest)
+    front = _StepsFrontSearch.of(as_product(model), quickest)
     vertices = list(front.ends)
     lines = [front.ends]
     while lines and len(vertices) < max_points:
@@ -448,7 +448,7 @@ def constrained_policy(
     model: Product, probability: float, steps: float, quickest: Quickest
 ) -> ConstrainedPolicy:
     """A policy with at least a probability and at most a number of steps, of a co-safe task."""
-    front = _Front.of(model, quickest)
+    front = _StepsFrontSearch.of(model, quickest)
     one_hot = np.eye(model.num_actions)
     first, last = front.ends
     highest = min(1.0, first.probability[2])
@@ -475,7 +475,7 @@ def constrained_policy(
 
 
 @dataclass(frozen=True)
-class _Front:
+class _StepsFrontSearch:
     """Search of the front by weighted sums ``min mu E[steps] + P(lost)``, shortest paths.
 
     Solved for the slope between two vertices, a sum gives another vertex, or certifies that no
@@ -486,7 +486,7 @@ class _Front:
     ends: tuple[Vertex, Vertex]  # the quickest optimal policy, and the earliest decision
 
     @staticmethod
-    def of(model: Product, quickest: Quickest | None) -> _Front:
+    def of(model: Product, quickest: Quickest | None) -> _StepsFrontSearch:
         if is_traced(model):
             raise ValueError("fronts are found on the host; call it outside jit and vmap.")
         if not model.automaton.is_cosafe:
@@ -496,9 +496,9 @@ class _Front:
             )
         quickest = quickest_policy(model) if quickest is None else quickest
         clock = StepAnalysis(model)
-        front = _Front(clock, ())  # type: ignore[arg-type]
+        front = _StepsFrontSearch(clock, ())  # type: ignore[arg-type]
         ends = front.vertex(quickest.policy), front.vertex(front.cheapest(1.0, _LINE_TOLERANCE)[0])
-        return _Front(clock, ends)
+        return _StepsFrontSearch(clock, ends)
 
     def vertex(self, policy: np.ndarray) -> Vertex:
         return Vertex(policy, self.clock.probability(policy), self.clock.steps(policy)[:3])

@@ -29,7 +29,7 @@ from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.engine.host_solution import (
-    Chain,
+    PolicyChain,
     complement_event,
     default_tolerance,
     induced_chain,
@@ -93,7 +93,7 @@ def sparse_satisfaction(
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     automaton, letter = automaton_and_letters(model, task)
     states = starting_states(model, states)
-    reader = _Reader(automaton, letter, label_on == "entry")
+    reader = _LetterReader(automaton, letter, label_on == "entry")
     product = _product(model, reader, states)
     solution, row = _best(product, reader, objective, tolerance)
     chosen: Array = product.base_row[row]
@@ -129,7 +129,7 @@ def starting_states(model: Model, states: Array) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Reader:
+class _LetterReader:
     """An automaton, the letter of each state ``int[S]``, and whether it is read on entry."""
 
     automaton: Automaton
@@ -149,7 +149,7 @@ class _Reader:
 
 def _best(
     product: SparseProduct,
-    reader: _Reader,
+    reader: _LetterReader,
     objective: str,
     tolerance: jax.Array | float | None,
     depth: int = 0,
@@ -195,11 +195,11 @@ class ReachabilityProblem(NamedTuple):
 
 def reachability_problem(result: Satisfaction, objective: str) -> ReachabilityProblem:
     """The reachability problem that a satisfaction probability was solved by."""
-    reader = _Reader(result.automaton, result.letter, result.label_on == "entry")
+    reader = _LetterReader(result.automaton, result.letter, result.label_on == "entry")
     return _problem(result.product, reader, objective)
 
 
-def _problem(product: SparseProduct, reader: _Reader, objective: str) -> ReachabilityProblem:
+def _problem(product: SparseProduct, reader: _LetterReader, objective: str) -> ReachabilityProblem:
     automaton = reader.automaton
     opposite = automaton.is_safety or (not automaton.has_final_states and objective == "min")
     goal: np.ndarray = (reader.rejecting if opposite else reader.accepting)[product.memory]
@@ -240,7 +240,7 @@ def product_satisfaction(
     if policy is not None:
         chain = _chain(product, model, policy)
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
-    reader = _Reader(automaton, letter, on_entry)
+    reader = _LetterReader(automaton, letter, on_entry)
     solution, row = _best(product, reader, objective, tolerance, depth)
     parts: dict[str, Array] = {
         name: np.asarray(getattr(solution, name)).reshape(shape)
@@ -254,7 +254,7 @@ def product_satisfaction(
     return replace(solution, **parts)
 
 
-def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
+def _chain(product: SparseProduct, model: Product, policy: Array) -> PolicyChain:
     """The chain of a policy of the model's rows."""
     policy = np.asarray(policy)
     written = sparse_mdp_of_product(product)
@@ -270,7 +270,7 @@ def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
     return induced_chain(written, written, weight)
 
 
-def _product(model: SparseMDP, reader: _Reader, states: np.ndarray) -> SparseProduct:
+def _product(model: SparseMDP, reader: _LetterReader, states: np.ndarray) -> SparseProduct:
     automaton, letter, on_entry = reader.automaton, reader.letter, reader.on_entry
     still = reader.accepting | reader.rejecting
     if still.size == 1 and not still.any():

@@ -73,10 +73,10 @@ _LARGEST = 0.1  # the largest share e
 _MAX_STEPS = 1_000_000
 
 
-class Problem(NamedTuple):
+class TotalRewardProblem(NamedTuple):
     """Residual problem after qualitative preprocessing."""
 
-    rows: dw.Rows  # of the model, and of the policy to evaluate if there is one
+    rows: dw.DoubleWordRows  # of the model, and of the policy to evaluate if there is one
     sign: int  # 1 for a maximum, -1 for a minimum; static
     reward: jax.Array  # ``[S, A]``, in double words
     policy: jax.Array | None  # ``float[S, A]``, the policy as given, or None
@@ -95,7 +95,7 @@ class Problem(NamedTuple):
         return self.rows.model
 
 
-class _Point(NamedTuple):
+class _BellmanImage(NamedTuple):
     """A value, its image under T, the action, and in an end component the state that takes it."""
 
     value: jax.Array  # value, image: in double words
@@ -107,8 +107,8 @@ class _Point(NamedTuple):
 # The inverse of the system of a policy, empty for large models; its actions; where it leaves.
 _Inverse = tuple[jax.Array, jax.Array, jax.Array]
 # The image of a point, in double words, and the relative and the absolute error of a solution.
-_Equation = tuple[Callable[[_Point], jax.Array], jax.Array, jax.Array]
-_Progress = tuple[_Point, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+_Equation = tuple[Callable[[_BellmanImage], jax.Array], jax.Array, jax.Array]
+_Progress = tuple[_BellmanImage, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 Tree = TypeVar("Tree")
 
 
@@ -173,12 +173,16 @@ def _enclosed(
 
 
 def _of_policy(
-    graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array, policy: jax.Array
-) -> Problem:
+    graph: TracedGraph,
+    rows: dw.DoubleWordRows,
+    reward: jax.Array,
+    target: jax.Array,
+    policy: jax.Array,
+) -> TotalRewardProblem:
     taken = graph.available & (policy > 0)
     finite = policy_sets(graph, target, policy).one
     first = graph.first(taken)[1]
-    return Problem(
+    return TotalRewardProblem(
         rows,
         1,
         dw.double_word(reward),
@@ -206,7 +210,9 @@ def _positive(reward: jax.Array) -> jax.Array:
     return lax.bitcast_convert_type(reward, kind) > 0
 
 
-def _largest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array) -> Problem:
+def _largest(
+    graph: TracedGraph, rows: dw.DoubleWordRows, reward: jax.Array, target: jax.Array
+) -> TotalRewardProblem:
     never = jnp.asarray(avoid(graph, target))
     doomed = attract(graph, never, among=~target)
     finite = ~doomed.region
@@ -215,10 +221,14 @@ def _largest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.A
     decided = jnp.where(never, avoids, jnp.where(finite, first, doomed.action))
     undecided = _earning(graph, reward, target, graph.available) & finite
     gain = dw.double_word(reward)
-    return Problem(rows, 1, gain, None, undecided, finite, graph.available, None, decided, None)
+    return TotalRewardProblem(
+        rows, 1, gain, None, undecided, finite, graph.available, None, decided, None
+    )
 
 
-def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array) -> Problem:
+def _smallest(
+    graph: TracedGraph, rows: dw.DoubleWordRows, reward: jax.Array, target: jax.Array
+) -> TotalRewardProblem:
     sure = surely(graph, target)
     finite = sure.region
     allowed = graph.available & graph.forall(finite) & graph.on_choices(finite & ~target)
@@ -227,7 +237,7 @@ def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.
     nothing = surely(graph, target, free)
     undecided = finite & ~nothing.region
     circles = components_within(graph, undecided, free)
-    return Problem(
+    return TotalRewardProblem(
         rows,
         -1,
         dw.double_word(reward),
@@ -244,13 +254,13 @@ def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.
 # --- the operator -----------------------------------------------------------------------------
 
 
-def _backup(problem: Problem, value: jax.Array) -> _Point:
+def _backup(problem: TotalRewardProblem, value: jax.Array) -> _BellmanImage:
     """A value's image under T, 0 outside of the undecided states."""
     ahead = problem.rows.expectation(value)
     return _chosen(problem, value, dw.plus(problem.reward, ahead))
 
 
-def _chosen(problem: Problem, value: jax.Array, ahead: jax.Array) -> _Point:
+def _chosen(problem: TotalRewardProblem, value: jax.Array, ahead: jax.Array) -> _BellmanImage:
     """The image of a value from those of its choices."""
     leaves = state_numbers(value.shape)
     if problem.policy is not None:
@@ -265,7 +275,7 @@ def _chosen(problem: Problem, value: jax.Array, ahead: jax.Array) -> _Point:
             image,
         )
     image = jnp.where(problem.undecided, image, 0)
-    return _Point(value, image if problem.sign > 0 else -image, action, leaves)
+    return _BellmanImage(value, image if problem.sign > 0 else -image, action, leaves)
 
 
 def _greatest(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -282,7 +292,7 @@ def _greatest(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Ar
     return flat[leaves].reshape(image.shape), leaves.reshape(image.shape)
 
 
-def _where_it_leaves(problem: Problem, at: _Point, x: jax.Array) -> jax.Array:
+def _where_it_leaves(problem: TotalRewardProblem, at: _BellmanImage, x: jax.Array) -> jax.Array:
     if problem.circles is None:
         return x
     result: jax.Array = lax.cond(
@@ -291,7 +301,7 @@ def _where_it_leaves(problem: Problem, at: _Point, x: jax.Array) -> jax.Array:
     return result
 
 
-def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
+def _onward(problem: TotalRewardProblem, at: _BellmanImage) -> Callable[[jax.Array], jax.Array]:
     """``x -> P_pi x`` for the policy that attains an image, 0 outside of the undecided states."""
     model = problem.model
     if problem.policy is None and not isinstance(model, Product):
@@ -305,7 +315,7 @@ def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
     return lambda x: jnp.where(problem.undecided, _where_it_leaves(problem, at, along(x)), 0)
 
 
-def _inverse(problem: Problem, at: _Point, known: _Inverse) -> _Inverse:
+def _inverse(problem: TotalRewardProblem, at: _BellmanImage, known: _Inverse) -> _Inverse:
     """The inverse of the system of the policy that attains an image, unless it is known."""
     model, weight = problem.model, problem.policy
     table, size = sweep_operator(model), problem.undecided.size
@@ -325,7 +335,7 @@ def _inverse(problem: Problem, at: _Point, known: _Inverse) -> _Inverse:
 
 
 def _improved(
-    problem: Problem, change: jax.Array, at: _Point, known: _Inverse
+    problem: TotalRewardProblem, change: jax.Array, at: _BellmanImage, known: _Inverse
 ) -> tuple[jax.Array, jax.Array]:
     """A step of policy iteration, and its number of applications of P."""
     # If the linear system is not solved, sweeps under its policy.
@@ -359,8 +369,12 @@ def _improved(
 
 
 def _solved(
-    problem: Problem, equation: _Equation, start: _Point, known: _Inverse, num_steps: jax.Array
-) -> tuple[_Point, _Inverse, jax.Array]:
+    problem: TotalRewardProblem,
+    equation: _Equation,
+    start: _BellmanImage,
+    known: _Inverse,
+    num_steps: jax.Array,
+) -> tuple[_BellmanImage, _Inverse, jax.Array]:
     """An approximate solution of ``v = image(v)`` by policy iteration, and its backup."""
     # One backup in the program serves the steps and the solution, which is an image.
     image, goal, slack = equation
@@ -399,34 +413,34 @@ def _solved(
 # --- the enclosure ----------------------------------------------------------------------------
 
 
-class _Search(NamedTuple):
+class _BoundSearch(NamedTuple):
     """State of the search for bounds; pairs are lower and upper."""
 
-    at: _Point  # the current point
+    at: _BellmanImage  # the current point
     known: _Inverse
     share: jax.Array  # e
     bounds: tuple[jax.Array, jax.Array]  # the proven bounds, in double words
     shares: tuple[jax.Array, jax.Array]  # the e of each proven bound, else infinity
     gap: jax.Array  # their distance, infinite without an upper one
-    safe: _Point  # the point with a policy that attains the bound on the safe side
+    safe: _BellmanImage  # the point with a policy that attains the bound on the safe side
     residual: jax.Array  # of that point
     tries: jax.Array  # number of trials
     num_steps: jax.Array  # number of applications of P; -1 before the first backup
     ended: jax.Array  # whether other shares would not help
 
 
-def _width(problem: Problem, gap: jax.Array, upper: jax.Array) -> jax.Array:
+def _width(problem: TotalRewardProblem, gap: jax.Array, upper: jax.Array) -> jax.Array:
     """The largest width, relative unless the value has a bound."""
     scale = upper if math.isinf(problem.highest) else 1
     each = jnp.where(jnp.isfinite(upper), gap / scale, jnp.inf)
     return jnp.max(jnp.where(problem.undecided, each, 0))
 
 
-def _wide(problem: Problem, k: _Search) -> jax.Array:
+def _wide(problem: TotalRewardProblem, k: _BoundSearch) -> jax.Array:
     return _width(problem, k.gap, dw.words(k.bounds[1])[0])
 
 
-def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
+def _tried(problem: TotalRewardProblem, tolerance: jax.Array, k: _BoundSearch) -> _BoundSearch:
     """One trial: solves for one of the bounds, checks it, and updates the share."""
     rows, above = problem.rows, (k.tries & 1) == 1
     sign = jnp.where(above, 1, -1).astype(k.share.dtype)
@@ -434,7 +448,7 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     # The shift exceeds the loss where words are flushed to zero.
     shift, factor = 8 * rows.underflow(size), dw.double_word(jnp.ones_like(sign), sign * k.share)
 
-    def image(at: _Point) -> jax.Array:
+    def image(at: _BellmanImage) -> jax.Array:
         swept = dw.plus(dw.product(factor, at.image), dw.double_word(sign * shift))
         return jnp.where(problem.undecided, swept, 0)
 
@@ -467,10 +481,12 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     share = jnp.where(above, jnp.maximum(k.share * change, floor), k.share)
     ended = above & ((below_known & above_known & (k.share <= floor)) | (share > _LARGEST))
     steps = k.tries + 1, n, ended
-    return _Search(at, known, share, bounds, shares, gap, safe, residual, *steps)
+    return _BoundSearch(at, known, share, bounds, shares, gap, safe, residual, *steps)
 
 
-def solve_problem(problem: Problem, tolerance: jax.Array, requested: jax.Array) -> Solution:
+def solve_problem(
+    problem: TotalRewardProblem, tolerance: jax.Array, requested: jax.Array
+) -> Solution:
     """The enclosure of a problem, of width `tolerance` if possible; converged if `requested`.
 
     Values are 0 where they are infinite.
@@ -480,10 +496,10 @@ def solve_problem(problem: Problem, tolerance: jax.Array, requested: jax.Array) 
     zero = dw.double_word(jnp.zeros(problem.undecided.shape, dtype))
     numbers, none = state_numbers(zero.shape), jnp.int32(0)
     # Where every policy leaves the undecided states, the first one is greedy for zero.
-    start, num_steps = _Point(zero, zero, problem.decided, numbers), none - 1
+    start, num_steps = _BellmanImage(zero, zero, problem.decided, numbers), none - 1
     if problem.start is not None:
         gain = jnp.where(problem.undecided, action_mean(problem.start, problem.reward), 0)
-        start, num_steps = _Point(zero, gain, problem.start, numbers), none
+        start, num_steps = _BellmanImage(zero, gain, problem.start, numbers), none
     size = zero.size if is_small(sweep_operator(model), zero.size) else 0
     no_inverse = jnp.zeros((size, size), dtype), jnp.full_like(numbers, -1), numbers
     never = jnp.asarray(jnp.inf, dtype)
@@ -492,7 +508,7 @@ def solve_problem(problem: Problem, tolerance: jax.Array, requested: jax.Array) 
     inner = jnp.maximum(tolerance - 2 * eps, tolerance / 2)
     share = jnp.maximum(2 * _ROUNDINGS * rows.unit, 1e-6 * tolerance).astype(dtype)
     residual = jnp.max(jnp.abs(dw.words(start.image)[0]))
-    k = _Search(
+    k = _BoundSearch(
         start,
         no_inverse,
         share,
@@ -529,7 +545,7 @@ def solve_problem(problem: Problem, tolerance: jax.Array, requested: jax.Array) 
     return Solution(value, policy, lower, upper, k.residual, num_steps, status)
 
 
-def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
+def _policy(problem: TotalRewardProblem, safe: _BellmanImage) -> tuple[jax.Array, jax.Array]:
     """A point's policy in all states, and whether it leaves the undecided states almost surely."""
     graph = TracedGraph(problem.model)
     action, always = safe.action, jnp.bool_(True)

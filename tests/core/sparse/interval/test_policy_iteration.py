@@ -181,7 +181,7 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
         maximize=True,
     )
     nodes = problem.operator()
-    search = interval_optimum._Search(nodes, Accuracy(1e-6), False)
+    search = interval_optimum._PolicySearch(nodes, Accuracy(1e-6), False)
     chosen, p = nodes.exit_rows(positive=True), nodes.interior()
     begin = PolicyPair(chosen, p, np.zeros(nodes.size), np.ones(nodes.size))
     far = search.upper_bound(search.approximate(begin) or begin)
@@ -194,7 +194,7 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
     found = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
     open_ = problem.interior
     assert (found.beyond - found.attained)[open_].max() < 6e-7
-    monkeypatch.setattr(interval_optimum._Search, "proportional_bound", lambda *_: None)
+    monkeypatch.setattr(interval_optimum._PolicySearch, "proportional_bound", lambda *_: None)
     other = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
     assert (found.attained <= other.beyond + 1e-12)[open_].all()
     assert (other.attained <= found.beyond + 1e-12)[open_].all()
@@ -218,7 +218,7 @@ def test_refined_bounds_are_narrower_and_agree(maximize, adversarial):
             adversarial=adversarial,
         )
         found = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
-        search = interval_optimum._Search(problem.operator(), Accuracy(1e-6), False)
+        search = interval_optimum._PolicySearch(problem.operator(), Accuracy(1e-6), False)
         operator = search.operator
         begin = PolicyPair(
             operator.exit_rows(positive=maximize),

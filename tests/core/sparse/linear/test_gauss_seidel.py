@@ -150,9 +150,9 @@ def test_what_mixes_slowly_is_left_to_others():
 @pytest.mark.parametrize("maximize", [True, False])
 def test_what_sweeps_leave_unsolved_is_not_proven(always, maximize, monkeypatch):
     """Sweeps that end much too early find bounds that hold, or none."""
-    sweep = relaxation._Search.sweep
+    sweep = relaxation._SweepSearch.sweep
     monkeypatch.setattr(
-        relaxation._Search,
+        relaxation._SweepSearch,
         "sweep",
         lambda self, value, extra, rough: sweep(self, value, extra, max(rough, 0.2)),
     )
