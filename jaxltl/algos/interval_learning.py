@@ -55,7 +55,7 @@ from jaxltl.algos.common.explicit_games import cumulative, draw, draw_weighted, 
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_own, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, Numeric, PyTree
-from jaxltl.core.automata.translate import Task
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.graphs.end_components import (
     Accepting,
@@ -105,12 +105,12 @@ class Problem:
     num_claims: jax.Array
 
 
-def make_problem(world: Model, task: Task) -> Problem:
+def make_problem(world: Model, formula: FormulaLike) -> Problem:
     """A checked :class:`Problem`: the product with the task, and its qualitative preprocessing.
 
     Args:
       world: an MDP or a sparse model; its labels, start and graph are known to the learner.
-      task: a formula, its text, or an automaton over the letters that occur. To make a probability
+      formula: a formula, its text, or an automaton over the letters that occur. To make a probability
         small, negate the formula.
 
     Raises:
@@ -130,7 +130,7 @@ def make_problem(world: Model, task: Task) -> Problem:
         )
     # The sparse form lists each successor of an action once, as it is observed.
     padded = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
-    model = product(padded, task, label_on="exit")
+    model = product(padded, formula, label_on="exit")
     accepting = accepting_end_components(model)
     sure = almost_surely_reaching(model, accepting.region).region
     winning, losing = np.asarray(sure), ~np.asarray(attractor(model, sure).region)

@@ -140,21 +140,21 @@ class SequencePlan:
 
 
 def make_plan(
-    task: Formula | str | Automaton,
+    formula: Formula | str | Automaton,
     events: ArrayLike,
     propositions: Sequence[str],
     *,
     depth: int,
     max_sequences: int = 16,
 ) -> SequencePlan:
-    """The :class:`SequencePlan` of a `task`: a formula, its text, or an automaton; made on the host.
+    """The :class:`SequencePlan` of a `formula`: a formula, its text, or an automaton; made on the host.
 
     `events`, ``bool[E, P]``, are the labels that occur, as in training, with columns `propositions`;
     `depth` is D, as in training, and `max_sequences` is M, the number of sequences for each state. Not
     differentiable. Raises as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
     table = sequences.reach_avoid_sequences(
-        task if isinstance(task, Automaton) else to_automaton(task),
+        formula if isinstance(formula, Automaton) else to_automaton(formula),
         events,
         validation.distinct_names("propositions", propositions),
         depth=depth,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata.automaton import Automaton, named_propositions
-from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.automata.runs import Verdict
 from jaxltl.core.environments.task_environment import TaskOptions, TaskTables, make_task_tables
 
@@ -19,7 +19,7 @@ Labels = Callable[[PyTree, PyTree], Collection[str]]
 
 def gymnasium_task(
     env: PyTree,
-    formula: Task,
+    formula: FormulaLike,
     labels: Labels,
     *,
     propositions: Sequence[str] | None = None,

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core import struct, validation
 from jaxltl.core.array_types import Key
 from jaxltl.core.automata.automaton import Automaton, letter_index
-from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.logic.ltl import Formula, parse_ltl
+from jaxltl.core.logic.ltl import parse_ltl
 from jaxltl.core.models import MDP, Trajectories, project_trajectories, rollout
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax
@@ -212,7 +212,7 @@ class _Family(NamedTuple):
 
 def random_worlds(
     seeds: Iterable[int],
-    task: Task = COMPLETE,
+    formula: FormulaLike = COMPLETE,
     *,
     num_obstacles: int = 5,
     min_distance: int = 3,
@@ -224,7 +224,7 @@ def random_worlds(
 
     Args:
       seeds: one for each world, which depends on its own seed alone.
-      task: an automaton, or a formula over the kinds of cells. A cell's label is read on exit.
+      formula: an automaton, or a formula over the kinds of cells. A cell's label is read on exit.
       num_obstacles: cells of each kind of obstacle, which may touch; each object has one.
       min_distance, obstacle_distance: of objects from objects, and of obstacles from objects, in the
         maximum norm.
@@ -240,7 +240,7 @@ def random_worlds(
     """
     shape, kinds, num_objects, margin, blank = _grid("random_worlds", appearance)
     num_obstacles = validation.integer("num_obstacles", num_obstacles)
-    automaton, step = _on_kinds(task, kinds)
+    automaton, step = _on_kinds(formula, kinds)
     family = _Family(blank, kinds, automaton, step)
     num_kinds = len(kinds) - num_objects
     placement = Placement(
@@ -269,26 +269,28 @@ def random_worlds(
     return worlds
 
 
-def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
-    """The world of :func:`random_worlds` of one `seed` and `task`, with the same `options`.
+def random_world(seed: int, formula: FormulaLike = COMPLETE, **options: Any) -> World:
+    """The world of :func:`random_worlds` of one `seed` and `formula`, with the same `options`.
 
     >>> random_world(3, shape=(6, 8), num_obstacles=2).shape
     (6, 8)
     """
-    return random_worlds([seed], task, **options)[0]
+    return random_worlds([seed], formula, **options)[0]
 
 
-def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
-    """The task's automaton, and its transition table by cell kind ``[P + 1, Q]``."""
+def _on_kinds(formula: FormulaLike, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
+    """The automaton of a formula, and its transition table by cell kind ``[P + 1, Q]``."""
     names = [name for name, _ in kinds]
-    if isinstance(task, str | Formula):
-        formula = parse_ltl(task) if isinstance(task, str) else task
-        require_known(formula.propositions, names, "the task")
-        labels = [frozenset({n} & set(formula.propositions)) for n in [*names, ""]]
-        task = to_automaton(formula, letters=list(dict.fromkeys(labels)))
-    require_known(task.propositions, names, "the task")
-    read = [letter_index(task, {n} & set(task.propositions)) for n in [*names, ""]]
-    return task, np.asarray(task.delta)[:, read].T
+    if isinstance(formula, Automaton):
+        automaton = formula
+    else:
+        parsed = parse_ltl(formula) if isinstance(formula, str) else formula
+        require_known(parsed.propositions, names, "the formula")
+        labels = [frozenset({n} & set(parsed.propositions)) for n in [*names, ""]]
+        automaton = to_automaton(parsed, letters=list(dict.fromkeys(labels)))
+    require_known(automaton.propositions, names, "the formula")
+    read = [letter_index(automaton, {n} & set(automaton.propositions)) for n in [*names, ""]]
+    return automaton, np.asarray(automaton.delta)[:, read].T
 
 
 def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:

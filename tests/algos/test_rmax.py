@@ -491,7 +491,7 @@ def test_what_the_graph_does_not_have_is_told():
 def test_mistakes_in_the_problem():
     found = patrol()
     make = partial(rmax.make_problem, found.game)
-    with pytest.raises(ValueError, match="spec has shape"):
+    with pytest.raises(ValueError, match="formula has shape"):
         make(np.ones(3, bool), found.reward)
     with pytest.raises(ValueError, match="reward has shape"):
         make(found.accepting, np.zeros((3, 2)))

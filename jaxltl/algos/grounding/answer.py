@@ -46,7 +46,7 @@ from jaxltl.algos.grounding.hypotheses import (
     step_log_likelihood,
 )
 from jaxltl.algos.grounding.problem import Hparams, Problem
-from jaxltl.core.automata.translate import Task, as_automaton
+from jaxltl.core.automata.translate import FormulaLike, as_automaton
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import product
 from jaxltl.core.pretty_print import brief
@@ -194,7 +194,7 @@ def robust_policy(
     world: MDP,
     labels: Sequence[np.ndarray],
     symbols: Sequence[str],
-    task: Task,
+    formula: FormulaLike,
     *,
     tolerance: float = 1e-4,
     max_points: int = 100,
@@ -209,7 +209,7 @@ def robust_policy(
       world: with an initial distribution.
       labels: ``bool[S, P]`` of each of at most 8 groundings.
       symbols: P names.
-      task: a formula over them, or its automaton.
+      formula: a formula over them, or its automaton.
       tolerance: width of the bounds of the maximin.
       max_points: maximal number of weighted sums; bounds hold at any number.
 
@@ -221,7 +221,7 @@ def robust_policy(
             f"there are {len(labels)} groundings; a robust policy takes 1 to {MAX_MEMBERS}. "
             "Lower the level of the credible set, or answer the query."
         )
-    automaton, objectives = as_automaton(task), []
+    automaton, objectives = as_automaton(formula), []
     names: list[str] = []
     columns: list[np.ndarray] = []
     for i, label in enumerate(labels):
@@ -247,11 +247,11 @@ def robust_policy(
 
 
 def probability_under(
-    robust: RobustPolicy, labels: np.ndarray, symbols: Sequence[str], task: Task
+    robust: RobustPolicy, labels: np.ndarray, symbols: Sequence[str], formula: FormulaLike
 ) -> float:
     """A certified lower bound of the satisfaction probability of a policy `robust` under any grounding.
 
-    Of a `task`, a formula over P `symbols` or its automaton, with `labels` ``bool[S, P]``, not necessarily
+    Of a `formula`, a formula over P `symbols` or its automaton, with `labels` ``bool[S, P]``, not necessarily
     those of one of the policy's groundings, from the initial distribution. Independent of the search: each
     policy is evaluated in the product of its chain with the task. Loose if expected times are beyond 1e12
     steps.
@@ -261,7 +261,7 @@ def probability_under(
     initial = np.zeros(sparse.num_states)
     initial[robust.front.product.start] = robust.initial[robust.initial > 0]
     sparse = replace(sparse, initial=initial, label=jnp.asarray(label), propositions=tuple(symbols))
-    model = product(sparse, as_automaton(task))
+    model = product(sparse, as_automaton(formula))
     total = 0.0
     for share, weight in zip(robust.share, robust.front.policies, strict=True):
         if share > 0:

@@ -114,7 +114,7 @@ def make_problem(
     worlds: MDP | Sequence[MDP],
     observation: ArrayLike | Sequence[ArrayLike],
     demonstrations: Trajectories | Sequence[Trajectories],
-    task: Automaton | Formula | str,
+    formula: Automaton | Formula | str,
     *,
     network: nn.Module | None = None,
     features: ArrayLike | None = None,
@@ -125,7 +125,7 @@ def make_problem(
       worlds: a world, or several with the same actions; their labels are not read.
       observation: ``float[S, O]``, or one for each world: what is seen in each state.
       demonstrations: of a world, or one batch for each world; states and actions alone.
-      task: a formula over P symbols without a meaning yet, or its automaton, co-safe, safety or Buchi.
+      formula: a formula over P symbols without a meaning yet, or its automaton, co-safe, safety or Buchi.
       network: the grounding, a flax module ``float[..., O] -> float[..., P]``; default
         :class:`LinearGrounding`.
       features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the event reward;
@@ -143,7 +143,7 @@ def make_problem(
     """
     worlds = [worlds] if isinstance(worlds, MDP) else list(worlds)
     several = [demonstrations] if isinstance(demonstrations, Trajectories) else demonstrations
-    automaton = require_task(task)
+    automaton = require_task(formula)
     blank = [
         replace(
             world,
@@ -172,10 +172,10 @@ def make_problem(
     )
 
 
-def require_task(task: Automaton | Formula | str) -> Automaton:
+def require_task(formula: Automaton | Formula | str) -> Automaton:
     """The automaton of a task that some words satisfy and some violate; ValueError otherwise."""
-    automaton = task if isinstance(task, Automaton) else to_automaton(task)
-    text = f"the task {task}" if not isinstance(task, Automaton) else "the task"
+    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    text = f"the task {formula}" if not isinstance(formula, Automaton) else "the task"
     if not automaton.propositions:
         raise ValueError(f"{text} has no symbols; there is nothing to ground.")
     if len(automaton.propositions) > _MAX_SYMBOLS:

@@ -60,7 +60,7 @@ class Problem:
 
 def make_problem(
     game: Model,
-    spec: ArrayLike | Parity | Automaton | Formula | str,
+    formula: ArrayLike | Parity | Automaton | Formula | str,
     reward: ArrayLike,
     *,
     environment: ArrayLike | str = "random",
@@ -71,7 +71,7 @@ def make_problem(
 
     Args:
       game: a Game, or an MDP, in which the system always moves.
-      spec: accepting states ``bool[S]``, an objective, or a formula or automaton; its product with
+      formula: accepting states ``bool[S]``, an objective, or a formula or automaton; its product with
         the game reads labels on exit. A deterministic Buchi condition or weaker.
       reward: ``float[S, A]`` or ``float[S, A, K]`` on the given game, for actions of both players.
       environment: ``"random"``; ``"adversarial"``: optimal against an optimal system, by the
@@ -87,7 +87,9 @@ def make_problem(
     reward = np.asarray(reward, float)
     shape = game.mdp.probability.shape
     require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
-    joint, accepting, base_state, memory = _joint_game(game, spec, start_distribution(game, start))
+    joint, accepting, base_state, memory = _joint_game(
+        game, formula, start_distribution(game, start)
+    )
     played = _merge_successors(joint)
     observed = check_reward(joint, reward[base_state])
     accepting = to_jax(accepting)
@@ -110,24 +112,24 @@ def make_problem(
 
 
 def _joint_game(
-    game: Game, spec: ArrayLike | Parity | Automaton | Formula | str, start: NDArray[np.float64]
+    game: Game, formula: ArrayLike | Parity | Automaton | Formula | str, start: NDArray[np.float64]
 ) -> tuple[Game, NDArray[np.bool_], NDArray[np.integer], NDArray[np.integer]]:
     """The given game, or the reachable part of its product with an automaton.
 
     With the accepting states, and the game's and the automaton's state of each state.
     """
     game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
-    if isinstance(spec, Automaton | Formula | str):
-        joint, objective = task_game(game, spec)
+    if isinstance(formula, Automaton | Formula | str):
+        joint, objective = task_game(game, formula)
         part = restrict(joint)
         base, memory = np.asarray(part.base_state), np.asarray(part.memory)
         number = jnp.asarray(base * joint.state_shape[1] + memory)
         return part.model, _accepting(objective_at(objective, number)), base, memory
-    if isinstance(spec, Parity):
-        accepting = _accepting(spec)
+    if isinstance(formula, Parity):
+        accepting = _accepting(formula)
     else:
-        accepting = np.asarray(spec)
-        require_shape("spec", accepting, (game.num_states,))
+        accepting = np.asarray(formula)
+        require_shape("formula", accepting, (game.num_states,))
     base = np.arange(game.num_states)
     return game, accepting.astype(bool), base, np.zeros_like(base)
 

@@ -19,7 +19,7 @@ from jaxltl.core.automata.emerson_lei import (
 from jaxltl.core.automata.parity import simplify
 from jaxltl.core.automata.products import EVEN, ODD
 from jaxltl.core.automata.runs import Lasso, align, find_lasso, has_lasso, joint_runs
-from jaxltl.core.automata.translate import Task, as_automaton
+from jaxltl.core.automata.translate import FormulaLike, as_automaton
 from jaxltl.core.logic.ltl import Letter
 
 
@@ -42,7 +42,7 @@ def is_universal(automaton: Automaton) -> bool:
     return not has_lasso([automaton], [(ODD,)])
 
 
-def find_difference(a: Task, b: Task) -> Lasso | None:
+def find_difference(a: FormulaLike, b: FormulaLike) -> Lasso | None:
     """A word that exactly one of two automata accepts, as a short lasso.
 
     Args:
@@ -63,7 +63,7 @@ def find_difference(a: Task, b: Task) -> Lasso | None:
     return find_lasso(_aligned(a, b), [(EVEN, ODD), (ODD, EVEN)])
 
 
-def is_equivalent(a: Task, b: Task) -> bool:
+def is_equivalent(a: FormulaLike, b: FormulaLike) -> bool:
     """True if two automata or formulas accept the same words over their joint letters; see `align`.
 
     Args:
@@ -85,12 +85,12 @@ def is_equivalent(a: Task, b: Task) -> bool:
     return not has_lasso(_aligned(a, b), [(EVEN, ODD), (ODD, EVEN)])
 
 
-def find_not_included(a: Task, b: Task) -> Lasso | None:
+def find_not_included(a: FormulaLike, b: FormulaLike) -> Lasso | None:
     """A short lasso that the first automaton accepts and the second rejects."""
     return find_lasso(_aligned(a, b), [(EVEN, ODD)])
 
 
-def is_included(a: Task, b: Task) -> bool:
+def is_included(a: FormulaLike, b: FormulaLike) -> bool:
     """True if the language of the first automaton is included in that of the second, over joint letters.
 
     Args:
@@ -111,26 +111,26 @@ def is_included(a: Task, b: Task) -> bool:
     return not has_lasso(_aligned(a, b), [(EVEN, ODD)])
 
 
-def intersection(a: Task, b: Task) -> Automaton:
+def intersection(a: FormulaLike, b: FormulaLike) -> Automaton:
     """The automaton that accepts the words that both accept."""
     return _combine(a, b, "and")
 
 
-def union(a: Task, b: Task) -> Automaton:
+def union(a: FormulaLike, b: FormulaLike) -> Automaton:
     """The automaton that accepts the words that at least one accepts."""
     return _combine(a, b, "or")
 
 
-def difference(a: Task, b: Task) -> Automaton:
+def difference(a: FormulaLike, b: FormulaLike) -> Automaton:
     """The automaton that accepts the words that `a` accepts and `b` rejects."""
     return _combine(a, complement(as_automaton(b)), "and")
 
 
-def _aligned(a: Task, b: Task) -> tuple[Automaton, Automaton]:
+def _aligned(a: FormulaLike, b: FormulaLike) -> tuple[Automaton, Automaton]:
     return align(as_automaton(a), as_automaton(b))
 
 
-def _combine(a: Task, b: Task, connective: str) -> Automaton:
+def _combine(a: FormulaLike, b: FormulaLike, connective: str) -> Automaton:
     """The automaton of the words for which `a` `connective` `b`."""
     a, b = _aligned(a, b)
     runs = joint_runs([a, b])
@@ -167,7 +167,9 @@ def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], Conditi
     return bits[level_of[place].reshape(priority.shape)], condition, first + last
 
 
-def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None = None) -> Automaton:
+def synchronize(
+    memory: FormulaLike, formula: FormulaLike, *, alphabet: Iterable[Letter] | None = None
+) -> Automaton:
     """Synchronous product of two automata, with the acceptance of the second.
 
     A policy with the memory of one automaton is judged by the task of another: make the product
@@ -176,7 +178,7 @@ def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None =
 
     Args:
       memory: Q1 states; an automaton, a formula or its text.
-      task: Q2 states, likewise.
+      formula: Q2 states, likewise.
       alphabet: the letters for formulas, see `to_automaton`.
 
     Returns:
@@ -191,7 +193,7 @@ def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None =
       ([[0, 1], [1, 1]], [False, True])
     """
     alphabet = None if alphabet is None else list(alphabet)
-    first, second = align(as_automaton(memory, alphabet), as_automaton(task, alphabet))
+    first, second = align(as_automaton(memory, alphabet), as_automaton(formula, alphabet))
     delta1, delta2 = np.asarray(first.delta), np.asarray(second.delta)
     num1, num2 = len(delta1), len(delta2)
     delta = delta1[:, None] * num2 + delta2[None]

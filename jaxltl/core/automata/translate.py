@@ -285,7 +285,7 @@ def track_on_demand(run: Trackers, max_states: int) -> ParityTable:
 
 
 Acceptance = Literal["auto", "dfa", "buchi", "parity"]
-Task = Automaton | Formula | str
+FormulaLike = Automaton | Formula | str
 
 GOOD_ENOUGH = 3  # states up to which no other combination is tried
 WORTHWHILE = 3  # how many times as much the other combinations may track
@@ -508,9 +508,9 @@ def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:
     return _names(automaton, progression, [diagrams[q] for q in range(len(delta))])
 
 
-def as_automaton(task: Task, letters: Iterable[Letter] | None = None) -> Automaton:
+def as_automaton(formula: FormulaLike, letters: Iterable[Letter] | None = None) -> Automaton:
     """The automaton itself, or that of a formula or its text; see `to_automaton`."""
-    return task if isinstance(task, Automaton) else to_automaton(task, letters)
+    return formula if isinstance(formula, Automaton) else to_automaton(formula, letters)
 
 
 def _undecided(automaton: Automaton) -> str:

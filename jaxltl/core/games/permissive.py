@@ -79,7 +79,7 @@ class Permissive:
 
 def permissive_strategy(
     game: Model,
-    spec: Parity | GR1 | Automaton | Formula | str,
+    formula: Parity | GR1 | Automaton | Formula | str,
     *,
     method: str = "auto",
     bound: int | None = None,
@@ -99,7 +99,7 @@ def permissive_strategy(
 
     Args:
       game: a Game, an MDP or a Product.
-      spec: an objective, a formula or an automaton, as for
+      formula: an objective, a formula or an automaton, as for
         :func:`~jaxltl.core.games.winning.winning_region`.
       method: see above.
       bound: for ``"counter"`` and ``"parity"``.
@@ -123,7 +123,7 @@ def permissive_strategy(
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
-    world, goal = on_states(as_padded_game(game), spec)
+    world, goal = on_states(as_padded_game(game), formula)
     graph = concrete_graph(world, goal)
     objective: PyTree
     world, objective = jax.tree.map(np.asarray, (world, goal))

@@ -90,7 +90,7 @@ class Winning:
 
 
 def winning_region(
-    game: Model, spec: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
+    game: Model, formula: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
 ) -> Winning:
     """Winning region of the system, and winning strategies of both players.
 
@@ -101,7 +101,7 @@ def winning_region(
       game: a Game; any other model is the game in which the system always moves. Actions in one
         on a sparse model are rows, in its product with a task those of
         :func:`~jaxltl.core.models.construct.convert.to_sparse`.
-      spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
+      formula: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
         formula or an automaton, solved on its product with the game (``label_on="exit"``).
       chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment
         chooses random successors, so that winning is sure. States from S on are then those choices
@@ -123,7 +123,7 @@ def winning_region(
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
     arena = as_game(game) if chance == "random" else as_padded_game(game)
-    arena, objective = on_states(arena, spec)
+    arena, objective = on_states(arena, formula)
     if chance == "adversarial":
         arena, origin = adversarial_chance(arena)
         objective = objective_at(objective, origin)
@@ -177,15 +177,15 @@ def almost_sure_buchi(game: Model, accepting: States) -> Winning:
 
 
 def on_states(
-    game: Game, spec: Parity | GR1 | Automaton | Formula | str
+    game: Game, formula: Parity | GR1 | Automaton | Formula | str
 ) -> tuple[Game, Parity | GR1]:
     """A game and an objective on its states; of a formula or an automaton, :func:`task_game`."""
-    return (game, spec) if isinstance(spec, Parity | GR1) else task_game(game, spec)
+    return (game, formula) if isinstance(formula, Parity | GR1) else task_game(game, formula)
 
 
-def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity]:
+def task_game(game: Game, formula: Automaton | Formula | str) -> tuple[Game, Parity]:
     """The product of a game with a task, and the task as a parity objective on its states."""
-    joint = product(game, spec, label_on="exit")
+    joint = product(game, formula, label_on="exit")
     automaton, letter = joint.mdp.automaton, joint.mdp.letter
     none = to_jax(np.zeros(joint.state_shape, bool))
     if automaton.has_final_states:

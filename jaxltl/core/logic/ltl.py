@@ -204,8 +204,8 @@ _SPELLING = {
 }
 
 
-def parse_ltl(text: str) -> Formula:
-    """The formula written in `text`, in the syntax of Spot.
+def parse_ltl(formula: str) -> Formula:
+    """The formula written in `formula`, in the syntax of Spot.
 
     From loosest to tightest: `->` `<->` (right), `|`, `xor`, `&` (left), `U R W M` (right), then
     the prefixes `! X F G`. Also read: `&& /\\ || \\/ ^ ~ => <=> [] <> V true false 1 0`, the signs
@@ -222,7 +222,7 @@ def parse_ltl(text: str) -> Formula:
     - Any other name is quoted, with `\\` before a quote or backslash in it: `F "Goal 1"`.
 
     Args:
-      text: the formula.
+      formula: the formula.
 
     Returns:
       The `Formula`; its ``str`` is text that is read as the same formula.
@@ -234,17 +234,17 @@ def parse_ltl(text: str) -> Formula:
       >>> print(parse_ltl("GFa -> b U c && d"))
       G F a -> ((b U c) & d)
     """
-    if not isinstance(text, str) or not text.strip():
+    if not isinstance(formula, str) or not formula.strip():
         raise ValueError(
-            f"parse_ltl: expected the text of a formula, got {type(text).__name__} {text!r}. "
+            f"parse_ltl: expected the text of a formula, got {type(formula).__name__} {formula!r}. "
             "Pass a string such as 'F goal & G !crash'."
         )
     from lark.exceptions import UnexpectedInput
 
     try:
-        return _parser().parse(text)  # type: ignore[return-value]
+        return _parser().parse(formula)  # type: ignore[return-value]
     except UnexpectedInput as error:
-        raise ValueError(_syntax_error(text, error)) from None
+        raise ValueError(_syntax_error(formula, error)) from None
 
 
 @functools.cache

@@ -177,31 +177,31 @@ def occurring_letters(
 
 @overload
 def product(
-    world: Game, task: Automaton | Formula | str, *, label_on: str = ...
+    world: Game, formula: Automaton | Formula | str, *, label_on: str = ...
 ) -> Game[Product]: ...
 
 
 @overload
 def product(
-    world: World, task: Automaton | Formula | str, *, label_on: str = ...
+    world: World, formula: Automaton | Formula | str, *, label_on: str = ...
 ) -> Product[World]: ...
 
 
 def product(
-    world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = "entry"
+    world: LabelledModel, formula: Automaton | Formula | str, *, label_on: str = "entry"
 ) -> Product | Game:
-    """Lazy product of a model and a task.
+    """Lazy product of a model and the automaton of a formula.
 
     Args:
       world: an MDP, a DenseMDP, a SparseMDP, a ShardedMDP or a Game, with concrete labels.
-      task: an automaton, or a formula, translated over the letters that occur in the model.
+      formula: a formula, translated over the letters that occur in the model, or an automaton.
       label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
 
     Returns:
       A :class:`Product`; of a game, the :class:`~jaxltl.core.models.game.Game` on the product.
 
     Raises:
-      ValueError: an unknown proposition in the task, or a letter that the automaton does not have.
+      ValueError: an unknown proposition in the formula, or a letter that the automaton does not have.
 
     Example:
       >>> from jaxltl import from_dense
@@ -211,7 +211,7 @@ def product(
     """
     validation.choice("label_on", label_on, ("entry", "exit"))
     if isinstance(world, Game):
-        model = product(world.mdp, task, label_on=label_on)
+        model = product(world.mdp, formula, label_on=label_on)
         xp, system = namespace(world.system)
         return Game(model, to_jax(xp.broadcast_to(system[:, None], model.state_shape)))
     if isinstance(world, Product):
@@ -224,23 +224,27 @@ def product(
             "world has traced labels, from which no product is made; make it outside jit and vmap, "
             "and pass the product in."
         )
-    if isinstance(task, str | Formula):
-        formula = parse_ltl(task) if isinstance(task, str) else task
-        require_known(formula.propositions, world.propositions, "the task")
-        task = to_automaton(formula, letters=occurring_letters(world, formula.propositions))
-    if not isinstance(task, Automaton):
+    automaton = formula
+    if isinstance(formula, str | Formula):
+        parsed = parse_ltl(formula) if isinstance(formula, str) else formula
+        require_known(parsed.propositions, world.propositions, "the formula")
+        automaton = to_automaton(parsed, letters=occurring_letters(world, parsed.propositions))
+    if not isinstance(automaton, Automaton):
         raise ValueError(
-            f"task is {validation.shorten(task)}; give a formula, its text, or an automaton."
+            f"formula is {validation.shorten(formula)}; give a formula, its text, or an automaton."
         )
-    names = named_propositions(task)
-    require_known(names, world.propositions, "the task")
+    names = named_propositions(automaton)
+    require_known(names, world.propositions, "the formula")
     column = [world.propositions.index(p) for p in names]
     labels = distinct_labels(world)
     rows, letter = distinct_rows(labels[:, column])
     index = np.array(
-        [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
+        [_letter(automaton, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)],
+        np.int32,
     )
-    return Product(world, to_jax(task), letters_by_state(world, index[letter.ravel()]), label_on)
+    return Product(
+        world, to_jax(automaton), letters_by_state(world, index[letter.ravel()]), label_on
+    )
 
 
 @singledispatch

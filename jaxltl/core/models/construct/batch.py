@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
@@ -24,14 +24,16 @@ from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
 
-def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
-    """The products of several models with one task, stacked along a leading axis for ``vmap``.
+def stack_products(
+    worlds: Sequence[MDP], formula: FormulaLike, *, label_on: str = "exit"
+) -> Product:
+    """The products of several models with one automaton, stacked along a leading axis for ``vmap``.
 
     Smaller models are padded with unreachable states, and so are successor lists.
 
     Args:
       worlds: W models with the same actions and the same propositions, in any order.
-      task: an automaton, or a formula, translated over the letters of all models.
+      formula: a formula, translated over the letters of all models, or an automaton.
       label_on: ``"exit"`` or ``"entry"``, see :class:`~jaxltl.core.models.product.Product`.
 
     Returns:
@@ -50,19 +52,20 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
     worlds = [_like_first(world, i, worlds[0]) for i, world in enumerate(worlds)]
     if not worlds:
         raise ValueError("there are no worlds to stack; give at least one.")
-    if isinstance(task, str | Formula):
-        formula = parse_ltl(task) if isinstance(task, str) else task
-        known = set(formula.propositions)
+    automaton = formula
+    if isinstance(formula, str | Formula):
+        parsed = parse_ltl(formula) if isinstance(formula, str) else formula
+        known = set(parsed.propositions)
         letters = {
             x for world in worlds for x in occurring_letters(world, known & set(world.propositions))
         }
-        task = to_automaton(formula, letters=sorted(letters, key=sorted))
+        automaton = to_automaton(parsed, letters=sorted(letters, key=sorted))
     num_states = max(world.num_states for world in worlds)
     width = max(world.num_successors for world in worlds)
     products = []
     for i, world in enumerate(worlds):
         try:
-            lane = product(world, task, label_on=label_on)
+            lane = product(world, automaton, label_on=label_on)
         except ValueError as error:
             raise ValueError(f"world {i}: {error}") from error
         extra = num_states - world.num_states
@@ -166,12 +169,12 @@ def restrict_stacked_actions(models: Product, allowed: PyTree) -> Product:
     return replace(models, allowed=to_jax(np.stack([np.asarray(x) for x in masks])))
 
 
-def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
+def lift_memory_policy(policy: jax.Array, automaton: Automaton | int) -> jax.Array:
     """A policy with the memory of one automaton in the product with a synchronised second automaton.
 
     Args:
       policy: ``[S, Q1, ...]``, or with leading axes before S if it is ``float[..., S, Q1, A]``.
-      task: the second automaton of :func:`synchronize`, or its number Q2 of states.
+      automaton: the second automaton of :func:`synchronize`, or its number Q2 of states.
 
     Returns:
       ``[S, Q1 * Q2, ...]``, independent of the second automaton. Differentiable in the policy.
@@ -180,7 +183,7 @@ def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
       >>> lift_memory_policy(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
       [1.0, 1.0, 0.0, 0.0]
     """
-    num2 = task if isinstance(task, int) else len(task.delta)
+    num2 = automaton if isinstance(automaton, int) else len(automaton.delta)
     stochastic = jnp.issubdtype(jnp.result_type(policy), jnp.floating)
     return jnp.repeat(policy, num2, axis=-2 if stochastic else -1)
 

@@ -14,7 +14,7 @@ from jaxltl.core.statistics.confidence_sets import (
     describe_graph,
     require_graph,
 )
-from jaxltl.core.automata.translate import Task
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.counts import TransitionCounts, align_counts
 from jaxltl.core.models.interval import IntervalMDP, make_interval
@@ -88,7 +88,7 @@ class DataGuarantee:
 def learn_guarantee(
     model: RowModel,
     counts: TransitionCounts | ConfidenceSets | np.ndarray,
-    task: Task,
+    formula: FormulaLike,
     confidence: float,
     *,
     graph: Graph,
@@ -107,7 +107,7 @@ def learn_guarantee(
         :func:`~jaxltl.core.models.construct.counts.model_from_counts`; its probabilities are unused.
       counts: of its transitions, matched by name; or ``int[T]``, one for each of its entries; or
         confidence sets of its entries, from `intervals_from_counts`.
-      task: a formula, its text, or an automaton.
+      formula: a formula, its text, or an automaton.
       confidence: in (0, 1), of all returned statements at once.
       graph: the assumption on the model's graph, required: ``"given"``, it is known; ``"seen"``,
         ``"complete"`` or :class:`~jaxltl.core.statistics.confidence_sets.LeastProbability`, as for
@@ -155,10 +155,10 @@ def learn_guarantee(
         sets = _without_unlikely(sparse, sets, graph.value)
     interval, aligned = _with_sets(sparse, sets)
     worst = robust_satisfaction(
-        interval, task, objective=objective, nature="adversarial", tolerance=tolerance
+        interval, formula, objective=objective, nature="adversarial", tolerance=tolerance
     )
     best = robust_satisfaction(
-        interval, task, objective=objective, nature="cooperative", tolerance=tolerance
+        interval, formula, objective=objective, nature="cooperative", tolerance=tolerance
     )
     share = np.asarray(interval.initial)
     share = share[share > 0]
@@ -282,7 +282,7 @@ def _gain(
 def guarantee_curve(
     model: RowModel,
     counts: TransitionCounts | np.ndarray,
-    task: Task,
+    formula: FormulaLike,
     confidence: float,
     sizes: Sequence[int],
     *,
@@ -296,7 +296,7 @@ def guarantee_curve(
     The subsets are the prefixes of one random order of the data.
 
     Args:
-      model, counts, task, confidence, graph, method, objective: see :func:`learn_guarantee`; the
+      model, counts, formula, confidence, graph, method, objective: see :func:`learn_guarantee`; the
         confidence is that of each single point.
       sizes: numbers of transitions.
       seed: of the order.
@@ -336,6 +336,6 @@ def guarantee_curve(
     for i in np.argsort(-wanted, kind="stable"):
         every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")
         bound[i] = learn_guarantee(
-            sparse, every, task, confidence, graph=graph, method=method, objective=objective
+            sparse, every, formula, confidence, graph=graph, method=method, objective=objective
         ).bound
     return bound

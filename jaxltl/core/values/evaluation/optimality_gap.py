@@ -179,7 +179,7 @@ def _require_tabular(agent: Agent) -> None:
 
 def optimality_gap(
     table: TabulatedEnvironment,
-    task: Automaton | Formula | str,
+    formula: Automaton | Formula | str,
     policy: ArrayLike,
     *,
     num_steps: int | None = None,
@@ -194,7 +194,7 @@ def optimality_gap(
 
     Args:
       table: from :func:`~jaxltl.core.environments.tabulate.tabulate`.
-      task: a formula, its text, or an automaton; memory states are those of its automaton.
+      formula: a formula, its text, or an automaton; memory states are those of its automaton.
       policy: actions ``int[S, Q]`` or their probabilities ``float[S, Q, A]``, such as
         :func:`tabulate_policy` returns. Rows that miss a sum of one by rounding are scaled.
       num_steps: n; default the table's.
@@ -220,10 +220,10 @@ def optimality_gap(
       ([1.0], [0.375], 0.625)
     """
     validation.instance("table", table, TabulatedEnvironment, "one of tabulate")
-    if not isinstance(task, Automaton):
-        task = to_automaton(task)
+    if not isinstance(formula, Automaton):
+        formula = to_automaton(formula)
     steps = table.num_steps if num_steps is None else validation.integer("num_steps", num_steps)
-    model = product(table.model, task)
+    model = product(table.model, formula)
     table_of_policy = _rows_of(policy)
     shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
     if (
@@ -240,7 +240,7 @@ def optimality_gap(
     if steps is None:
         value, optimum = _unbounded(table, model, table_of_policy, start)
     else:
-        value, optimum = _bounded(table, model, task, table_of_policy, start, steps)
+        value, optimum = _bounded(table, model, formula, table_of_policy, start, steps)
     own, best = (tuple(np.asarray(x) for x in (y.lower, y.upper)) for y in (value, optimum))
     sure = np.isin(own, (0, 1)).all(axis=0) & np.isin(best, (0, 1)).all(axis=0)
     below, above = best[0] - own[1], best[1] - own[0]
@@ -276,22 +276,22 @@ def _rows_of(policy: ArrayLike) -> np.ndarray:
 def _bounded(
     table: TabulatedEnvironment,
     model: Product,
-    task: Automaton,
+    automaton: Automaton,
     policy: np.ndarray,
     start: np.ndarray,
     steps: int,
 ) -> tuple[Solution, Solution]:
     """Step-bounded probabilities of the agent and the optimum, from each initial state."""
-    base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
+    base, decisions, letter = table.model.host, verdicts(automaton), np.asarray(model.letter)
     reachable = sparse_product(
         base,
-        np.asarray(task.delta),
+        np.asarray(automaton.delta),
         letter,
         (start, np.asarray(model.initial_memory)[start]),
         still=decisions != Verdict.UNDECIDED,
     )
     ended = np.asarray(table.terminated)[reachable.base_state]
-    at_end = lasso_verdicts(task)[reachable.memory, letter[reachable.base_state]]
+    at_end = lasso_verdicts(automaton)[reachable.memory, letter[reachable.base_state]]
     target = np.where(ended, at_end, decisions[reachable.memory]) == Verdict.SATISFIED
     going = ~np.asarray(table.truncated)[reachable.base_state]
     best = host.until(reachable.host, target, going, steps, np.maximum)

@@ -13,7 +13,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
-from jaxltl.core.automata.translate import Task
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
@@ -57,17 +57,17 @@ class _Verdicts(NamedTuple):
 
 def robust_satisfaction(
     model: Model,
-    task: Task,
+    formula: FormulaLike,
     *,
     objective: str = "max",
     nature: str | None = None,
     states: ArrayLike | None = None,
     tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
-    """Robust satisfaction probability of a task in an interval MDP; labels are read on exit."""
+    """Robust satisfaction probability of a formula in an interval MDP; labels are read on exit."""
     world, system = world_of(model)
     requested = requested_width(tolerance)
-    automaton, letter = automaton_and_letters(world.nominal, task)
+    automaton, letter = automaton_and_letters(world.nominal, formula)
     states = starting_states(world, states)
     start = states, np.broadcast_to(automaton.initial, states.shape)
     product, host, verdicts = _product(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.table import explore
-from jaxltl.core.automata.translate import Task
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief, describe
@@ -63,7 +63,7 @@ class Objective:
       0.75
     """
 
-    formula: Task | None = None
+    formula: FormulaLike | None = None
     target: Array | str | None = None
     stay: Array | str | None = None
     avoid: Array | str | None = None

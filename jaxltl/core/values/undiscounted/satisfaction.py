@@ -20,7 +20,7 @@ from jaxltl.core.graphs.end_components import (
     accepting_bottom_components,
     accepting_end_components,
 )
-from jaxltl.core.automata.translate import Task
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
@@ -126,7 +126,7 @@ def satisfaction_probability(
 @overload
 def optimal_satisfaction(
     model: Product,
-    task: None = None,
+    formula: None = None,
     *,
     objective: str = "max",
     nature: str | None = None,
@@ -138,7 +138,7 @@ def optimal_satisfaction(
 @overload
 def optimal_satisfaction(
     model: Model | IntervalMDP | Game,
-    task: Task,
+    formula: FormulaLike,
     *,
     objective: str = "max",
     nature: str | None = None,
@@ -152,7 +152,7 @@ def optimal_satisfaction(
 @validated(games=True)
 def optimal_satisfaction(
     model: Product | Model | IntervalMDP | Game,
-    task: Task | None = None,
+    formula: FormulaLike | None = None,
     *,
     objective: str = "max",
     nature: str | None = None,
@@ -161,7 +161,7 @@ def optimal_satisfaction(
     tolerance: jax.Array | float | None = None,
     **options: Unpack[SolverOptions],
 ) -> Solution | Satisfaction:
-    """Maximal or minimal satisfaction probability of a product, or of a model and a task.
+    """Maximal or minimal satisfaction probability of a product, or of a model and a formula.
 
     For Buchi and parity tasks, the probability of reaching an accepting end component, in which the
     policy is accepted almost surely (Baier and Katoen 2008, section 10.6.4); for other tasks as in
@@ -173,28 +173,28 @@ def optimal_satisfaction(
     inside the component, until its least priority is read next. This is a stochastic shortest path
     (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action.
 
-    A model with a `task` is solved on the host, on the reachable part of its product; an interval
+    A model with a `formula` is solved on the host, on the reachable part of its product; an interval
     model with adversarial nature is a stochastic parity game.
 
     Args:
-      model: a product; or with `task` a concrete model, an interval model or a game on one of them.
-      task: a formula, its text, or an automaton over the letters that occur in the model.
+      model: a product; or with `formula` a concrete model, an interval model or a game on one of them.
+      formula: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       nature: for interval models, ``"adversarial"`` (default) or ``"cooperative"``.
-      states: with `task`, ``int[I]``, the requested states; default the initial ones.
-      label_on: with `task`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
+      states: with `formula`, ``int[I]``, the requested states; default the initial ones.
+      label_on: with `formula`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
         state's label; the probability is the same. Interval models read on exit.
       tolerance: as for :func:`reachability_probability`.
       max_steps, start, relative: as for :func:`reachability_probability`; the first two of a product.
 
     Returns:
       Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, rows
-      for a sparse world. With a task, a :class:`Satisfaction`, a finite-memory policy of rows.
+      for a sparse world. With a formula, a :class:`Satisfaction`, a finite-memory policy of rows.
       Differentiable in a product's transition probabilities, with the optimal
       policy held fixed; not for sparse and interval models, which are solved on the host.
 
     Raises:
-      ValueError: neither a product nor a task, an unknown label, state or objective, an option that
+      ValueError: neither a product nor a formula, an unknown label, state or objective, an option that
         is not for this model, or a product of a sparse world with restricted actions.
 
     Example:
@@ -210,7 +210,7 @@ def optimal_satisfaction(
     )
     if relative:
         tolerance = relative_width(model, tolerance)
-    if task is not None:
+    if formula is not None:
         refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
         refuse_iteration(max_steps, start)
         if isinstance(model, Game) and isinstance(model.mdp, MDP | DenseMDP):
@@ -219,12 +219,17 @@ def optimal_satisfaction(
             if label_on is not None:  # interval models read labels on exit
                 validation.choice("label_on", label_on, ("exit",))
             return robust_satisfaction(
-                model, task, objective=objective, nature=nature, states=states, tolerance=tolerance
+                model,
+                formula,
+                objective=objective,
+                nature=nature,
+                states=states,
+                tolerance=tolerance,
             )
         refuse_nature(nature)
         return sparse_satisfaction(
             to_sparse(model),
-            task,
+            formula,
             objective=objective,
             states=states,
             label_on="entry" if label_on is None else label_on,
@@ -232,7 +237,7 @@ def optimal_satisfaction(
         )
     refuse_game("optimal_satisfaction", [("model", model)])
     if states is not None or label_on is not None:
-        raise ValueError("states and label_on are for a model and a task, not for a product.")
+        raise ValueError("states and label_on are for a model and a formula, not for a product.")
     model = as_product(model)
     by_rows = objective in ("max", "min") and is_sparse(model)
     if by_rows or isinstance(model.mdp, IntervalMDP):

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.runs import live_states, universal_states
-from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.deferred import Deferred, deferred_field
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
@@ -80,7 +80,7 @@ Satisfaction.row = deferred_field(4, "Rows of the policy in each state.")  # typ
 
 def sparse_satisfaction(
     model: SparseMDP,
-    task: Task,
+    formula: FormulaLike,
     *,
     objective: str = "max",
     states: Array | None = None,
@@ -91,7 +91,7 @@ def sparse_satisfaction(
     reduction_for(objective)
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
-    automaton, letter = automaton_and_letters(model, task)
+    automaton, letter = automaton_and_letters(model, formula)
     states = starting_states(model, states)
     reader = _LetterReader(automaton, letter, label_on == "entry")
     product = _product(model, reader, states)
@@ -282,20 +282,20 @@ def _product(model: SparseMDP, reader: _LetterReader, states: np.ndarray) -> Spa
     )
 
 
-def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
-    """The automaton of a task over the letters of a model, and the letter of each state."""
-    if not isinstance(task, Automaton):
-        task = as_formula(task)
-        letters, number = state_letters(model, task.propositions)
-        task = to_automaton(task, letters=letters)
+def automaton_and_letters(model: SparseMDP, formula: FormulaLike) -> tuple[Automaton, np.ndarray]:
+    """The automaton of a formula over the letters of a model, and the letter of each state."""
+    if not isinstance(formula, Automaton):
+        formula = as_formula(formula)
+        letters, number = state_letters(model, formula.propositions)
+        formula = to_automaton(formula, letters=letters)
     else:
-        letters, number = state_letters(model, named_propositions(task))
-    index = np.array([letter_index(task, letter) for letter in letters], np.int64)
+        letters, number = state_letters(model, named_propositions(formula))
+    index = np.array([letter_index(formula, letter) for letter in letters], np.int64)
     automaton = replace(
-        task,
-        delta=np.asarray(task.delta),
-        priority=np.asarray(task.priority),
-        letters=np.asarray(task.letters),
+        formula,
+        delta=np.asarray(formula.delta),
+        priority=np.asarray(formula.priority),
+        letters=np.asarray(formula.letters),
     )
     return automaton, index[number]
 

@@ -126,7 +126,7 @@ def test_options_of_other_models_are_refused():
         ):
             optimal_satisfaction(model, "F a", **option)
     for option in ({"states": [0]}, {"label_on": "exit"}):
-        with pytest.raises(ValueError, match="for a model and a task"):
+        with pytest.raises(ValueError, match="for a model and a formula"):
             optimal_satisfaction(product(model, "F a"), **option)
     with pytest.raises(ValueError, match="is no product of a world and a task"):
         optimal_satisfaction(model)
