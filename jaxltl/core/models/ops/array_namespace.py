@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from contextvars import ContextVar
 from typing import TypeVar, cast
 
 import jax
@@ -21,6 +22,9 @@ from jaxltl.core.models.protocols import Array
 
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., PyTree])
+
+# True inside a callback, where JAX must not run: its threads may all wait for callbacks.
+_inside_callback: ContextVar[bool] = ContextVar("inside_callback", default=False)
 
 
 def is_traced(tree: PyTree) -> bool:
@@ -38,12 +42,14 @@ def namespace(*trees: PyTree) -> tuple[PyTree, ...]:
 
 
 def to_jax(tree: PyTree) -> PyTree:
-    """A tree with JAX arrays, without compilation."""
+    """A tree with JAX arrays, without compilation; inside a callback with NumPy arrays."""
     return jax.tree.map(jax_array, tree)
 
 
 def jax_array(array: ArrayLike) -> jax.Array:
-    """A JAX array, without compilation."""
+    """A JAX array, without compilation; inside a callback a NumPy array."""
+    if _inside_callback.get():
+        return cast(jax.Array, np.asarray(array))
     # device_put may share memory with its argument, hence the copy.
     return array if isinstance(array, jax.Array) else jax.device_put(np.array(array))
 
@@ -67,13 +73,22 @@ def jit(*static: str) -> Callable[[FunctionT], FunctionT]:
 def host_callback(function: Callable[..., PyTree], result: PyTree, *arguments: PyTree) -> PyTree:
     """``function(*arguments)`` on NumPy arrays, inside ``jit``; sequential under ``vmap``."""
     # JAX rounds the arrays of a callback to single precision if double precision is enabled for the
-    # calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
-    arguments = jax.tree.map(jnp.asarray, arguments)
-    dtypes = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)
+    # calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words. Concrete
+    # arrays are not passed, as each array of a call costs time.
+    leaves, form = jax.tree.flatten(arguments)
+    traced = {i: x for i, x in enumerate(leaves) if isinstance(x, jax.core.Tracer)}
+    known = [None if i in traced else np.asarray(x) for i, x in enumerate(leaves)]
+    dtypes = {i: np.dtype(x.dtype) for i, x in traced.items()}
     kinds = jax.tree.map(lambda x: np.dtype(jax.dtypes.canonicalize_dtype(x.dtype)), result)
 
-    def on_host(*words: PyTree) -> PyTree:
-        results = function(*jax.tree.map(_from_words, words, dtypes))
+    def on_host(words: dict[int, Array]) -> PyTree:
+        passed = {i: _from_words(x, dtypes[i]) for i, x in words.items()}
+        full = [passed.get(i, x) for i, x in enumerate(known)]
+        token = _inside_callback.set(True)
+        try:
+            results = function(*jax.tree.unflatten(form, full))
+        finally:
+            _inside_callback.reset(token)
         return jax.tree.map(lambda kind, x: _to_words(np.asarray(x, kind)), kinds, results)
 
     def words_of(x: jax.Array, kind: np.dtype) -> jax.ShapeDtypeStruct:
@@ -85,7 +100,7 @@ def host_callback(function: Callable[..., PyTree], result: PyTree, *arguments: P
     words = jax.pure_callback(
         on_host,
         jax.tree.map(words_of, result, kinds),
-        *jax.tree.map(_words, arguments),
+        {i: _words(x) for i, x in traced.items()},
         vmap_method="sequential",
     )
     return jax.tree.map(_number, words, kinds)
