@@ -131,14 +131,18 @@ def optimum(case: Case, aims: Aims, value, policy: np.ndarray | None = None) -> 
 
     `value` is a function of matrices ``[N, S, S]`` and rewards ``[N, S]`` to values ``[N, S]``.
     """
-    tables = options(case, aims, policy)
+    return minimax(options(case, aims, policy), value)
+
+
+def minimax(tables, value) -> np.ndarray:
+    """The value of the game in which each state has a table as of :func:`options`."""
     outer = list(itertools.product(*(range(len(t)) for t in tables)))
     inner = list(itertools.product(*(range(len(t[0])) for t in tables)))
-    chosen = [[tables[s][i[s]][j[s]] for s in range(case.num_states)] for i in outer for j in inner]
+    chosen = [[tables[s][i[s]][j[s]] for s in range(len(tables))] for i in outer for j in inner]
     matrices = np.array([[row for row, _ in one] for one in chosen])
     rewards = np.array([[paid for _, paid in one] for one in chosen])
     values = value(matrices, rewards)
-    return values.reshape(len(outer), len(inner), case.num_states).min(1).max(0)
+    return values.reshape(len(outer), len(inner), len(tables)).min(1).max(0)
 
 
 # --- values of chains [N, S, S] ---------------------------------------------------------------------

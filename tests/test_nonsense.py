@@ -751,7 +751,6 @@ def test_good_input_is_taken(tmp_path):
             "num_steps=None; it must be an integer",
         ),
         (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),
-        (lambda m: jl.average_reward(m, "r"), "robust_discounted_value, with a discount near 1"),
         (
             lambda m: multi_objective(m, [Objective(target="a"), Objective(target="a")]),
             "ask for one at a time",

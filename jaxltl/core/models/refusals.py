@@ -35,7 +35,6 @@ _INSTEAD = {
     "soft_value": _DISCOUNTED,
     "boltzmann_value": _DISCOUNTED,
     "occupancy_measure": _STRATEGY,
-    "average_reward": "mean_payoff(game, reward), of a deterministic game",
     "total_reward": _REWARD,
     "hitting_time": _REWARD,
     "reachability_probability": _REACHING,

@@ -1,5 +1,5 @@
 from .average.average_reward import average_reward as average_reward
-from .average.average_reward import mean_payoff as mean_payoff
+from .average.mean_payoff import mean_payoff as mean_payoff
 from .discounted.discounted import optimal_value as optimal_value, policy_value as policy_value
 from .discounted.minimax import minimax_value as minimax_value, strategy_value as strategy_value
 from .discounted.occupancy import (

@@ -13,8 +13,8 @@ from jaxltl.core.models import Game
 
 # Those that know who moves; the cells of tests/core/values/test_matrix.py test their answers.
 FOR_GAMES = {
-    "minimax_value", "strategy_value", "mean_payoff", "robust_reachability", "robust_total_reward",
-    "robust_discounted_value", "optimal_satisfaction", "winning_region", "permissive_strategy",
+    "minimax_value", "strategy_value", "mean_payoff", "average_reward", "robust_reachability",
+    "robust_total_reward", "robust_discounted_value", "optimal_satisfaction", "winning_region", "permissive_strategy",
     "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
 }  # fmt: skip
 # Analyses of the graph and operations on models, which are not about who chooses.

@@ -61,6 +61,10 @@ def discounting(s: Subject, objective, nature=None, policy=None):
     return s.optimum(lambda m, r: reference.discounted(m, r, DISCOUNT), objective, nature, policy)
 
 
+def averaging(s: Subject, objective, nature=None, policy=None):
+    return s.optimum(reference.average, objective, nature, policy)
+
+
 for objective in ("max", "min"):
     direction = {"objective": objective}
     for nature in (None, "cooperative"):
@@ -130,9 +134,12 @@ for objective in ("max", "min"):
     question(f"prepared reach {objective}", partial(reaching, **direction))(
         lambda s, m, o=direction: jl.solve_prepared(jl.prepare(m, s.mask(s.case.b), **o))
     )
-    question(f"average {objective}", lambda s, o=direction: s.optimum(reference.average, **o))(
-        lambda s, m, o=direction: jl.average_reward(m, s.reward, **o)
-    )
+    for nature in (None, "cooperative"):
+        aims = {**direction, "nature": nature}
+        name = objective + (", helped" if nature else "")
+        question(f"average {name}", partial(averaging, **aims))(
+            lambda s, m, aims=aims: jl.average_reward(m, s.reward, **aims)
+        )
 
 question("discounted", partial(discounting, objective="max"))(
     lambda s, m: jl.optimal_value(m, s.reward, DISCOUNT)
@@ -157,6 +164,9 @@ question("policy: reward", of_policy(earning))(
 )
 question("policy: discounted", of_policy(discounting))(
     lambda s, m: jl.policy_value(m, s.policy, s.reward, DISCOUNT)
+)
+question("policy: average", of_policy(averaging))(
+    lambda s, m: jl.average_reward(m, s.reward, policy=s.policy)
 )
 question("policy: discounted, worst case", of_policy(discounting))(
     lambda s, m: jl.values.strategy_value(m, s.policy, s.reward, DISCOUNT)
@@ -303,18 +313,21 @@ within 3 max                      +++++++ ....... +++++.. .......
 next max                          +++++++ ....... +++++.. .......
 reward of 3 steps max             +++++++ ....... +++++.. .......
 prepared reach max                +++++++ ....... +++++.. .......
-average max                       +++++.. ....... +++++.. .......
+average max                       +++++++ +++++++ +++++++ +++++++
+average max, helped               .....++ .....++ .....++ .....++
 within 3 min                      +++++++ ....... +++++.. .......
 next min                          +++++++ ....... +++++.. .......
 reward of 3 steps min             +++++++ ....... +++++.. .......
 prepared reach min                +++++++ ....... +++++.. .......
-average min                       +++++.. ....... +++++.. .......
+average min                       +++++++ +++++++ +++++++ +++++++
+average min, helped               .....++ .....++ .....++ .....++
 discounted                        +++++++ ....... +++++.. .......
 discounted of both players        +++++.. +++++.. +++++.. +++++..
 policy: reach                     +++++++ ....... +++++.. .......
 policy: robust reach              .....++ +..++++ ....... .......
 policy: reward                    +++++++ ....... +++++.. .......
 policy: discounted                +++++++ ....... +++++.. .......
+policy: average                   +++++++ +++++++ +++++++ +++++++
 policy: discounted, worst case    +++++.. +++++.. +++++.. +++++..
 F b max                           +++++++ +++++++ +++++++ .......
 F b min                           +++++++ +++++++ +++++++ .......

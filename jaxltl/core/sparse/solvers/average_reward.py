@@ -10,6 +10,7 @@ then a shortest path problem (Puterman 1994, chapter 9).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,18 @@ _IDLE_SHARE = 1e-12  # this share, after which policy iteration ends
 _BEST_SHARE = 1e-3  # of the range of biases: the best states
 _TINY = 1e-13  # relative size of gains that have no relative tolerance
 _LOOSEST = 1e-3  # share up to which second-order terms are negligible
-_FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolved further
+
+
+class Scale(NamedTuple):
+    """Signs and sizes of the numbers, on which the accuracy depends."""
+
+    sign: int = 1  # -1 if rewards are negated ones
+    depth: int = 0  # the number of roundings behind each probability
+    # share of the largest reward: gains nearer to zero are not resolved relatively
+    floor: float = 1e-6
+
+
+_UNSCALED = Scale()
 
 
 def average(
@@ -66,16 +78,15 @@ def average(
     *,
     tolerance: float,
     max_steps: int,
-    sign: int = 1,
+    scale: Scale = _UNSCALED,
 ) -> Enclosure:
     """Largest long-run average reward per step; the residual is half the widest gain's enclosure."""
     components = end_components(mdp)
     states = np.flatnonzero(components.region(mdp))
     states = states[np.argsort(components.component[states], kind="stable")]
     leaders, start = np.unique(components.component[states], return_index=True)
-    gains = _gains(
-        _submodel(mdp, components.inside, states, start, (reward, magnitude)), tolerance, max_steps
-    )
+    part = submodel(mdp, components.inside, states, start, (reward, magnitude), scale)
+    gains = component_gains(part, tolerance, max_steps)
     middle, half = (gains.lower + gains.upper) / 2, float((gains.upper - gains.lower).max()) / 2
     row = mdp.row_start[:-1].astype(np.int64)
     row[states] = gains.row
@@ -86,15 +97,18 @@ def average(
             onward = shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool))
             row = np.where(inside, row, onward)
         return Enclosure(value, value - half, value + half, row, gains.rounds, half, _METHOD)
-    stopping = _stopping_problem(mdp, components, leaders)
-    least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
+    stopping = _stopping_problem(mdp, components, leaders, scale.depth)
+    least = max(float(np.abs(middle).min()), scale.floor * float(magnitude.max()))
     width = tolerance / 4 * least
     if half <= width:
-        (low, high, taken, rounds), slack = stopping.solve(middle, tolerance, width, sign), half
+        (low, high, taken, rounds), slack = (
+            stopping.solve(middle, tolerance, width, scale.sign),
+            half,
+        )
     else:
         # The error of large gains would be too much for small ones: both sides separately.
-        low, _, taken, rounds = stopping.solve(gains.lower, tolerance, width, sign)
-        high, slack = stopping.solve(gains.upper, tolerance, width, sign)[1], 0.0
+        low, _, taken, rounds = stopping.solve(gains.lower, tolerance, width, scale.sign)
+        high, slack = stopping.solve(gains.upper, tolerance, width, scale.sign)[1], 0.0
     return Enclosure(
         value=(low + high) / 2,
         lower=low - slack,
@@ -149,6 +163,7 @@ class _Stopping:
     node: Integers  # int[S], the node of each state
     mdp: HostMDP  # the model; its last nodes are terminal
     origin: Integers  # int[R'], the model's row of each row; -1 for stopping
+    depth: int
 
     def solve(
         self, gain: Floats, tolerance: float, width: float, sign: int
@@ -162,7 +177,7 @@ class _Stopping:
         known = np.concatenate([np.zeros(size), worth - shift])
         interior = np.arange(mdp.num_states) < size
         enclosure = policy_iteration(
-            ShortestPathProblem(mdp, interior, known, np.zeros(mdp.num_rows)),
+            ShortestPathProblem(mdp, interior, known, np.zeros(mdp.num_rows), depth=self.depth),
             maximize=sign > 0,
             relative=relative,
             tolerance=tolerance / 4 if relative else width,
@@ -176,7 +191,7 @@ class _Stopping:
 
 
 def _stopping_problem(
-    mdp: HostMDP, components: SparseEndComponents, leaders: Integers
+    mdp: HostMDP, components: SparseEndComponents, leaders: Integers, depth: int
 ) -> _Stopping:
     heads = np.flatnonzero(components.component == np.arange(mdp.num_states))
     node = np.searchsorted(heads, components.component)
@@ -185,14 +200,14 @@ def _stopping_problem(
     ends = np.concatenate([node[leaders], stops]), np.tile(stops, 2)
     small, order = with_stops(mdp, row, node, ends, heads.size + stops.size)
     origin = np.concatenate([row, np.full(2 * stops.size, -1)])
-    return _Stopping(node, small, origin[order])
+    return _Stopping(node, small, origin[order], depth)
 
 
 # --- the gain of each component ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Submodel:
+class Submodel:
     """Some components as a separate model, without the rows that leave them."""
 
     mdp: HostMDP  # its states are those of the components, one component after the other
@@ -201,7 +216,12 @@ class _Submodel:
     row: Integers  # int[R'], the rows of the model
     reward: Floats  # float64[R'] (reward, magnitude)
     magnitude: Floats
-    unit: float  # the rounding of one backup
+    scale: Scale
+
+    @cached_property
+    def unit(self) -> float:
+        """The rounding of one backup."""
+        return backup_unit(self.mdp) + self.scale.depth * _EPS
 
     def change(self, v: Floats) -> Floats:
         """``T v - v``."""
@@ -226,7 +246,9 @@ class _Submodel:
     def allowed_width(self, low: Floats, high: Floats, tolerance: float) -> Floats:
         """The width of bounds that the tolerance allows."""
         weight = np.maximum.reduceat(self.mdp.over_choices(np.maximum, self.magnitude), self.start)
-        return tolerance * np.maximum(np.minimum(np.abs(low), np.abs(high)), _FLOOR * weight)
+        return tolerance * np.maximum(
+            np.minimum(np.abs(low), np.abs(high)), self.scale.floor * weight
+        )
 
     def first_best(self, quantity: Floats) -> Integers:
         """The first row of each state with the largest quantity."""
@@ -237,14 +259,25 @@ class _Submodel:
         """The value with 0 at each component's first state."""
         return v - np.repeat(v[self.start], self.size)
 
+    def restricted(self, states: Integers, start: Integers) -> Submodel:
+        """The submodel of some components."""
+        rows, rewards = np.ones(self.mdp.num_rows, bool), (self.reward, self.magnitude)
+        small = submodel(self.mdp, rows, states, start, rewards, self.scale)
+        return replace(small, row=self.row[small.row])
 
-def _submodel(
+    def policy_iteration(self, known: Gains, rest: Unsettled, tolerance: float) -> Floats | None:
+        """Policy iteration on one component; None at its end, else a bias to continue from."""
+        return _policy_iteration(known, rest, tolerance)
+
+
+def submodel(
     mdp: HostMDP,
     inside: Booleans,
     states: Integers,
     start: Integers,
     rewards: tuple[Floats, Floats],
-) -> _Submodel:
+    scale: Scale,
+) -> Submodel:
     """Some components of a model, with the rows that stay inside."""
     number = positions(states, mdp.num_states)
     row = np.flatnonzero(inside & (number[mdp.state] >= 0))
@@ -253,11 +286,11 @@ def _submodel(
     small, _ = mdp.select(offsets_from_counts(count), row, number)
     reward, magnitude = (x[row] for x in rewards)
     size = np.diff(start, append=states.size)
-    return _Submodel(small, start, size, row, reward, magnitude, backup_unit(small))
+    return Submodel(small, start, size, row, reward, magnitude, scale)
 
 
 @dataclass(frozen=True)
-class _Bias:
+class Bias:
     """A policy's gain, and its bias in two floats."""
 
     gain: float
@@ -266,7 +299,7 @@ class _Bias:
 
 
 @dataclass
-class _Gains:
+class Gains:
     """Bounds of the gains of C components."""
 
     lower: Floats  # float64[C] (lower, upper)
@@ -274,7 +307,7 @@ class _Gains:
     row: Integers  # int64[S'], rows of their states that attain the lower bound
     rounds: int = 0  # sweeps, and linear systems
 
-    def update(self, rest: _Unsettled) -> None:
+    def update(self, rest: Unsettled) -> None:
         """Applies the span bound of a value."""
         part, which = rest.part, rest.which
         gain, slack = part.gain(rest.v)
@@ -287,7 +320,7 @@ class _Gains:
         self.lower[which] = np.maximum(self.lower[which], low)
         self.upper[which] = np.minimum(self.upper[which], high)
 
-    def update_by_weights(self, rest: _Unsettled, chosen: Integers, bias: _Bias) -> None:
+    def update_by_weights(self, rest: Unsettled, chosen: Integers, bias: Bias) -> None:
         """Applies the bound by perturbed weights to a policy of one component.
 
         With costs ``c = r - min r`` and ``g = gain - min r``, a row has the balance
@@ -316,44 +349,43 @@ class _Gains:
             self.row[rest.states] = part.row[chosen]
         self.upper[which] = min(self.upper[which], bounds[1])
 
-    def too_wide(self, rest: _Unsettled, tolerance: float) -> Booleans:
+    def too_wide(self, rest: Unsettled, tolerance: float) -> Booleans:
         """Components with bounds wider than the tolerance."""
         low, high = self.lower[rest.which], self.upper[rest.which]
         return high - low > rest.part.allowed_width(low, high, tolerance)
 
 
 @dataclass(frozen=True)
-class _Unsettled:
+class Unsettled:
     """Components with too wide bounds: their numbers, states, submodel, and a value."""
 
     which: Integers
     states: Integers
-    part: _Submodel
+    part: Submodel
     v: Floats
 
-    def only(self, kept: Booleans) -> _Unsettled:
+    def only(self, kept: Booleans) -> Unsettled:
         """Some of these."""
         if kept.all():
             return self
         part, size = self.part, self.part.size[kept]
         states = np.flatnonzero(np.repeat(kept, part.size))
-        rows, start = np.ones(part.mdp.num_rows, bool), size.cumsum() - size
-        small = _submodel(part.mdp, rows, states, start, (part.reward, part.magnitude))
-        small = replace(small, row=part.row[small.row])
-        return _Unsettled(self.which[kept], self.states[states], small, self.v[states])
+        small = part.restricted(states, size.cumsum() - size)
+        return Unsettled(self.which[kept], self.states[states], small, self.v[states])
 
 
-def _gains(whole: _Submodel, tolerance: float, max_steps: int) -> _Gains:
+def component_gains(whole: Submodel, tolerance: float, max_steps: int) -> Gains:
     """Bounds on the largest gain of each component."""
     count, size = whole.start.size, whole.mdp.num_states
-    known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
-    rest = _Unsettled(np.arange(count), np.arange(size), whole, np.zeros(size))
+    known = Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
+    rest = Unsettled(np.arange(count), np.arange(size), whole, np.zeros(size))
     rest = _value_iteration(known, rest, tolerance, min(_SWEEPS, max_steps), patience=0)
     for turn in range(_TURNS):
         settled, v = np.zeros(rest.which.size, bool), rest.v.copy()
         for i in np.flatnonzero(rest.part.size <= _ELIMINATED):
             one = np.arange(settled.size) == i
-            bias = _policy_iteration(known, rest.only(one), tolerance)
+            one_part = rest.only(one)
+            bias = one_part.part.policy_iteration(known, one_part, tolerance)
             settled[i] = bias is None
             if bias is not None:
                 v[np.repeat(one, rest.part.size)] = bias
@@ -368,8 +400,8 @@ def _gains(whole: _Submodel, tolerance: float, max_steps: int) -> _Gains:
 
 
 def _value_iteration(
-    known: _Gains, rest: _Unsettled, tolerance: float, num_steps: int, patience: float = np.inf
-) -> _Unsettled:
+    known: Gains, rest: Unsettled, tolerance: float, num_steps: int, patience: float = np.inf
+) -> Unsettled:
     """Value iteration of all components at once, until each is narrow or convergence is slow."""
     before: Floats | None = None
     done = 0
@@ -391,7 +423,7 @@ def _value_iteration(
     return rest
 
 
-def _steps_needed(known: _Gains, rest: _Unsettled, before: Floats, tolerance: float) -> Floats:
+def _steps_needed(known: Gains, rest: Unsettled, before: Floats, tolerance: float) -> Floats:
     """The number of further steps, by the rate at which bounds became narrower since `before`."""
     low, high = known.lower[rest.which], known.upper[rest.which]
     now = high - low
@@ -403,7 +435,7 @@ def _steps_needed(known: _Gains, rest: _Unsettled, before: Floats, tolerance: fl
 # --- policies of one component -------------------------------------------------------------------
 
 
-def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floats | None:
+def _policy_iteration(known: Gains, rest: Unsettled, tolerance: float) -> Floats | None:
     """Policy iteration (Howard 1960) on one component, over policies with one recurrent class.
 
     Returns None at its end; the bias of a best policy where recurrent classes alternate.
@@ -412,7 +444,7 @@ def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floa
     chosen, best, idle = part.first_best(part.gain(rest.v)[0]), rest.v, 0
     for _ in range(_ROUNDS):
         known.rounds += 1
-        before, solved = float(known.lower[rest.which[0]]), _evaluated(part, chosen)
+        before, solved = float(known.lower[rest.which[0]]), evaluated(part, chosen)
         if solved is None:
             return best
         bias, chosen = solved
@@ -439,7 +471,7 @@ def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floa
     return best
 
 
-def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | None:
+def evaluated(part: Submodel, chosen: Integers) -> tuple[Bias, Integers] | None:
     """A policy's gain and bias, and the policy, led to its recurrent class of the largest gain."""
     mdp, size = part.mdp, part.mdp.num_states
     chain = mdp.matrix[chosen]
@@ -465,8 +497,8 @@ def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | No
 
 
 def _gain_and_bias(
-    part: _Submodel, chosen: Integers, states: Integers, recurrent: Integers | None = None
-) -> _Bias | None:
+    part: Submodel, chosen: Integers, states: Integers, recurrent: Integers | None = None
+) -> Bias | None:
     """Gain and bias of a chain with one recurrent class, by renewal at a frequent state.
 
     The bias is refined in two floats (Wilkinson 1963): it may exceed the resolution of one float.
@@ -508,4 +540,4 @@ def _gain_and_bias(
             gain += float(share)
             high, lost = two_sum(high, earned - share * time)
             high, low = two_sum(high, low + lost)
-    return _Bias(gain, high - high[visited], low - low[visited])
+    return Bias(gain, high - high[visited], low - low[visited])

@@ -1,69 +1,82 @@
-"""Long-run average rewards of Markov chains, decision processes and deterministic games."""
+"""Long-run average rewards of every kind of model."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from fractions import Fraction
-from typing import NamedTuple
+from typing import Unpack, cast
 
-import chex
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.models.compiled import compiled_form, reshape_solution
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.padded import pad_rows
-from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
-from jaxltl.core.models.mesh.sharded import refuse_sharded
-from jaxltl.core.models.ops.array_namespace import jit, is_traced
-from jaxltl.core.models.ops.operators import induced_chain
-from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
-from jaxltl.core.sparse.solvers.average_reward import RewardRange, average, within_range
-from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.discounted.discounted import expected_reward
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import ActionModel, Array, Model
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, reward_structure
+from jaxltl.core.sparse.interval.average_reward import AverageGame, Goal, optimal_average
+from jaxltl.core.sparse.interval.robust_values import RobustValues
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+
+from jaxltl.core.sparse.solvers.average_reward import RewardRange, Scale, average, within_range
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
+from jaxltl.core.types import Solution, row_tolerance
+from jaxltl.core.values.engine.host_solution import induced_chain, is_sparse, with_given_policy
 from jaxltl.core.values.engine.state_quantities import (
-    solution_from_error,
     finite_reward,
     reduction_for,
-    row_reward,
     reward_span,
+    row_reward,
+    solution_from_error,
+    transition_reward,
 )
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core.values.interval.robust import nature_direction, refuse_nature
 
 
-@validated(host=True)
+@validated(games=True, host=True)
 def average_reward(
     model: Model,
-    reward: Array | str,
+    reward: Reward,
     *,
     objective: str = "max",
+    nature: str | None = None,
+    policy: Array | None = None,
     tolerance: float = 1e-6,
-    max_steps: int = 1_000_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
-    """Optimal expected long-run average reward per step: ``lim 1/n E[r_1 + ... + r_n]``.
+    """Expected long-run average reward per step, ``lim 1/n E[r_1 + ... + r_n]``: optimal, or of a policy.
 
     For multichain models too (Puterman 1994, chapter 9): the best expected gain of the end
     component in which a trajectory ends. Gains are enclosed by the span of ``T v - v`` and are the
-    terminal rewards of an optimal stopping problem. Games have :func:`mean_payoff`.
+    terminal rewards of an optimal stopping problem. In games and interval models the optimum of each
+    side against a strategy of the other one is such a problem, and bounds the value; strategies are
+    those for discounts near 1 (Blackwell 1962). :func:`mean_payoff` is exact, for deterministic games.
 
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
-      objective: ``"max"`` or ``"min"``; irrelevant for chains.
+      model: any concrete model. In a game the environment has the opposite objective.
+      reward: of states, choices or transitions, as for
+        :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
+      objective: ``"max"`` or ``"min"``, of the system; irrelevant for chains.
+      nature: of interval models: ``"adversarial"`` (default), against the objective, or
+        ``"cooperative"``.
+      policy: evaluate this policy, of a game the system's: actions ``int32[S]`` or ``float[S, A]``;
+        rows or ``float[R]`` for sparse rows. Default: optimise.
       tolerance: width of the enclosure, relative to the value; for small values relative to a
         millionth of the largest reward (a thousandth, if some are negative).
-      max_steps: sweeps of value iteration at most.
+      max_steps: sweeps of value iteration at most; default 10^6.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the bound
-      on the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
-      enclosure. Concrete arrays only; not differentiable.
+      :class:`Solution`; `value` is ``float64`` in the shape of the states. `policy` attains the bound on
+      the safe side (`lower` of a maximum), for both players of a game and with `nature` of interval
+      models: actions ``int32[S]``, or rows for sparse rows. `residual` is half the width of the gain's
+      widest enclosure. PRECISION where bounds are valid and wider than the tolerance. Concrete arrays
+      only; not differentiable.
 
     Raises:
-      ValueError: the reward, the objective, or a model with intervals.
+      ValueError: the reward, the objective, the policy, or `nature` of a model without intervals.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -73,37 +86,51 @@ def average_reward(
       >>> found.value.round(9).tolist(), found.policy.tolist()
       ([5.0, 8.0, 4.0], [0, 2, 3])
     """
-    if hasattr(model, "nominal"):
-        raise ValueError(
-            "averages in the long run are not solved for where probabilities are "
-            "intervals; ask robust_discounted_value, with a discount near 1, or "
-            "total_reward until a target, or give model.nominal, which is one "
-            "choice of nature."
-        )
-    sparse = to_sparse(model)
-    model, reward = sparse, row_reward(model, sparse, reward)
-    sign = 1 if reduction_for(objective) is np.maximum else -1
-    earned, magnitude = finite_reward(model, reward)
-    enclosure = average(
-        model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
-    )
-    ends = _range(reward_structure(model, reward))
-    enclosure = within_range(
-        model.host, sign * earned, enclosure, ends if sign > 0 else ends.negated
-    )
+    (max_steps,) = validation.options("average_reward", options, max_steps=1_000_000)
+    reduction_for(objective)
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    sets = None
+    if isinstance(world, IntervalMDP):
+        nature = nature_direction(nature, objective)
+        if isinstance(lazy, Product):
+            product = lazy
+            world = world.changed(lambda nominal: to_sparse(replace(product, mdp=nominal)))
+        sparse, sets = world.nominal, world.host
+        rewards = reward_structure(sparse, reward)
+    else:
+        refuse_nature(nature)
+        sparse = to_sparse(lazy)
+        rewards = reward_structure(sparse, row_reward(lazy, sparse, reward))
+    earned, magnitude = finite_reward(sparse, rewards)
+    goal = Goal(_range(rewards), tolerance, max_steps)
+    if sets is None and not isinstance(model, Game):
+        enclosure = _of_one_player(model, sparse, (earned, magnitude), objective, policy, goal)
+    else:
+        game, row = _game(model, sparse, sets, rewards, (objective, nature), policy)
+        values = optimal_average(game, goal)
+        enclosure = _original(values, row, sparse.num_states)
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(enclosure.upper - enclosure.value, enclosure.value - enclosure.lower)
     least = small * float(magnitude.max())
+    by_rows = is_sparse(lazy) or sets is not None
+    choice = enclosure.row if by_rows else np.asarray(sparse.action)[enclosure.row]
     solution = solution_from_error(
-        sign * enclosure.value,
+        enclosure.value,
         error,
-        enclosure.row.astype(np.int32),
+        choice.astype(np.int32).reshape(model.state_shape),
         enclosure.rounds,
-        enough=tolerance * np.maximum(np.abs(enclosure.value), least),
-        span=(ends.least, ends.largest),
+        enough=tolerance / 2 * np.maximum(np.abs(enclosure.value), least),
+        span=(goal.ends.least, goal.ends.largest),
     )
-    residual: Array = np.float64(enclosure.residual)
-    return replace(solution, residual=residual)
+    parts: dict[str, Array] = {
+        name: getattr(solution, name).reshape(model.state_shape)
+        for name in ("value", "lower", "upper")
+    }
+    parts["residual"] = np.float64(enclosure.residual)
+    if sets is not None and policy is None:
+        parts["nature"] = values.probability
+    return with_given_policy(replace(solution, **parts, method=enclosure.method), policy)
 
 
 def _range(rewards: Rewards) -> RewardRange:
@@ -116,252 +143,91 @@ def _range(rewards: Rewards) -> RewardRange:
     return RewardRange(least, largest, (alone or least_zero, alone or largest_zero))
 
 
-@validated(games=True)
-def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:
-    """Mean payoff: the exact average reward that the system secures in a deterministic game.
-
-    The value of ``liminf (r_1 + ... + r_n) / n`` under optimal play (Ehrenfeucht and
-    Mycielski 1979), by policy iteration with gains and biases (Cochet-Terrasson and Gaubert 2006)
-    in exact arithmetic, on integers with the rewards' common denominator.
-
-    Args:
-      game: a deterministic Game; any other model is the game in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``, finite; moves of both players count. In a game
-        on a sparse model, which is padded for it, as of
-        :func:`~jaxltl.core.models.sparse.choice_reward`.
-      max_steps: maximal number of pairs of strategies.
-
-    Returns:
-      :class:`Solution`; `policy` is ``int32[S]``, optimal for both players; rows in a game on a
-      sparse model. `lower` and `upper` are the neighbouring floats where the mean is not a float,
-      and infinite where `max_steps` did not suffice. Concrete arrays only; not differentiable.
-
-    Raises:
-      ValueError: a move has several successors, the reward has a wrong shape or is not finite,
-        or the values are traced.
-
-    Example:
-      >>> from jaxltl import from_dense, make_game
-      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [0, 1.0]]])
-      >>> game = make_game(world, [True, False])
-      >>> mean = mean_payoff(game, jnp.array([[1.0, 4.0], [0.0, 3.0]]))
-      >>> mean.value.tolist(), mean.policy.tolist()
-      ([2.0, 2.0], [1, 0])
-    """
-    game_model = as_game(game)
-    refuse_sharded(game_model)
-    if is_traced((game_model, reward)):
-        raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")
-    form, reward = compiled_form(game_model, reward)
-    if isinstance(form.mdp, SparseMDP):
-        host = form.mdp.host
-        earned = pad_rows(form.mdp, choice_reward(form.mdp, reward))
-        solution = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
-        row = pad_rows(form.mdp, np.arange(host.num_rows))
-        policy = row[np.arange(host.num_states), np.asarray(solution.policy)]
-        return reshape_solution(
-            game_model, replace(solution, policy=jnp.asarray(policy, jnp.int32))
-        )
-    game, reward = form, expected_reward(form, reward)
-    if not is_deterministic(game):
-        raise ValueError(
-            "mean_payoff is for deterministic games, and some move of this one has several "
-            "successors; use minimax_value with a discount near 1, or remove chance."
-        )
-    graph, scale = _graph(form, reward)
-    policy, gain, num_steps, done = _mean_iteration(graph, max_steps)
-    exact = [Fraction(int(p), int(q) * scale) for p, q in zip(*gain, strict=True)]
-    value, lower, upper = _as_floats(exact, np.dtype(game.dtype))
-    shape = game.state_shape
-    if not done:
-        lower, upper = np.full_like(value, -np.inf), np.full_like(value, np.inf)
-    return Solution(
-        value=jnp.asarray(value.reshape(shape)),
-        policy=jnp.asarray(policy.reshape(shape), jnp.int32),
-        lower=jnp.asarray(lower.reshape(shape)),
-        upper=jnp.asarray(upper.reshape(shape)),
-        residual=jnp.zeros((), game.dtype),
-        num_steps=jnp.int32(num_steps),
-        status=status_code(jnp.bool_(done), jnp.bool_(True)),
+def _of_one_player(
+    model: Model,
+    sparse: SparseMDP,
+    rewards: tuple[Array, Array],
+    objective: str,
+    policy: Array | None,
+    goal: Goal,
+) -> Enclosure:
+    """The average of an MDP, or of the chain of a policy."""
+    host, ends, sign, depth = sparse.host, goal.ends, 1 if objective == "max" else -1, 0
+    if policy is not None:
+        chain = induced_chain(model, sparse, policy)
+        rewards = chain.mean(rewards[0], host.row_start), chain.mean(rewards[1], host.row_start)
+        host, depth = chain.mdp, chain.depth
+        if chain.depth:  # means of equal rewards may differ by their rounding
+            ends = ends._replace(is_exact=(False, False))
+    earned = sign * rewards[0]
+    enclosure = average(
+        host,
+        earned,
+        rewards[1],
+        tolerance=goal.tolerance,
+        max_steps=goal.max_steps,
+        scale=Scale(sign, depth),
     )
+    enclosure = within_range(host, earned, enclosure, ends if sign > 0 else ends.negated)
+    if sign > 0:
+        return enclosure
+    low, high = -enclosure.upper, -enclosure.lower
+    return replace(enclosure, value=-enclosure.value, lower=low, upper=high)
 
 
-class _Graph(NamedTuple):
-    """A deterministic game over flat states, with integer rewards."""
-
-    successor: Integers  # int[S, A]
-    weight: Integers  # int64[S, A], or Python's integers where these are too small
-    available: Booleans
-    system: Booleans
-
-
-class _Biases(NamedTuple):
-    """``T(v + t g) = v + (t + 1) g`` for large t, exactly."""
-
-    # g is ``numerator / denominator`` in lowest terms, `rank` orders the gains, and `bias` is the
-    # denominator times v.
-
-    numerator: Integers
-    denominator: Integers
-    rank: Integers
-    bias: Integers
-
-
-def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
-    """The game's graph with its rewards times a common denominator, which is returned."""
-    columns = [np.asarray(_only_successor(game, a)) for a in range(game.num_actions)]
-    available = np.asarray(game.available).reshape(-1, game.num_actions)
-    values = np.where(available, np.asarray(reward, float).reshape(available.shape), 0)
-    if not np.isfinite(values).all():
-        s, a = np.argwhere(~np.isfinite(values))[0]
-        raise ValueError(f"the reward of state {s}, action {a} is {values[s, a]}; make it finite.")
-    distinct, place = np.unique(values, return_inverse=True)
-    exact = [Fraction(x) for x in distinct.tolist()]
-    scale = max(x.denominator for x in exact)  # powers of two
-    whole = [int(x * scale) for x in exact]
-    # A bias is a sum over a path, times a denominator; sums of slack are longer by a factor S.
-    small = 2 * len(values) ** 2 * max(map(abs, whole)) < _most_bias(len(values))
-    weight = np.array(whole, np.int64 if small else object)[place.reshape(values.shape)]
-    system = np.asarray(game.system).ravel()
-    return _Graph(np.stack(columns, -1), weight, available, system), scale
+def _game(
+    model: Model,
+    sparse: SparseMDP,
+    sets: UncertainMDP | None,
+    rewards: Rewards,
+    directions: tuple[str, str | None],
+    policy: Array | None,
+) -> tuple[AverageGame, Array]:
+    """The game of a model, under a policy of the system, and the original row of each row."""
+    host, (objective, nature) = sparse.host, directions
+    is_system = np.ones(sparse.num_states, bool)
+    if isinstance(model, Game):
+        is_system, model = np.asarray(model.system, bool).ravel(), model.mdp
+    game = AverageGame(
+        UncertainMDP(host, host.probability, host.probability) if sets is None else sets,
+        transition_reward(sparse, rewards),
+        is_system == (objective == "max"),
+        None if nature is None else nature == "max",
+    )
+    if policy is None:
+        return game, np.arange(sparse.num_rows)
+    weight = _weights(model, sparse, sets is not None, np.asarray(policy), is_system)
+    if np.isin(weight[is_system[host.state]], (0, 1)).all():
+        small, row, _ = game.restricted(~is_system[host.state] | (weight > 0))
+        return small, row
+    weight = weight / np.where(is_system, host.over_choices(np.add, weight), 1)[host.state]
+    return game.with_half_steps(is_system, weight)
 
 
-@jit()
-def _only_successor(game: Game, action: int) -> jax.Array:
-    chain = induced_chain(game, jnp.full(game.state_shape, action, jnp.int32))
-    slot = chain.successor_probability[:, 0].argmax(-1)
-    if hasattr(chain, "successor"):
-        return jnp.take_along_axis(chain.successor[:, 0], slot[:, None], axis=-1)[:, 0]
-    return slot
+def _weights(
+    model: Model, sparse: SparseMDP, has_sets: bool, policy: Array, where: Booleans
+) -> Array:
+    """A policy as checked weights of rows, ``float64[R]``."""
+    if has_sets or is_sparse(model):
+        flat = policy.ravel() if is_deterministic(policy) else policy
+        return row_weights(sparse, flat, where)
+    num_actions = cast(ActionModel, model).num_actions
+    actions = (*model.state_shape, num_actions)
+    if is_deterministic(policy) and policy.shape == actions[:-1]:
+        policy = np.eye(num_actions)[policy]
+    if policy.shape != actions:
+        raise ValueError(
+            f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
+            f"or {actions} of their probabilities."
+        )
+    flat = policy.reshape(sparse.num_states, -1).astype(np.float64)
+    weight = flat[sparse.host.state, np.asarray(sparse.action)]
+    require_weights(sparse.host, weight, row_tolerance(np.float64), where)
+    return weight
 
 
-def _most_bias(num_states: int) -> int:
-    """The largest bias with which no sum can leave the range of int64."""
-    return 2**61 // (8 * num_states)
-
-
-def _mean_iteration(
-    graph: _Graph, max_steps: int
-) -> tuple[Integers, tuple[Integers, Integers], int, bool]:
-    """Optimal strategies of both players, the gains, the steps, and whether they are optimal."""
-    states = np.arange(len(graph.system))
-    policy = graph.available.argmax(-1)
-    zero = np.zeros(len(states), graph.weight.dtype)
-    old = inner = _Biases(zero, zero + 1, np.zeros(len(states), int), zero)
-    for n in range(1, max_steps + 1):
-        inner = _evaluate(graph.successor[states, policy], graph.weight[states, policy], inner)
-        if np.abs(inner.bias).max() > _most_bias(len(states)):
-            graph = graph._replace(weight=graph.weight.astype(object))
-        answer = _improve(graph, inner, policy, ~graph.system)
-        if (answer != policy).any():
-            policy = answer
-            continue
-        inner = old = _taken_over(graph, policy, inner, old)
-        # Other biases can make other answers the best ones.
-        policy = _improve(graph, inner, policy, ~graph.system)
-        better = _improve(graph, inner, policy, graph.system)
-        if (better == policy).all():
-            return policy, (inner.numerator, inner.denominator), n, True
-        policy = better
-    return policy, (inner.numerator, inner.denominator), max_steps, False
-
-
-def _evaluate(successor: Integers, weight: Integers, old: _Biases) -> _Biases:
-    """Gains and biases of fixed choices, for which all paths end in cycles, by step doubling."""
-    # On each cycle the bias of its first state is the old one where the gain is, and else zero.
-    states = np.arange(len(successor))
-    doublings = len(states).bit_length()
-    first, ahead = states, successor
-    for _ in range(doublings):
-        first, ahead = np.minimum(first, first[ahead]), ahead[ahead]
-    root = first[ahead]
-    at_root = root == states
-    ahead = np.where(at_root, states, successor)
-    paid, length = np.where(at_root, 0, weight), np.where(at_root, 0, 1)
-    for _ in range(doublings):
-        paid, length, ahead = paid + paid[ahead], length + length[ahead], ahead[ahead]
-    total = (weight + paid[successor])[root]
-    size = (1 + length[successor])[root]
-    if weight.dtype == object:
-        length, size = length.astype(object), size.astype(object)
-    common = np.gcd(total, size)
-    numerator, denominator = total // common, size // common
-    same = (numerator == old.numerator[root]) & (denominator == old.denominator[root])
-    start = np.where(same, old.bias[root], 0)
-    bias = denominator * paid - numerator * length + start
-    return _Biases(numerator, denominator, _ranks(numerator, denominator), bias)
-
-
-def _ranks(numerator: Integers, denominator: Integers) -> Integers:
-    pairs = list(zip(numerator.tolist(), denominator.tolist(), strict=True))
-    order = sorted(set(pairs), key=lambda pair: Fraction(*pair))
-    number = {pair: i for i, pair in enumerate(order)}
-    return np.array([number[pair] for pair in pairs])
-
-
-def _images(graph: _Graph, v: _Biases) -> Integers:
-    """Denominator times ``r - g + v(t)`` for each move to t, with the gain g of t."""
-    t = graph.successor
-    return v.denominator[t] * graph.weight - v.numerator[t] + v.bias[t]
-
-
-def _improve(graph: _Graph, v: _Biases, policy: Integers, chooser: Booleans) -> Integers:
-    """The choosers' best moves, by gain and then by bias; changed only if strictly better."""
-    states = np.arange(len(policy))
-    sign = np.where(graph.system, 1, -1)[:, None]
-    rank = np.where(graph.available, sign * v.rank[graph.successor], -len(states) - 1)
-    best = rank.max(-1, keepdims=True)
-    image = sign * _images(graph, v)
-    level = rank == best
-    image = np.where(level, image, image.min() - 1)
-    action = image.argmax(-1)
-    better = (best[:, 0] > rank[states, policy]) | (image[states, action] > image[states, policy])
-    return np.where(chooser & better, action, policy)
-
-
-def _taken_over(graph: _Graph, policy: Integers, v: _Biases, old: _Biases) -> _Biases:
-    """Biases of the environment's best answer that agree with old ones where these fit."""
-    # They fit if no gain has changed. Then, on cycles of moves without slack, the bias is the old
-    # one; elsewhere it exceeds v by the least sum of slack and excess on the way to such states.
-    changed = (v.numerator != old.numerator) | (v.denominator != old.denominator)
-    if changed.any():
-        return v
-    states = np.arange(len(policy))
-    own = graph.available & ~graph.system[:, None]
-    own[states, policy] = True
-    own &= v.rank[graph.successor] == v.rank[:, None]
-    slack = _images(graph, v) - v.bias[:, None]
-    critical = _on_cycles(graph.successor, own & (slack == 0))
-    lift = np.where(critical, old.bias - v.bias, 0)
-    ceiling = np.abs(lift).max() + np.where(own, slack, 0).max() * len(states) + 1
-    lift = np.where(critical, lift, ceiling)
-    slack = np.where(own, slack, 2 * ceiling)
-    while True:
-        least = np.minimum(lift, (slack + lift[graph.successor]).min(-1))
-        if (least == lift).all():
-            return v._replace(bias=v.bias + lift)
-        lift = least
-
-
-def _on_cycles(successor: Integers, used: Booleans) -> Booleans:
-    """States on a cycle of used moves."""
-    from scipy import sparse  # a tenth of a second that only host graphs need
-
-    source = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
-    target = successor[used]
-    edges = sparse.coo_array((np.ones(len(source), bool), (source, target)), 2 * (len(used),))
-    count, part = sparse.csgraph.connected_components(edges, connection="strong")
-    large: Booleans = np.bincount(part, minlength=count)[part] > 1
-    large[source[source == target]] = True
-    return large
-
-
-def _as_floats(exact: list[Fraction], dtype: np.dtype[np.floating]) -> tuple[Floats, ...]:
-    """The nearest floats, and floats that enclose the exact numbers."""
-    value = np.array([float(x) for x in exact]).astype(dtype)
-    lower, upper = value.copy(), value.copy()
-    for i, x in enumerate(exact):
-        if Fraction(float(value[i])) != x:
-            lower[i] = np.nextafter(value[i], dtype.type(-np.inf))
-            upper[i] = np.nextafter(value[i], dtype.type(np.inf))
-    return value, lower, upper
+def _original(values: RobustValues, row: Array, num_states: int) -> Enclosure:
+    """Values and rows of the original states."""
+    value, lower, upper = (x[:num_states] for x in (values.value, values.lower, values.upper))
+    rows = row[values.row[:num_states]]
+    return Enclosure(value, lower, upper, rows, values.rounds, values.residual, values.method)

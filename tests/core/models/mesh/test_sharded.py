@@ -17,7 +17,7 @@ from jaxltl.core.models.mesh.shard import ModelPart, from_mesh, model_from_parts
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.core.values.average.average_reward import mean_payoff
+from jaxltl.core.values.average.mean_payoff import mean_payoff
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.prepared.prepared import prepare
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions

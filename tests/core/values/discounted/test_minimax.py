@@ -13,7 +13,7 @@ from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models import to_dense
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.values.average.average_reward import mean_payoff
+from jaxltl.core.values.average.mean_payoff import mean_payoff
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from tests import reference
 from tests import reference_game_value as brute
