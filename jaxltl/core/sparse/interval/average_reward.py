@@ -117,7 +117,7 @@ class AverageGame:
         return game, np.append(row[begins], row)
 
 
-class Goal(NamedTuple):
+class AverageGoal(NamedTuple):
     """The range of the rewards, the width of bounds, and the effort."""
 
     ends: RewardRange
@@ -140,7 +140,7 @@ class Goal(NamedTuple):
         return self.tolerance * _SHARE * (_MIXED_FLOOR if self.is_mixed else 1)
 
 
-def optimal_average(game: AverageGame, goal: Goal) -> RobustValues:
+def optimal_average(game: AverageGame, goal: AverageGoal) -> RobustValues:
     """Long-run average reward per step under optimal play of both players, with certified bounds."""
     best: RobustValues | None = None
     scale, ends = goal.floor * float(game.magnitude.max()), goal.ends
@@ -183,7 +183,7 @@ def _discounted_strategies(game: AverageGame, discount: float) -> tuple[Integers
     return encoded.policy(values.row, values.probability), p, values.rounds
 
 
-def _bound(game: AverageGame, row: Integers, p: Floats, side: int, goal: Goal) -> Floats:
+def _bound(game: AverageGame, row: Integers, p: Floats, side: int, goal: AverageGoal) -> Floats:
     """Upper bound of the game by fixing the minimiser (side 1), or lower bound (-1)."""
     mdp = game.model.mdp
     free = game.maximizes == (side > 0)
@@ -216,7 +216,7 @@ def _bound(game: AverageGame, row: Integers, p: Floats, side: int, goal: Goal) -
 # --- the optimum of a player and nature together ------------------------------------------------------
 
 
-def _joint_upper_bound(model: UncertainMDP, reward: Floats, goal: Goal) -> Floats:
+def _joint_upper_bound(model: UncertainMDP, reward: Floats, goal: AverageGoal) -> Floats:
     """Upper bound of the average that the choices and nature attain together, ``float64[S]``."""
     # A larger set for nature: sums of ends that are one up to rounding are read as one.
     model = model if model.enlarged is None else model.enlarged

@@ -16,7 +16,7 @@ from jaxltl.core.models.ops.operators import is_deterministic, require_weights, 
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, reward_structure
-from jaxltl.core.sparse.interval.average_reward import AverageGame, Goal, optimal_average
+from jaxltl.core.sparse.interval.average_reward import AverageGame, AverageGoal, optimal_average
 from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 
@@ -103,7 +103,7 @@ def average_reward(
         sparse = to_sparse(lazy)
         rewards = reward_structure(sparse, row_reward(lazy, sparse, reward))
     earned, magnitude = finite_reward(sparse, rewards)
-    goal = Goal(_range(rewards), tolerance, max_steps)
+    goal = AverageGoal(_range(rewards), tolerance, max_steps)
     if sets is None and not isinstance(model, Game):
         enclosure = _of_one_player(model, sparse, (earned, magnitude), objective, policy, goal)
     else:
@@ -149,7 +149,7 @@ def _of_one_player(
     rewards: tuple[Array, Array],
     objective: str,
     policy: Array | None,
-    goal: Goal,
+    goal: AverageGoal,
 ) -> Enclosure:
     """The average of an MDP, or of the chain of a policy."""
     host, ends, sign, depth = sparse.host, goal.ends, 1 if objective == "max" else -1, 0

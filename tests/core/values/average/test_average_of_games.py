@@ -8,7 +8,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards
-from jaxltl.core.sparse.interval.average_reward import AverageGame, Goal, optimal_average
+from jaxltl.core.sparse.interval.average_reward import AverageGame, AverageGoal, optimal_average
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.solvers.average_reward import RewardRange
 from jaxltl.core.types import Status
@@ -257,7 +257,7 @@ def test_the_engine_takes_nature_of_either_player():
         one, two = (
             optimal_average(
                 AverageGame(host, sign * paid, owner == (sign > 0), sign > 0),
-                Goal(ends, 1e-6, 10_000),
+                AverageGoal(ends, 1e-6, 10_000),
             )
             for sign in (1, -1)
         )
