@@ -1,8 +1,8 @@
 """Solvers of the host inside ``jit`` and ``vmap``, by a callback.
 
-A compiled solver of a small model takes seconds to compile and a millisecond to run; a solver of the
-host needs no compilation and takes a few milliseconds. Hence a callback is faster in loops of up to
-about a thousand solves, and it answers each question that the host answers. The callback runs
+Of a product with 60 states, the first call of a compiled solver takes about 8 s of CPU time and a later
+one 1.4 ms; a callback takes 0.06 s and 8 ms, which is less for up to about a thousand solves. It also
+answers questions that have no compiled solver. The callback runs
 NumPy and SciPy only: a JAX operation inside it would wait for the program that waits for it.
 """
 
