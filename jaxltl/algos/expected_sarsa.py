@@ -71,7 +71,7 @@ class State(RunState):
     position: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Of a step: the `value` at the initial states by the table, the largest absolute
     temporal-difference error `residual`, and a `status`, NONFINITE or COMPLETED."""

@@ -324,7 +324,7 @@ class State(RunState):
     optimizer: optax.OptState
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of the point before a step; scalars, of a run ``[T]``.
 

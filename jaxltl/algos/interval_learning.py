@@ -222,7 +222,7 @@ class State(RunState):
     residual: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures after a step; scalars, of a run ``[T]``.
 

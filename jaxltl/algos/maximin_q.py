@@ -284,7 +284,7 @@ class State(RunState):
     pending_reward: Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures after a step; scalars, of a run ``[T]``.
 

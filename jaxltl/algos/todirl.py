@@ -252,7 +252,7 @@ class State(RunState):
     stopped: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 

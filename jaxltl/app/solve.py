@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
-from jaxltl.core.pretty_print import is_vacuous
 from jaxltl.core.models import Game, IntervalMDP, SparseMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.sparse.mdp import HostMDP
@@ -304,6 +304,20 @@ def _number(x: object) -> Any:
     if isinstance(x, float) and not np.isfinite(x):
         return None if np.isnan(x) else "inf" if x > 0 else "-inf"
     return x + 0.0 if isinstance(x, float) else x  # no negative zero; JSON has no infinity
+
+
+def is_vacuous(lower: Floats, upper: Floats) -> Booleans:
+    """Marks bounds that exclude no probability, or no reward on one side.
+
+    >>> is_vacuous(np.array([0, 0, 2, np.inf]), np.array([1, 0.5, np.inf, np.inf])).tolist()
+    [True, False, True, False]
+    """
+    low, high = np.asarray(lower, float), np.asarray(upper, float)
+    infinite = np.isinf(low) | np.isinf(high)
+    marked: Booleans = (
+        ((low <= 0) & (high == 1)) | (infinite & (low != high)) | np.isnan(low) | np.isnan(high)
+    )
+    return marked
 
 
 def text(result: PropertyResult) -> str:

@@ -11,21 +11,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial, wraps
+from functools import wraps
 from types import MappingProxyType
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 from flax.struct import field
 
-from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.status import Status
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.suggestions import unknown_keyword
 
-__all__ = ["Static", "dataclass", "field", "metrics", "register"]
+__all__ = ["Static", "dataclass", "field", "register"]
 
 ClassT = TypeVar("ClassT")
-_CODES = {"status": Status}
 
 
 class _TextField:
@@ -86,18 +84,12 @@ def dataclass(cls: type[ClassT], **options: Any) -> type[ClassT]:
 
     Fields made by ``field(pytree_node=False)`` are static: part of the structure, compared by value.
     """
-    result: Any = brief(codes=_CODES)(dataclasses.dataclass(frozen=True, **options)(cls))
+    result: Any = brief(dataclasses.dataclass(frozen=True, **options)(cls))
     result.replace = _replace
     result.__init__ = _suggesting(result.__init__, result)
     static = [f.name for f in dataclasses.fields(result) if not f.metadata.get("pytree_node", True)]
     arrays = [f.name for f in dataclasses.fields(result) if f.name not in static]
     return register(result, arrays, static)
-
-
-@dataclass_transform(frozen_default=True, field_specifiers=(field, dataclasses.field))
-def metrics(cls: type[ClassT]) -> type[ClassT]:
-    """Decorator: a :func:`dataclass` of a learner's metrics, whose ``repr`` shows the last row."""
-    return brief(facts=partial(history, codes=_CODES))(dataclass(cls))
 
 
 def _suggesting(init: Callable[..., None], cls: type) -> Callable[..., None]:

@@ -11,16 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
 
-from jaxltl.core.pretty_print import (
-    bounds_text,
-    array_text,
-    brief,
-    enum_counts,
-    is_array,
-    batch_text,
-    value_range,
-    describe,
-)
+from jaxltl.core.pretty_print import brief, describe
 from jaxltl.core.status import Status as Status
 from jaxltl.core.validation import RANGES, shorten
 
@@ -61,23 +52,7 @@ class NotConverged(RuntimeError):
     """
 
 
-def _facts(solution: Any) -> tuple[str, ...]:
-    more = solution.status.shape
-    counts = enum_counts(solution.status, Status)
-    steps = value_range(solution.num_steps)
-    return (
-        f"{batch_text(more)}: {counts}" if more else counts,
-        f"value {describe(solution.value)}",
-        bounds_text(solution.lower, solution.upper),
-        "1 step" if steps == "1" else f"{steps} steps",
-        f"residual {value_range(solution.residual)}",
-        f"by {solution.method}" if solution.method else "",
-        f"policy {array_text(solution.policy)}" if is_array(solution.policy) else "",
-        f"nature {array_text(solution.nature)}" if is_array(solution.nature) else "",
-    )
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class Solution:
     """The solution of a solver, with its evidence.

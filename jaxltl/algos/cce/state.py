@@ -335,7 +335,7 @@ class State(RunState):
     status: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of a step; scalars unless a shape is given.
 

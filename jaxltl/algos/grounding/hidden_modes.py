@@ -101,7 +101,7 @@ class Hparams:
     optimizer: str = static(optimizers.NAMES, default="adam")
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 

@@ -78,7 +78,7 @@ class State(RunState):
     optimizer: PyTree
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of the parameters before a step; scalars, of a run ``[T]``.
 

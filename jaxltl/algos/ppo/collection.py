@@ -132,7 +132,7 @@ class State(RunState):
     transitions: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of a step; scalars. Those of episodes are of the policy before it.
 

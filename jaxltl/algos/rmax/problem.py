@@ -283,7 +283,7 @@ class State(RunState):
     fault: jax.Array
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures after a step; scalars, of a run ``[T]``.
 

@@ -111,7 +111,7 @@ __all__ = [
 ]
 
 
-@struct.metrics
+@struct.dataclass
 class Metrics:
     """Figures of a step; scalars; means over finite trajectories of the policy before the step.
 

@@ -5,7 +5,7 @@ An automaton reads one letter per step; a letter is the set of the propositions 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.core.pretty_print import brief, truncate, batch_text, propositions_text, readable
+from jaxltl.core.pretty_print import brief
 
 
 class Condition(NamedTuple):
@@ -37,18 +37,7 @@ ACCEPTANCES = tuple(CONDITIONS)
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 
 
-def _facts(automaton: Automaton) -> Iterator[str]:
-    *more, count, width = automaton.delta.shape
-    yield automaton.acceptance
-    yield batch_text(more)
-    batch = f"{count} states, {width} letters {propositions_text(automaton.propositions)}"
-    yield batch if more else extent_text(automaton)
-    start = readable(automaton.initial)
-    if automaton.state_names and start is not None and not start.ndim:
-        yield f"for {truncate(automaton.state_names[int(start)])}"
-
-
-@brief(facts=_facts, drawn=True)
+@brief(fields=("acceptance", "delta", "propositions", "state_names"), drawn=True)
 @dataclass(frozen=True, eq=False)
 class Automaton:
     """A complete deterministic automaton; see `make_automaton` for checked construction.
@@ -99,11 +88,6 @@ class Automaton:
     def is_safety(self) -> bool:
         """True if words are accepted by never leaving the final states."""
         return self.acceptance == "safety"
-
-    @property
-    def is_buchi(self) -> bool:
-        """True if words are accepted by taking accepting transitions infinitely often."""
-        return self.acceptance == "buchi"
 
     @property
     def is_parity(self) -> bool:

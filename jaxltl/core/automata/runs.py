@@ -23,6 +23,7 @@ from jaxltl.core.automata.products import (
 )
 from jaxltl.core.automata.table import ParityTable
 from jaxltl.core.logic.ltl import Letter
+from jaxltl.core.pretty_print import CODES
 
 Lasso = tuple[list[frozenset[str]], list[frozenset[str]]]
 
@@ -155,6 +156,9 @@ class Verdict(enum.IntEnum):
     UNDECIDED = 0
     SATISFIED = 1  # every continuation is accepted
     VIOLATED = 2  # none is
+
+
+CODES["verdict"] = Verdict
 
 
 def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:

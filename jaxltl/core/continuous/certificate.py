@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypedDict, Unpack
 
@@ -177,15 +177,7 @@ _BYTES = 400  # of memory for a cell and action, about
 PAIRS = 2**24  # of cells and actions on one grid
 
 
-def _facts(certificate: Certificate) -> Iterator[str]:
-    lower, upper = certificate.bounds_text()
-    yield f"{certificate.formula}"
-    yield f"initial states: {lower} to {upper}"
-    yield f"{certificate.grid.num_cells:,} cells"
-    yield certificate.status.name
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True, eq=False)
 class Certificate:
     """Bounds of the probability that a formula holds from each cell, under one policy.

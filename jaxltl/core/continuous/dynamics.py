@@ -30,7 +30,7 @@ from jaxltl.core.environments.environment import (
     make_environment,
     traced,
 )
-from jaxltl.core.pretty_print import brief, count, propositions_text
+from jaxltl.core.pretty_print import brief
 
 Floats = NDArray[np.float64]
 Bounds = tuple[Floats, Floats]
@@ -39,20 +39,7 @@ Step = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 OUTSIDE = ("violates", "clip")
 
 
-def _facts(dynamics: Dynamics) -> list[str]:
-    actions = count(dynamics.num_actions, "action coordinate")
-    if isinstance(dynamics.actions, np.ndarray):
-        actions = count(len(dynamics.actions), "action")
-    return [
-        count(dynamics.num_states, "state coordinate"),
-        actions,
-        count(dynamics.num_noise, "noise coordinate"),
-        propositions_text(dynamics.propositions),
-        f"outside={dynamics.outside!r}",
-    ]
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """Stochastic dynamics in a box; :func:`make_dynamics` builds checked ones.

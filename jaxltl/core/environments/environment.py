@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import struct, validation
 from jaxltl.core.models.protocols import Array, Key, Numeric, PyTree
-from jaxltl.core.pretty_print import brief, count, nested_repr, propositions_text, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
 ENDINGS = ("repeat", "violated", "undecided", "rejected")
@@ -48,15 +48,7 @@ class Finite:
     num: int = struct.field(pytree_node=False)
 
 
-def _space_facts(value: Box) -> tuple[str, ...]:
-    low, high = (value_range(x) for x in (value.low, value.high))
-    return (
-        f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]",
-        f"from {low} to {high}" if max(len(low), len(high)) < 40 else "",
-    )
-
-
-@brief(facts=_space_facts)
+@brief
 @struct.dataclass
 class Box:
     """A space of arrays between two bounds; :func:`make_box` builds a checked one.
@@ -171,27 +163,7 @@ class Timestep(NamedTuple):
     discount: Numeric = 1.0
 
 
-def _spaces(tree: PyTree) -> str:
-    if hasattr(tree, "low"):
-        return nested_repr(tree)
-    if not isinstance(tree, dict):
-        tree = dict(zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True))
-    return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in tree.items())})"
-
-
-def _facts(value: Environment) -> tuple[str, ...]:
-    one = value.actions
-    return (
-        count(one.num, "action") if isinstance(one, Finite) else f"actions {nested_repr(one)}",
-        f"observations {_spaces(value.observations)}",
-        propositions_text(value.propositions),
-        f"at most {count(value.horizon, 'step')}" if value.horizon is not None else "",
-        "actions are masked" if value.allowed is not None else "",
-        "outcomes are declared" if value.outcomes is not None else "",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class Environment:
     """A simulated environment; :func:`make_environment` builds a checked one.

@@ -23,7 +23,7 @@ from jaxltl.core.environments.environment import (
     require_environment,
     require_key,
 )
-from jaxltl.core.pretty_print import array_text, batch_text, brief, count, readable, value_range
+from jaxltl.core.pretty_print import brief
 
 
 def require_agent(agent: object) -> Agent:
@@ -84,23 +84,7 @@ def _without_memory(
     return function(observation, key), memory
 
 
-def _facts(value: Episode) -> tuple[str, ...]:
-    *more, steps = value.valid.shape
-    first = batch_text(more), f"at most {count(steps, 'step')}"
-    read, reward, cost = (readable(x) for x in (value.valid, value.reward, value.cost))
-    if read is None:
-        return (*first, f"reward {array_text(value.reward)}")
-    return (
-        *first,
-        f"made {value_range(read.sum(-1))}",
-        f"reward {value_range(reward.sum(-1))}" if reward is not None else "",
-        f"cost {value_range(cost.sum(-1))}" if cost is not None and cost.any() else "",
-        f"terminated {value_range(value.terminated)}",
-        f"truncated {value_range(value.truncated)}",
-    )
-
-
-@brief(facts=_facts)
+@brief
 class Episode(NamedTuple):
     """A trajectory of T steps; a batch has leading axes.
 

@@ -26,20 +26,10 @@ from jaxltl.core.automata.runs import (
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.protocols import Array
-from jaxltl.core.pretty_print import batch_text, brief, count, enum_counts
+from jaxltl.core.pretty_print import brief
 
 
-def _facts(value: Monitor) -> tuple[str, ...]:
-    *more, states, letters = value.delta.shape
-    return (
-        batch_text(more),
-        count(states, "state"),
-        count(letters, "letter"),
-        enum_counts(value.verdict, Verdict),
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class Monitor:
     """A runtime monitor: an automaton with a verdict in each state.

@@ -66,7 +66,7 @@ class SequenceSampler:
     sets: Array
 
 
-@brief(codes={"verdict": Verdict})
+@brief
 class SequenceWorld(NamedTuple):
     """A state with its sequence, the number of completed steps, and the verdict."""
 

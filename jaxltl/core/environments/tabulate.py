@@ -26,7 +26,7 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.environments.episodes import without_time_limit
 from jaxltl.core.models.protocols import Array, Key, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief, count, nested_repr, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 _BATCH = 1024  # states of a batch, at most
@@ -35,18 +35,7 @@ _LIVE, _TERMINATED, _TRUNCATED = range(3)
 _EVIDENCE = ("keyless", "declared", "keys", "distinct")  # from the strongest to the weakest
 
 
-def _facts(value: TabulatedEnvironment) -> tuple[str, ...]:
-    return (
-        nested_repr(value.model, 92),
-        count(value.start.shape[-1], "beginning"),
-        f"terminated {value_range(value.terminated)}",
-        f"truncated {value_range(value.truncated)}",
-        f"at most {count(value.num_steps, 'step')}" if value.num_steps is not None else "",
-        f"evidence {value.evidence!r}",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class TabulatedEnvironment:
     """A tabulated environment; see :func:`tabulate`.

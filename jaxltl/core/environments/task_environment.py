@@ -44,7 +44,7 @@ from jaxltl.core.pretty_print import brief
 _Tree = TypeVar("_Tree")
 
 
-@brief(codes={"verdict": Verdict})
+@brief
 class TaskWorld(NamedTuple):
     """A state of the product of an environment and a task.
 

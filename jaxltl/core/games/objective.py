@@ -5,7 +5,7 @@ Sets of states are Boolean arrays, or Boolean formulas over the propositions of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TypeAlias, cast
 
 import chex
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxltl.core import struct
 
-from jaxltl.core.pretty_print import brief, count, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
@@ -23,14 +23,7 @@ from jaxltl.core.models.protocols import Array, LabelledModel, Model, base_model
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 
 
-def _parity_facts(value: Parity) -> Iterator[str]:
-    yield f"priorities below {value.num_priorities}"
-    yield count(value.priority.size, "state")
-    for name in ("won", "lost"):
-        yield f"{name} {value_range(getattr(value, name))}"
-
-
-@brief(facts=_parity_facts)
+@brief
 @struct.dataclass
 class Parity:
     """Parity objective: the least priority met infinitely often is even.
@@ -53,14 +46,7 @@ class Parity:
     num_priorities: int = struct.field(pytree_node=False)
 
 
-def _gr1_facts(value: GR1) -> Iterator[str]:
-    yield count(value.assumptions.shape[-2], "assumption")
-    yield count(value.guarantees.shape[-2], "guarantee")
-    yield count(value.lost.shape[-1], "state")
-    yield f"lost {value_range(value.lost)}"
-
-
-@brief(facts=_gr1_facts)
+@brief
 @struct.dataclass
 class GR1:
     """Generalised reactivity of rank one (Piterman, Pnueli and Sa'ar 2006).
@@ -273,29 +259,6 @@ def _parity(
         lost=to_jax(~safe & ~won),
         num_priorities=num_priorities,
     )
-
-
-def generalized_buchi(game: Model, sets: Sequence[States], *, safe: States = "true") -> GR1:
-    """Generalised Buchi objective: meet each of several sets infinitely often, and ``G safe``.
-
-    Args:
-      game: the game.
-      sets: of states, each ``bool[S]`` or a Boolean formula over propositions.
-      safe: states never to leave.
-
-    Returns:
-      :class:`GR1` with one assumption that always holds.
-
-    Raises:
-      ValueError: see :func:`states_with_label`.
-
-    Example:
-      >>> import jaxltl as jl
-      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> jl.winning_region(path, generalized_buchi(path, ["a", "b"])).region.tolist()
-      [True, True, True]
-    """
-    return gr1(game, (), sets, safe=safe)
 
 
 def gr1(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from jaxltl.core import struct
 
 from jaxltl.core.array_types import Booleans
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.pretty_print import array_text, brief, count, describe, nested_repr, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.games.generalized_reactivity import NEVER, gr1_layers, solve_gr1
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import objective_at, on_states, solve_parity
@@ -33,18 +33,7 @@ from jaxltl.core.sparse.rows import first_action
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
 
-def _facts(value: Permissive) -> Iterator[str]:
-    region = readable(value.region)
-    if region is None:
-        yield f"region {array_text(value.region)}"
-    else:
-        yield f"wins from {np.count_nonzero(region):,} of {count(region.size, 'state')}"
-    yield f"allowed {describe(value.allowed)}"
-    yield value.reason
-    yield nested_repr(value.game, 92)
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class Permissive:
     """A permissive strategy: its allowed moves, on the game with its memory.

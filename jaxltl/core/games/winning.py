@@ -7,7 +7,7 @@ both win surely. Regions are computed on supports, exactly, as fixed points of a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple, TypeAlias, cast
 
 import jax
@@ -16,7 +16,7 @@ from jaxltl.core import struct
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.pretty_print import array_text, brief, count, nested_repr, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.games.generalized_reactivity import solve_gr1
 from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
@@ -33,25 +33,7 @@ from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 
-def _facts(value: Winning) -> Iterator[str]:
-    region = readable(value.region)
-    if region is None:
-        yield f"region {array_text(value.region)}"
-    else:
-        wins = int(np.count_nonzero(region))
-        yield f"the system wins from {wins:,} of {count(region.size, 'state')}"
-        yield f"the environment from {region.size - wins:,}"
-    initial = readable(value.game.initial)
-    if region is not None and initial is not None and initial.shape == region.shape:
-        yield "realizable" if (region | (initial <= 0)).all() else "not realizable"
-    memories = value.action.shape[len(value.region.shape) :]
-    if memories:
-        yield f"strategies with {memories[0]} and {value.counter_action.shape[-1]} memories"
-    yield nested_repr(value.objective, 92)
-    yield nested_repr(value.game, 92)
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class Winning:
     """Winning regions of both players, and a winning strategy of each.

@@ -26,7 +26,7 @@ from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
 
 
-@brief(facts=lambda self: [self.text])
+@brief(fields=("text",))
 @dataclass(frozen=True)
 class Comparison:
     """A Boolean expression over variables, such as a comparison.
@@ -95,7 +95,7 @@ RationalNames = tuple[dict[str, Expression], dict[str, Value]]
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
 
 
-@brief(facts=lambda self: [f"{len(self.known)} names"])
+@brief
 @dataclass(frozen=True)
 class Definitions:
     """Names that properties may use, other than labels of the model.

@@ -29,7 +29,7 @@ FILTERS = {
 MAX_UNFOLDED_STEPS = 100  # of a step bound inside a formula, which is unfolded into nested X
 
 
-@brief(facts=lambda self: [self.text])
+@brief(fields=("text",))
 @dataclass(frozen=True)
 class Property:
     """A question about a model: a number, or whether a number meets a threshold.

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxltl.core import struct, validation
 
-from jaxltl.core.pretty_print import array_text, brief, count, nested_repr, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
@@ -29,17 +29,7 @@ from jaxltl.core.models.protocols import (
 from jaxltl.core.models.sparse import SparseMDP
 
 
-def _facts(value: Game) -> tuple[str, ...]:
-    read = readable(value.system)
-    return (
-        f"system: {array_text(value.system)}"
-        if read is None
-        else f"the system moves in {np.count_nonzero(read):,} of {count(read.size, 'state')}",
-        nested_repr(value.mdp, 92),
-    )
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class Game(Generic[Arena]):
     """Turn-based stochastic game of the system against the environment; see :func:`make_game`.

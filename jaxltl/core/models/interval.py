@@ -12,8 +12,7 @@ import numpy as np
 from jaxltl.core import struct, validation
 from jaxltl.core.validation import first_true
 
-from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import brief, number, readable, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
@@ -36,18 +35,7 @@ _ENDS = ("lower", "upper", "center", "radius")
 _PREFIX = "\0"  # of the names of rewards that are ends, centers or radii
 
 
-def _facts(model: IntervalMDP) -> tuple[str, ...]:
-    low, high = readable(model.lower), readable(model.upper)
-    return (
-        *facts.sparse(model.nominal),
-        f"intervals at most {number(float((high - low).max()))} wide"
-        if low is not None and high is not None and low.size
-        else "",
-        f"radius {value_range(model.radius)}" if model.radius is not None else "",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class IntervalMDP:
     """Labelled MDP with uncertain transition probabilities: intervals, and optional L1 balls.

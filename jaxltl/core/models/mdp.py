@@ -14,15 +14,7 @@ from jaxltl.core import struct, validation
 from jaxltl.core.validation import first_true
 from numpy.typing import DTypeLike
 
-from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import (
-    array_text,
-    batch_text,
-    brief,
-    count,
-    propositions_text,
-    readable,
-)
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model
@@ -47,23 +39,7 @@ class _PaddedShape:
         return (self.num_states,)
 
 
-def _facts(model: MDP | DenseMDP) -> tuple[str, ...]:
-    weights = model.probability if isinstance(model, MDP) else model.transition
-    weight, available = readable(weights), readable(model.available)
-    return (
-        batch_text(model.available.shape[:-2]),
-        count(model.num_states, "state"),
-        count(model.num_actions, "action"),
-        array_text(weights)
-        if weight is None or available is None
-        else count(np.count_nonzero((weight > 0) & available[..., None]), "transition"),
-        propositions_text(model.propositions),
-        facts.initial_states(model.initial),
-        str(weights.dtype) if weight is not None else "",
-    )
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class MDP(_PaddedShape):
     """Labelled Markov decision process with padded successor lists; :func:`make_mdp` builds one.
@@ -109,7 +85,7 @@ class MDP(_PaddedShape):
         return self.probability.dtype
 
 
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class DenseMDP(_PaddedShape):
     """Labelled Markov decision process with a full matrix, for small batched problems.

@@ -18,7 +18,7 @@ from jaxltl.core import struct, validation
 from jaxltl.core.models.ops.array_namespace import is_traced, jit
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief, names_text, nested_repr
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import first_true
 
 
@@ -222,15 +222,7 @@ Ends = Array  # for all parameters, for each name, or float[D]
 _TRIALS = 64  # candidate points for a valid model
 
 
-def _facts(model: ParametricMDP) -> tuple[str, ...]:
-    ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
-    return (
-        names_text((f"{name} in [{low:.6g}, {high:.6g}]" for name, low, high in ends), 90),
-        nested_repr(model.model, 92),
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class ParametricMDP:
     """Markov chain or MDP with probabilities that depend on parameters in a box, with a constant graph.

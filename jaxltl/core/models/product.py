@@ -20,7 +20,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index, named_propos
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.pretty_print import batch_text, brief, count, describe, nested_repr
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import jax_array, namespace, to_jax
@@ -35,19 +35,7 @@ struct.register(
 )
 
 
-def _facts(model: Product) -> tuple[str, ...]:
-    memories = count(model.num_memory, "memory", "memories")
-    return (
-        batch_text(model.automaton.delta.shape[:-2]),
-        f"{count(model.num_states, 'state')} with {memories}",
-        nested_repr(model.mdp, 92),
-        f"beside {nested_repr(model.automaton, 92)}",
-        f"labels read on {model.label_on}",
-        f"allowed: {describe(model.allowed)}" if model.allowed is not None else "",
-    )
-
-
-@brief(facts=_facts, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class Product(Generic[World]):
     """Product of a model and an automaton that tracks the progress of a task.

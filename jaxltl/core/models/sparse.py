@@ -17,7 +17,6 @@ from numpy.typing import DTypeLike
 
 from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.logic.comparisons import Comparison
-from jaxltl.core.models import facts
 from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
@@ -75,7 +74,7 @@ def _taken(x: Array | None, index: Array) -> Array | None:
 Reward: TypeAlias = str | Rewards | Array | None
 
 
-@brief(facts=facts.sparse, drawn=True)
+@brief(drawn=True)
 @struct.dataclass
 class SparseMDP:
     """Labelled Markov decision process in compressed sparse rows; :func:`make_sparse` builds one.

@@ -15,7 +15,7 @@ import numpy as np
 from jaxltl.core import struct, validation
 from jaxltl.core.validation import first_true
 
-from jaxltl.core.pretty_print import batch_text, brief, count, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
@@ -31,17 +31,7 @@ struct.register(
 )
 
 
-def _facts(value: Trajectories) -> tuple[str, ...]:
-    *more, number_of, longest = value.state.shape
-    return (
-        batch_text(more),
-        f"{number_of:,} of at most {count(longest, 'step')}",
-        f"lengths {value_range(value.length)}",
-        f"states {value.state_shape}" if value.state_shape is not None else "",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class Trajectories:
     """N sequences of state-action pairs, padded with zeros to length T.

@@ -11,35 +11,12 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array
 from jaxltl.core.automata.runs import Verdict
-from jaxltl.core.pretty_print import brief, count, number
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.binomial import anytime, bounded_mean, clopper_pearson
 from jaxltl.core.status import Status
 
 
-def _evaluation_facts(value: Evaluation) -> tuple[str, ...]:
-    estimates = {name: getattr(value, name) for name in ("success", "reward", "cost", "length")}
-    decision = {True: "met", False: "not met", None: "open"}[value.decision]
-    return (
-        value.status.name,
-        count(value.num_episodes, "episode"),
-        *(
-            f"{name} {number(x.mean)} in [{x.lower:.6g}, {x.upper:.6g}]"
-            for name, x in estimates.items()
-            if x is not None and (name != "cost" or x.mean)
-        ),
-        f"confidence {value.confidence:g}",
-        f"threshold {value.threshold:g} {decision}" if value.threshold is not None else "",
-    )
-
-
-def _estimate_facts(value: Estimate) -> tuple[str, ...]:
-    return (
-        f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]",
-        value.method,
-    )
-
-
-@brief(codes={"verdict": Verdict})
+@brief
 class EpisodeTotals(NamedTuple):
     """Totals of one episode, or of many with a leading axis.
 
@@ -68,7 +45,7 @@ class EpisodeTotals(NamedTuple):
     discounted_visits: Array | None
 
 
-@brief(facts=_estimate_facts)
+@brief
 @dataclass(frozen=True)
 class Estimate:
     """A frequency or a mean with its confidence interval.
@@ -91,7 +68,7 @@ class Estimate:
     method: str
 
 
-@brief(facts=_evaluation_facts)
+@brief
 @dataclass(frozen=True)
 class Evaluation:
     """Result of :func:`evaluate`; printed as a table.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array, PyTree
 from jaxltl.core.automata.automaton import Automaton, letter_index
-from jaxltl.core.pretty_print import array_text, batch_text, brief, count
+from jaxltl.core.pretty_print import brief
 
 Key = Array | np.random.Generator | None
 Label = Collection[str] | Array  # the propositions that hold, or the number of a letter
@@ -34,20 +34,7 @@ class Progress(NamedTuple):
     step: Array
 
 
-def _facts(value: FiniteMemoryPolicy) -> tuple[str, ...]:
-    *more, states, memories = value.next_memory.shape
-    return (
-        batch_text(more),
-        count(states, "state"),
-        count(memories, "memory", "memories"),
-        f"mixes {count(value.num_actions, 'action')}" if value.is_random else "deterministic",
-        f"over {count(len(value.action), 'step')}" if value.has_horizon else "",
-        f"action {array_text(value.action)}",
-        f"labels read on {value.label_on}",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True, eq=False)
 class FiniteMemoryPolicy:
     """A policy of a model with the state of an automaton as its memory.

@@ -7,7 +7,7 @@ its samples. A union bound makes all of them hold together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.pretty_print import brief, count, readable, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.binomial import (
     Ends,
     anytime,
@@ -38,18 +38,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _LIMIT = 2**53  # throws of a row, up to which doubles count
 
 
-def _facts(sets: ConfidenceSets) -> Iterator[str]:
-    yield count(sets.num_samples.size, "row")
-    samples, low, high = (readable(x) for x in (sets.num_samples, sets.lower, sets.upper))
-    yield count(samples.sum(), "sample") if samples is not None else ""
-    yield f"{sets.method}, confidence {sets.confidence:g} shared by {sets.num_claims:,}"
-    yield (
-        f"intervals {value_range(high - low)} wide" if low is not None and high is not None else ""
-    )
-    yield f"radius {value_range(sets.radius)}" if sets.radius is not None else ""
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True)
 class ConfidenceSets:
     """Confidence sets of all rows, simultaneously valid with probability `confidence`.

@@ -15,7 +15,7 @@ from jaxltl.core.statistics.confidence_sets import LeastProbability, require_gra
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
-from jaxltl.core.pretty_print import brief, count, names_text, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 
@@ -28,17 +28,7 @@ _ANY = "any"  # the only action of an unvisited state
 Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
 
 
-def _facts(value: TransitionCounts) -> tuple[str, ...]:
-    samples = readable(value.count)
-    return (
-        count(samples.sum(), "sample") if samples is not None else "",
-        f"of {count(len(value.count), 'transition')}",
-        f"{count(len(value.states), 'state')}: {names_text(value.states)}",
-        f"{count(len(value.actions), 'action')}: {names_text(value.actions)}",
-    )
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True)
 class TransitionCounts:
     """Counts of observed transitions, each once and in lexicographic order.

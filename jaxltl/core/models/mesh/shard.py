@@ -12,7 +12,6 @@ from jax.sharding import Mesh
 from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
-from jaxltl.core.models import facts
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
@@ -27,7 +26,7 @@ from jaxltl.core.models.sparse import (
     refuse_underflow,
     sparse_part,
 )
-from jaxltl.core.pretty_print import brief, count
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
@@ -35,17 +34,7 @@ _PADDED = 1.25  # size of a single table of all rows, relative to the transition
 _HALO = 0.6  # fraction of the other devices' values from which on all of them are sent
 
 
-def _part_facts(value: ModelPart) -> tuple[str, ...]:
-    rows = len(value.entry_start) - 1
-    return (
-        count(rows if value.row_start is None else len(value.row_start) - 1, "state"),
-        count(rows, "choice"),
-        count(len(value.successor), "transition"),
-        *facts.named_annotations(value),
-    )
-
-
-@brief(facts=_part_facts)
+@brief
 @dataclass(frozen=True)
 class ModelPart:
     """A range of states of a model, with their choices.

@@ -16,13 +16,12 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core import struct, validation
-from jaxltl.core.models import facts
 from jaxltl.core.models.mesh.lanes import automatic, axes_of
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Array, Model, PyTree
-from jaxltl.core.pretty_print import brief, count, propositions_text, truncate
+from jaxltl.core.pretty_print import brief
 
 
 class StateLayout(NamedTuple):
@@ -136,20 +135,7 @@ class ShardedRowTable(NamedTuple):
         self.successor[place], self.probability[place] = successor, probability
 
 
-def _facts(model: ShardedMDP) -> tuple[str, ...]:
-    rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
-    return (
-        count(model.num_unpadded, "state"),
-        count(model.num_actions, "action"),
-        f"rows {truncate(rows)}",
-        propositions_text(model.propositions),
-        *facts.named_annotations(model),
-        f"on {count(model.mesh.shape[model.axis], 'device')} along {model.axis!r}",
-        str(model.dtype),
-    )
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class ShardedMDP:
     """Labelled MDP distributed over the devices of a mesh axis; see :func:`~jaxltl.models.shard`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.counts import TransitionCounts, align_counts
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief, count, nested_repr, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
 from jaxltl.core.types import require_shape
 from jaxltl.core import validation
@@ -31,17 +31,7 @@ from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 
-def _facts(value: DataGuarantee) -> Iterator[str]:
-    yield f"at {'least' if value.bound <= value.optimistic else 'most'} {value.bound:.6g}"
-    yield f"no policy beyond {value.optimistic:.6g}"
-    yield f"confidence {value.confidence:g}"
-    samples = readable(value.sets.num_samples)
-    yield count(samples.sum(), "sample") if samples is not None else ""
-    yield nested_repr(value.model, 92)
-    yield nested_repr(value.satisfaction.automaton, 92)
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True)
 class DataGuarantee:
     """A policy for a task, and bounds on its satisfaction probability with a confidence.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -24,7 +24,7 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Array, PyTree
-from jaxltl.core.pretty_print import brief, count, number, readable
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.sparse.solvers import step_bounded as host
@@ -41,20 +41,7 @@ _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at onc
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
 
 
-def _facts(value: OptimalityGap) -> Iterator[str]:
-    yield count(len(value.start), "beginning")
-    for name, ends in (
-        ("gap", value.mean),
-        ("value", value.mean_value),
-        ("optimum", value.mean_optimum),
-    ):
-        yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
-    upper = readable(value.upper)
-    yield f"gap at most {number(upper.max(initial=0.0))}" if upper is not None else ""
-    yield f"evidence {value.evidence!r}"
-
-
-@brief(facts=_facts)
+@brief
 class OptimalityGap(NamedTuple):
     """Result of :func:`optimality_gap`, for each of the N initial states.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxltl.core.automata.table import explore
 from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief, describe
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
@@ -24,15 +24,7 @@ from jaxltl.core.values.engine.state_quantities import nonnegative_reward, state
 _LIMIT = 8  # probabilities at once, of which all sets are looked at
 
 
-def _facts(value: Objective) -> Iterator[str]:
-    for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
-        field = getattr(value, name)
-        if field is not None:
-            yield f"{name}={describe(field)}"
-    yield f"direction={value.direction!r}"
-
-
-@brief(facts=_facts)
+@brief
 @dataclass(frozen=True, eq=False)
 class Objective:
     """One of several objectives: a probability or an expected reward.

@@ -17,7 +17,7 @@ from jaxltl.core.models.refusals import of_one_player
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, refuse_underflow
-from jaxltl.core.pretty_print import array_text, brief, count
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
@@ -28,20 +28,7 @@ from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval
 
 
-def _facts(value: Prepared) -> list[str]:
-    return [
-        value.question,
-        value.objective,
-        count(value.num_states, "state"),
-        count(value.num_rows, "choice"),
-        count(value.entry_row.shape[-1], "transition"),
-        "circles" if value.cyclic else "no circles",
-        count(value.levels, "level"),
-        array_text(value.probability),
-    ]
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class Prepared:
     """Preprocessed question about a model, for solves with other numbers.

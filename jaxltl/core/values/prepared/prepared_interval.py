@@ -16,7 +16,7 @@ from jax import lax
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
-from jaxltl.core.pretty_print import array_text, brief, count
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.prepared.interval_plan import (
@@ -46,18 +46,7 @@ from jaxltl.core.values.engine.state_quantities import state_mask
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
 
-def _facts(value: PreparedInterval) -> list[str]:
-    return [
-        value.question,
-        value.objective,
-        count(value.num_states, "state"),
-        count(value.num_rows, "choice"),
-        count(value.entry_row.shape[-1], "transition"),
-        array_text(value.lower),
-    ]
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class PreparedInterval:
     """Preprocessed question about an interval model, see :class:`Prepared`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import bounds_text, brief, count, is_vacuous, truncate, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
@@ -50,21 +50,7 @@ class PropertyStrategy(NamedTuple):
 PropertyStrategy.row = deferred_field(0, "Chosen rows.")  # type: ignore[assignment]
 
 
-def _facts(value: Answer) -> Iterator[str]:
-    yield value.status.name
-    yield count(len(value.states), "state")
-    unknown = is_vacuous(value.lower, value.upper)
-    if unknown.all():
-        yield f"value between {value_range(value.lower)} and {value_range(value.upper)}"
-    else:
-        yield f"value {value_range(np.where(unknown, np.nan, value.value))}"
-        yield bounds_text(value.lower, value.upper)
-    if value.holds is not None:
-        yield f"holds {truncate(str(value.holds))}"
-    yield f"by {value.method}"
-
-
-@brief(facts=_facts)
+@brief
 class Answer(NamedTuple):
     """The result of a property.
 

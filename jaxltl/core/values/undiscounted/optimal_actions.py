@@ -7,7 +7,6 @@ rest. docs/optimal-actions.md has the proofs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import jax
@@ -21,7 +20,7 @@ from jaxltl.core.graphs.attractor import max_sets, min_sets
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.pretty_print import brief, describe, enum_counts, value_range
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.certificates import rounding_unit
@@ -48,14 +47,7 @@ from jaxltl.core.values.engine.validated import validated
 Booleans = NDArray[np.bool_]
 
 
-def _facts(value: OptimalActions) -> Iterator[str]:
-    yield enum_counts(value.status, Status)
-    yield f"allowed {describe(value.allowed)}"
-    yield f"loses at most {value_range(value.loss)}"
-    yield f"best {describe(value.best.value)}"
-
-
-@brief(facts=_facts)
+@brief
 @struct.dataclass
 class OptimalActions:
     """A mask of optimal actions of a product.

@@ -50,7 +50,7 @@ _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
 
 
-@brief(codes={"status": Status})
+@brief
 @struct.dataclass
 class Performance:
     """Satisfaction probabilities of a policy; fields have a leading axis under ``vmap``.

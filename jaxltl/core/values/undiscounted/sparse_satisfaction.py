@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief, count, nested_repr
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.accepting import AcceptingRegion, accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
@@ -37,13 +36,7 @@ from jaxltl.core.values.engine.host_solution import (
 )
 
 
-def _facts(value: Satisfaction) -> Iterator[str]:
-    yield nested_repr(value.solution, 92)
-    yield nested_repr(value.automaton, 92)
-    yield f"{count(len(value.product.base_state), 'state')} of the product"
-
-
-@brief(facts=_facts)
+@brief
 class Satisfaction(NamedTuple):
     """Optimal satisfaction probability, with a finite-memory policy.
 
