@@ -1,9 +1,4 @@
-from .colored_world import (
-    load_world as load_world,
-    read_world as read_world,
-    save_world as save_world,
-    write_world as write_world,
-)
+from .colored_world import read_world as read_world, write_world as write_world
 from .drn.drn import read_drn as read_drn, write_drn as write_drn
 from .hoa.hoa import (
     read_hoa as read_hoa,

@@ -1,27 +1,19 @@
 """Text files of coloured gridworlds: one letter per cell, and the kinds of cells.
 
 Example:
-  >>> import tempfile
-  >>> from jaxltl.io.colored_world import load_world, read_world, save_world, write_world
+  >>> from jaxltl.io.colored_world import read_world, write_world
   >>> world = read_world("rbrp\\nbrbp\\nrbry")
   >>> world.shape, world.mdp.label[:, 0].tolist(), read_world(write_world(world)).shape
   ((1, 2), [True, False], (1, 2))
-  >>> path = tempfile.mkdtemp() + "/world.txt"
-  >>> save_world(path, world)
-  >>> load_world(path).shape
-  (1, 2)
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.files import atomic_write
 from jaxltl.envs.cell_kinds import COLORS, OBJECTS, OBSTACLES
 from jaxltl.envs.temporal_gridworld import World, colored_world
 
@@ -120,37 +112,3 @@ def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
                 "have the same length."
             )
     return np.array([[LETTERS.index(letter) for letter in row] for row in rows], np.int32)
-
-
-def save_world(path: str | os.PathLike[str], world: World) -> None:
-    """Writes a coloured gridworld to a text file, atomically.
-
-    Args:
-      path: the file.
-      world: the world.
-
-    Raises:
-      ValueError: the file cannot be written.
-    """
-    with atomic_write(path) as file:
-        file.write(write_world(world).encode())
-
-
-def load_world(path: str | os.PathLike[str]) -> World:
-    """Reads a coloured gridworld from a text file, see :func:`read_world`.
-
-    Args:
-      path: the file.
-
-    Returns:
-      A :class:`~jaxltl.envs.temporal_gridworld.World`.
-
-    Raises:
-      ValueError: the file cannot be read or is malformed.
-    """
-    try:
-        return read_world(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error

@@ -13,7 +13,7 @@ from jaxltl.app.files.task import kind_of
 from jaxltl.app.files.task_todirl import TodirlFile
 from jaxltl.app.reports.learn_todirl import report as report_todirl
 from jaxltl.envs import temporal_gridworld
-from jaxltl.io.colored_world import save_world, write_world
+from jaxltl.io.colored_world import write_world
 from jaxltl.io.learned_reward import load_reward, plan_in
 from tests.support import replaced
 from tests.test_cli import failure, interrupt_soon, run
@@ -122,8 +122,8 @@ def write(tmp_path):
 
 
 def write_files(place):
-    save_world(place / "world.txt", WORLD)
-    save_world(place / "other.txt", OTHER)
+    (place / "world.txt").write_text(write_world(WORLD))
+    (place / "other.txt").write_text(write_world(OTHER))
     for name, text in MAPS.items():
         (place / name).write_text(text)
     for name, shown in SHOWN.items():

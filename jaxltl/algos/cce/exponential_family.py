@@ -82,9 +82,6 @@ class Gamma:
     rate: jax.Array
 
 
-Family = DiagonalGaussian | FullGaussian | Gamma
-
-
 def diagonal_gaussian(mean: Array, std: Array | float) -> DiagonalGaussian:
     """A :class:`DiagonalGaussian` of a `mean` ``float[D]`` and positive `std`, ``float[D]`` or a number.
 

@@ -3,7 +3,6 @@ from .objective import (
     Parity as Parity,
     buchi as buchi,
     cobuchi as cobuchi,
-    generalized_buchi as generalized_buchi,
     gr1 as gr1,
     parity as parity,
     reach as reach,

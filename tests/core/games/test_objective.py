@@ -9,7 +9,6 @@ import jaxltl as jl
 from jaxltl.core.games.objective import (
     buchi,
     cobuchi,
-    generalized_buchi,
     gr1,
     parity,
     reach,
@@ -86,7 +85,7 @@ def test_wrong_sets(condition, message):
         (lambda x: buchi(game(), x), "accepting"),
         (lambda x: cobuchi(game(), x), "persistent"),
         (lambda x: parity(game(), [0, 1, 2], safe=x), "safe"),
-        (lambda x: generalized_buchi(game(), ["a", x]), r"guarantees\[1\]"),
+        (lambda x: gr1(game(), (), ["a", x]), r"guarantees\[1\]"),
         (lambda x: gr1(game(), [x], ["a"]), r"assumptions\[0\]"),
         (lambda x: gr1(game(), [], ["a"], safe=x), "safe"),
     ],
@@ -163,7 +162,7 @@ def test_gr1_and_generalized_buchi():
     assert found.assumptions.tolist() == [[False, False, True]]
     assert found.guarantees.tolist() == [[False, True, True], [True, False, False]]
     assert found.lost.tolist() == [False, False, True]
-    found = generalized_buchi(game(), ["a", "b"], safe="a")
+    found = gr1(game(), (), ["a", "b"], safe="a")
     assert found.assumptions.tolist() == [[True] * 3], "no assumption is one that always holds"
     assert found.guarantees.shape == (2, 3)
     assert found.lost.tolist() == [True, False, False]
@@ -180,7 +179,7 @@ def test_a_string_is_not_a_list_of_sets():
     with pytest.raises(ValueError, match="guarantees is 'a & b'; give a list"):
         gr1(game(), [], "a & b")
     with pytest.raises(ValueError, match="guarantees is 'b'; give a list"):
-        generalized_buchi(game(), jl.parse_ltl("b"))
+        gr1(game(), (), jl.parse_ltl("b"))
 
 
 def test_objectives_on_a_product_have_its_shape():

@@ -10,7 +10,6 @@ from jaxltl.core.games.objective import (
     GR1,
     Parity,
     buchi,
-    generalized_buchi,
     gr1,
     parity,
     reach,
@@ -240,7 +239,7 @@ def test_both_claims_can_fail_at_once():
 def test_reasons_with_memory():
     """Two goals: the system moves between the states 0 and 1, or stays in either."""
     game = deterministic([[0, 1], [0, 1]], [SYSTEM, SYSTEM])
-    both = generalized_buchi(game, [np.array([True, False]), np.array([False, True])])
+    both = gr1(game, (), [np.array([True, False]), np.array([False, True])])
     right = claim(game, both, [1, 1], [[0, 1], [0, 1]], [[0], [0]])
     assert verify(right)
     right.action = np.array([[0, 0], [0, 1]])
@@ -333,7 +332,7 @@ def test_wrong_shapes_and_objectives():
         verify(claim(game, objective, np.ones((2, 4)), np.zeros(4, int)))
     with pytest.raises(ValueError, match=r"action has shape \(4, 1\); expected \(4,\)"):
         verify(claim(game, objective, np.ones(4), np.zeros((4, 1), int)))
-    one = generalized_buchi(game, [np.ones(4, bool)])
+    one = gr1(game, (), [np.ones(4, bool)])
     with pytest.raises(ValueError, match=r"action has shape \(4,\); expected \(4, 1\)"):
         verify(claim(game, one, np.ones(4), np.zeros(4, int)))
     with pytest.raises(ValueError, match="objective is a str; give a Parity or a GR1"):

@@ -12,7 +12,6 @@ import jaxltl as jl
 from jaxltl.core.games.objective import (
     buchi,
     cobuchi,
-    generalized_buchi,
     gr1,
     parity,
     reach,
@@ -61,7 +60,7 @@ OBJECTIVES = {
         game, x["priority"], safe=x["safe"], num_priorities=NUM_PRIORITIES
     ),
     "gr1": lambda game, x: gr1(game, list(x["assumptions"]), list(x["guarantees"]), safe=x["safe"]),
-    "generalized": lambda game, x: generalized_buchi(game, list(x["guarantees"]), safe=x["safe"]),
+    "generalized": lambda game, x: gr1(game, (), list(x["guarantees"]), safe=x["safe"]),
 }
 
 REFERENCES = {
@@ -288,7 +287,7 @@ def test_memory_is_needed_and_given():
     """A state between two goals is left for each in turn."""
     world = jl.make_mdp(np.array([[1, 2], [0, 0], [0, 0]])[:, :, None], np.ones((3, 2, 1)))
     game = make_game(world, [True] * 3)
-    found = winning_region(game, generalized_buchi(game, [jnp.arange(3) == 1, jnp.arange(3) == 2]))
+    found = winning_region(game, gr1(game, (), [jnp.arange(3) == 1, jnp.arange(3) == 2]))
     assert found.region.all()
     assert found.action[0].tolist() == [0, 1]
     assert verify(found)
@@ -413,7 +412,7 @@ def test_formulas_equal_the_explicit_product(formula):
         ("G F a & G b", lambda g: buchi(g, "a", safe="b")),
         ("F G a & G b", lambda g: cobuchi(g, "a", safe="b")),
         ("b U a", lambda g: reach(g, "a", safe="b")),
-        ("G F a & G F b", lambda g: generalized_buchi(g, ["a", "b"])),
+        ("G F a & G F b", lambda g: gr1(g, (), ["a", "b"])),
         (
             "G !(a & b) & ((G F a & G F !b) -> (G F b & G F !a))",
             lambda g: gr1(g, ["a", "!b"], ["b", "!a"], safe="!(a & b)"),

@@ -22,7 +22,7 @@ NOT_ABOUT_CHOICE = {
     "attractor", "end_components", "lift_policy", "project_policy", "with_allowed", "restrict",
     "expectation", "pushforward", "exists_successor", "forall_successor", "sample_successor",
     "make_trajectories", "rollout", "lift_trajectories", "project_trajectories", "make_counts",
-    "align_counts", "states_with_label", "reach", "safety", "buchi", "cobuchi", "generalized_buchi",
+    "align_counts", "states_with_label", "reach", "safety", "buchi", "cobuchi",
     "gr1", "parity", "shard", "to_mesh", "make_game", "make_parametric", "choice_reward",
     "occurring_letters", "make_interval", "stack_products", "write_model",
     "tabulate_policy", "model_from_parts", "from_mesh", "to_sparse", "to_padded", "apply_strategy",
