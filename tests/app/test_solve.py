@@ -354,4 +354,4 @@ def test_no_number_is_given_where_the_bounds_exclude_nothing(low, high):
     text = module.text(result)
     assert "0.25" not in text and f"in [{low}, {high}]" in text and "PRECISION" in text
     assert module.result_entry(result)["value"] is None
-    assert "0.25" not in repr(answer) and "PRECISION" in repr(answer)
+    assert f"lower=[{low:g}], upper=[{high:g}]" in repr(answer) and "PRECISION" in repr(answer)
