@@ -98,7 +98,7 @@ def things(folder):
     told = {
         "model": sparse,
         "counts": counts,
-        "task": "F a",
+        "formula": "F a",
         "confidence": 0.9,
         "method": "anytime",
         "objective": "max",
@@ -132,7 +132,7 @@ def things(folder):
         ),
         (
             jl.optimal_satisfaction,
-            {"model": model, "task": "F a", "states": [0], "label_on": None},
+            {"model": model, "formula": "F a", "states": [0], "label_on": None},
         ),
         (jl.values.robust_next_probability, asked),
         (jl.values.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
@@ -258,7 +258,7 @@ def things(folder):
             regions.prove_around,
             {"problem": problem, "threshold": 0.3, "point": [0.5], "num_halvings": 3},
         ),
-        (interval_learning.make_problem, {"world": sparse, "task": "F a"}),
+        (interval_learning.make_problem, {"world": sparse, "formula": "F a"}),
     ]
 
 
@@ -403,11 +403,11 @@ def simulated():
         ),
         (
             jl.optimality_gap,
-            {"table": table, "task": "F goal", "policy": np.zeros((3, 2), int), "num_steps": 3},
+            {"table": table, "formula": "F goal", "policy": np.zeros((3, 2), int), "num_steps": 3},
         ),
         (bounded_mean, {"numbers": [0.5], "failure": 0.1, "planned": None}),
         (reach_avoid_sequences, {"automaton": jl.to_automaton("F goal"), **told}),
-        (many_tasks.make_plan, {"task": "F goal", **told}),
+        (many_tasks.make_plan, {"formula": "F goal", **told}),
         (many_tasks.stack_plans, {"plans": [plan]}),
         (
             many_tasks.sequence_agent,
@@ -679,7 +679,7 @@ def test_what_is_of_another_run_is_named():
         (lambda: rollout(key=jax.random.split(key)), "give a single one"),
         (lambda: rollout(state=found), "state is State; give one of trust_region.init"),
         (lambda: rollout(problem=small), "problem is Problem; give one of trust_region.make"),
-        (lambda: traced(rollout, hparams=wide), "parameters are not those of this Network"),
+        (lambda: traced(rollout, hparams=wide), "parameters are not those of this TanhNetwork"),
         (lambda: trust_region.act(trusted, bold, jnp.zeros(3)), r"trained on vectors float\["),
         (
             lambda: cce.step(found, search(3, 1), cce.Hparams()),

@@ -162,7 +162,7 @@ def certify(evidence: CountEvidence, query: CertificateQuery) -> DataGuarantee:
 
 def _options(evidence: CountEvidence, query: CertificateQuery) -> Record:
     return {
-        "task": query.formula,
+        "formula": query.formula,
         "confidence": query.confidence,
         "graph": evidence.graph,
         "method": query.method,

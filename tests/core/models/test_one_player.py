@@ -34,7 +34,7 @@ GIVEN = {
     "policy": np.zeros(3, np.int32), "policies": np.zeros(3, np.int32),
     "reward": np.ones((3, 2)), "discount": 0.9, "num_steps": 2, "num_step": 2, "bound": 2.0,
     "value": np.zeros(3), "prop": 'Pmax=? [ F "b" ]', "objectives": [], "solution": None,
-    "counts": None, "task": "F b", "confidence": 0.9, "graph": "given", "sizes": [1],
+    "counts": None, "formula": "F b", "confidence": 0.9, "graph": "given", "sizes": [1],
     "features": np.zeros((3, 2, 1)), "actions": None, "key": None,
 }  # fmt: skip
 

@@ -119,7 +119,7 @@ def calls(kind):
         (jl.multi_objective, {"model": coin(), "objectives": goals}, {"tolerance": 1e-6}),
         (jl.solve_property, {"model": coin(), "prop": 'Pmax=? [F "a"]'}, {"tolerance": 1e-6}),
         (jl.to_automaton, {"formula": "F a"}, {"max_states": 9, "acceptance": "auto"}),
-        (jl.product, {"world": KINDS["padded"](), "task": "F a"}, {"label_on": "entry"}),
+        (jl.product, {"world": KINDS["padded"](), "formula": "F a"}, {"label_on": "entry"}),
     ]
 
 
