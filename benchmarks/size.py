@@ -26,9 +26,8 @@ def functions(tree: ast.AST) -> Iterator[Function]:
 
 
 def num_parameters(function: Function) -> int:
-    """The number of parameters without ``self``, ``cls``, ``*args`` and ``**kwargs``."""
-    arguments = function.args
-    names = [x.arg for x in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
+    """The number of positional parameters without ``self``, ``cls`` and ``*args``."""
+    names = [x.arg for x in (*function.args.posonlyargs, *function.args.args)]
     return len(names) - (names[:1] in (["self"], ["cls"]))
 
 
@@ -102,14 +101,15 @@ def measure(package: Path) -> dict[str, int]:
     texts = sources(package)
     trees = [ast.parse(text) for text in texts.values()]
     parameters = [num_parameters(x) for tree in trees for x in functions(tree)]
+    keywords = [len(x.args.kwonlyargs) for tree in trees for x in functions(tree)]
     return {
         "modules": len(texts),
         "lines": sum(text.count("\n") for text in texts.values()),
         "statements": sum(map(statements, trees)),
         "docstring lines": sum(map(docstring_lines, trees)),
         "functions": len(parameters),
-        "functions with more than 6 parameters": sum(x > 6 for x in parameters),
-        "functions with more than 9 parameters": sum(x > 9 for x in parameters),
+        "functions with more than 6 positional parameters": sum(x > 6 for x in parameters),
+        "functions with more than 12 keyword-only parameters": sum(x > 12 for x in keywords),
         "Any in annotations": sum(map(num_any, trees)),
         "modules of the largest folder": max(modules_per_folder(package).values()),
         "names at the top level": top_level_names(package),
@@ -121,7 +121,7 @@ def main() -> None:
     folders = [Path(x) for x in sys.argv[1:]] or [Path(__file__).parent.parent / "jaxltl"]
     columns = [measure(folder) for folder in folders]
     for name in columns[0]:
-        print(f"{name:40}", *(f"{column[name]:>9,}" for column in columns))
+        print(f"{name:52}", *(f"{column[name]:>9,}" for column in columns))
 
 
 if __name__ == "__main__":
