@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Sequence
-from typing import Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core.array_types import PyTree
 from jaxltl.core.automata.automaton import Automaton, named_propositions
 from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.automata.runs import Verdict
-from jaxltl.core.environments.task_environment import TaskOptions, TaskTables, make_task_tables
+from jaxltl.core.environments.task_environment import TaskTables, make_task_tables
 
 Labels = Callable[[PyTree, PyTree], Collection[str]]
 
@@ -23,7 +23,12 @@ def gymnasium_task(
     labels: Labels,
     *,
     propositions: Sequence[str] | None = None,
-    **options: Unpack[TaskOptions],
+    ending: str = "repeat",
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
 ) -> PyTree:
     """The product of a gymnasium environment and a temporal-logic task, for other learners.
 
@@ -39,7 +44,9 @@ def gymnasium_task(
       formula: a formula, its text, or an automaton.
       labels: ``(observation, info) -> propositions that hold``, a collection of names.
       propositions: the names that `labels` may return; default: those of the formula.
-      options: see :class:`~jaxltl.core.environments.task_environment.TaskOptions`.
+      ending: the verdict of terminal states, see :func:`~jaxltl.task_environment`.
+      reward, discount, ratio, shaping, learner_discount: see
+        :func:`~jaxltl.core.environments.task_reward.make_task_reward`.
 
     Returns:
       The product, a ``gymnasium.Env``.
@@ -56,9 +63,17 @@ def gymnasium_task(
     """
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     names = named_propositions(automaton) if propositions is None else tuple(propositions)
-    if "embedding" in options:
-        raise ValueError("embedding: observations of a gymnasium product are one-hot.")
-    return _wrapper()(env, make_task_tables(automaton, names, **options), labels, names)
+    tables = make_task_tables(
+        automaton,
+        names,
+        ending=ending,
+        reward=reward,
+        discount=discount,
+        ratio=ratio,
+        shaping=shaping,
+        learner_discount=learner_discount,
+    )
+    return _wrapper()(env, tables, labels, names)
 
 
 @functools.cache  # one class, made when gymnasium is first needed

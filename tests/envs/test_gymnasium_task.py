@@ -208,7 +208,7 @@ def test_refusals():
         gymnasium_task(lake(), "F goal", lambda x, info: {"goals"}).reset()
     with pytest.raises(ValueError, match="labels returned 'goal'"):
         gymnasium_task(lake(), "F goal", lambda x, info: "goal").reset()
-    with pytest.raises(ValueError, match="embedding"):
+    with pytest.raises(TypeError, match="embedding"):
         gymnasium_task(lake(), "F goal", places, embedding=np.eye(2))
 
 

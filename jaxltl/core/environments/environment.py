@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypedDict, Unpack, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -201,35 +201,20 @@ class Environment:
     ending: str = struct.field(pytree_node=False, default="repeat")
 
 
-class EnvironmentOptions(TypedDict, total=False):
-    """Optional parts of an environment.
-
-    Attributes:
-      labels, allowed, starts, outcomes: see the module documentation.
-      propositions: the P names.
-      observations: a tree of :class:`Box`; default: unbounded.
-      horizon: an upper bound on the length of episodes.
-      ending: ``"repeat"`` (default), ``"violated"``, ``"undecided"`` or ``"rejected"``, the default of
-        the option of tasks (:class:`~jaxltl.core.environments.task_environment.TaskOptions`).
-    """
-
-    labels: Callable[..., jax.Array] | None
-    propositions: Sequence[str]
-    allowed: Callable[..., jax.Array] | None
-    observations: PyTree
-    horizon: int | None
-    starts: Callable[..., PyTree] | None
-    outcomes: Callable[..., PyTree] | None
-    ending: str
-
-
 def make_environment(
     reset: Callable[..., PyTree],
     step: Callable[..., Timestep],
     observe: Callable[..., PyTree],
     *,
     actions: Finite | Box | int,
-    **options: Unpack[EnvironmentOptions],
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+    allowed: Callable[..., jax.Array] | None = None,
+    observations: PyTree = None,
+    horizon: int | None = None,
+    starts: Callable[..., PyTree] | None = None,
+    outcomes: Callable[..., PyTree] | None = None,
+    ending: str = "repeat",
 ) -> Environment:
     """A checked :class:`Environment`.
 
@@ -237,7 +222,12 @@ def make_environment(
       reset, step, observe: see the module documentation; functions, or ``Partial`` objects with
         arrays. A step may omit the last fields of :class:`Timestep`.
       actions: the action space; a number stands for :class:`Finite`.
-      options: see :class:`EnvironmentOptions`.
+      labels, allowed, starts, outcomes: see the module documentation.
+      propositions: the P names.
+      observations: a tree of :class:`Box`; default: unbounded.
+      horizon: an upper bound on the length of episodes.
+      ending: ``"repeat"``, ``"violated"``, ``"undecided"`` or ``"rejected"``, the default of the
+        argument of tasks (:func:`~jaxltl.core.environments.task_environment.task_environment`).
 
     Returns:
       :class:`Environment`.
@@ -257,9 +247,7 @@ def make_environment(
     >>> corridor.actions.num, corridor.observations.shape
     (2, (1,))
     """
-    validation.keywords("make_environment", options, EnvironmentOptions)
-    names = validation.distinct_names("propositions", options.get("propositions", ()))
-    horizon, observations = options.get("horizon"), options.get("observations")
+    names = validation.distinct_names("propositions", propositions)
     if horizon is not None:
         horizon = validation.integer("horizon", horizon, least=1)
     actions = Finite(int(actions)) if isinstance(actions, int | np.integer) else actions
@@ -270,8 +258,8 @@ def make_environment(
     functions: dict[str, PyTree] = {"reset": reset, "step": step, "observe": observe}
     for name, function in functions.items():
         validation.function(name, function)
-    functions |= {n: options.get(n) for n in ("labels", "allowed", "starts", "outcomes")}
-    if functions["labels"] is None:
+    functions |= {"labels": labels, "allowed": allowed, "starts": starts, "outcomes": outcomes}
+    if labels is None:
         if names:
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
         functions["labels"] = Partial(no_labels)
@@ -284,7 +272,7 @@ def make_environment(
         observations=observations,
         propositions=names,
         horizon=horizon,
-        ending=validation.choice("ending", options.get("ending", "repeat"), ENDINGS),
+        ending=validation.choice("ending", ending, ENDINGS),
     )
     seen = _check_functions(environment)
     if observations is None:

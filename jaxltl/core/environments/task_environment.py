@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, TypeVar, Unpack, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from jaxltl.core.environments.environment import (
     require_environment,
 )
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, make_finite_task, verdicts
-from jaxltl.core.environments.task_reward import RewardOptions, make_task_reward
+from jaxltl.core.environments.task_reward import make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.protocols import Array, Key, PyTree
@@ -131,27 +131,38 @@ struct.register(
 )
 
 
-class TaskOptions(RewardOptions, total=False):
-    """Options of a task; those of the reward as of :class:`RewardOptions`.
-
-    Attributes:
-      ending: the verdict of a terminal state of the environment while the task is undecided:
-        ``"repeat"`` (default): that of the last label repeated for ever, as in an absorbing state;
-        ``"violated"``; ``"undecided"``; or ``"rejected"``: violated, even where the label of the
-        terminal state satisfies the formula. An environment with another `ending` sets the default.
-      embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
-    """
-
-    ending: str
-    embedding: ArrayLike | None
-
-
 def make_task_tables(
-    formula: Formula | str | Automaton, propositions: Sequence[str], **options: Unpack[TaskOptions]
+    formula: Formula | str | Automaton,
+    propositions: Sequence[str],
+    *,
+    ending: str = "repeat",
+    embedding: ArrayLike | None = None,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
 ) -> TaskTables:
-    """The tables of a task."""
-    validation.keywords("make_task_tables", options, TaskOptions)
-    ending, embedding = options.get("ending", "repeat"), options.get("embedding")
+    """The tables of a task.
+
+    Args:
+      formula: a formula, its text, or an automaton.
+      propositions: the P names of the labels.
+      ending: the verdict of a terminal state of the environment while the task is undecided:
+        ``"repeat"``: that of the last label repeated for ever, as in an absorbing state;
+        ``"violated"``; ``"undecided"``; or ``"rejected"``: violated, even where the label of the
+        terminal state satisfies the formula.
+      embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
+      reward, discount, ratio, shaping, learner_discount: see
+        :func:`~jaxltl.core.environments.task_reward.make_task_reward`.
+
+    Returns:
+      :class:`TaskTables`.
+
+    Raises:
+      ValueError: an unknown proposition, an embedding of another shape, or a reward that does not
+        fit the task.
+    """
     validation.choice("ending", ending, ENDINGS)
     propositions = validation.distinct_names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
@@ -160,8 +171,15 @@ def make_task_tables(
     with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
         reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
-    reward_options = {n: x for n, x in options.items() if n not in ("ending", "embedding")}
-    pay = make_task_reward(automaton, decisions, **cast(RewardOptions, reward_options))
+    pay = make_task_reward(
+        automaton,
+        decisions,
+        reward=reward,
+        discount=discount,
+        ratio=ratio,
+        shaping=shaping,
+        learner_discount=learner_discount,
+    )
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
     features = None if embedding is None else validation.float_array("embedding", embedding)
@@ -185,7 +203,7 @@ def make_task_tables(
         discount=pay.discount.astype(number),
         decided=pay.decided.astype(number),
         potential=pay.potential.astype(number),
-        learner_discount=np.asarray(options.get("learner_discount", 1.0), number),
+        learner_discount=np.asarray(learner_discount, number),
         embedding=None if features is None else features.astype(number),
         state_names=automaton.state_names,
     )
@@ -221,7 +239,13 @@ def task_environment(
     *,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] | None = None,
-    **options: Unpack[TaskOptions],
+    ending: str | None = None,
+    embedding: ArrayLike | None = None,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
 ) -> Environment:
     """The product of an environment and a temporal-logic task, as an environment.
 
@@ -234,9 +258,12 @@ def task_environment(
     Args:
       environment: the environment.
       formula: a formula, its text, an automaton over all subsets of its propositions, or the tables
-        of :func:`make_task_tables`, which take no further options.
+        of :func:`make_task_tables`, which exclude the arguments from `ending` on.
       labels, propositions: ``world -> bool[P]`` and its names; default: the environment's.
-      options: see :class:`TaskOptions`.
+      ending: the verdict of terminal states, see :func:`make_task_tables`; default: the environment's.
+      embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
+      reward, discount, ratio, shaping, learner_discount: see
+        :func:`~jaxltl.core.environments.task_reward.make_task_reward`.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
@@ -271,14 +298,24 @@ def task_environment(
         labels=environment.labels if labels is None else labels,
         propositions=names,
     )
+    options: dict[str, Any] = {
+        "ending": ending,
+        "embedding": embedding,
+        "reward": reward,
+        "discount": discount,
+        "ratio": ratio,
+        "shaping": shaping,
+        "learner_discount": learner_discount,
+    }
     if not isinstance(formula, TaskTables):
-        options = {"ending": environment.ending, **options}
+        options["ending"] = environment.ending if ending is None else ending
         tables = make_task_tables(formula, inner.propositions, **options)
         if not isinstance(formula, Automaton):
             _require_open(str(formula), tables.verdict[tables.initial])
-    elif options:
-        raise ValueError(f"{', '.join(options)}: give options to make_task_tables instead.")
     else:
+        defaults = task_environment.__kwdefaults__ or {}
+        if changed := [name for name, x in options.items() if x is not defaults[name]]:
+            raise ValueError(f"{', '.join(changed)}: give this to make_task_tables instead.")
         tables = formula
     names = inner.propositions
     if tables.weight.shape != (len(names),):

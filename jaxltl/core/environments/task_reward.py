@@ -6,7 +6,7 @@ a decided verdict earns a separate reward and ends the episode.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,27 +37,15 @@ class TaskReward(NamedTuple):
     potential: np.ndarray
 
 
-class RewardOptions(TypedDict, total=False):
-    """Options of a task's reward, see :func:`make_task_reward`.
-
-    Attributes:
-      reward: its name; ``"auto"`` (default) takes ``"reach"`` for co-safe tasks, ``"keep"`` for
-        safety, ``"eventual"`` for Buchi and ``"parity"`` for other tasks.
-      discount: g; default: 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else .99.
-      ratio: of ``"two-discount"`` and ``"parity"``; default: 1 - g.
-      shaping: None, ``"distance"``, or a potential ``float[Q]``.
-      learner_discount: the learner's own discount, which shaping takes into account; default: 1.
-    """
-
-    reward: str
-    discount: float | None
-    ratio: float | None
-    shaping: str | ArrayLike | None
-    learner_discount: float
-
-
 def make_task_reward(
-    automaton: Automaton, decisions: np.ndarray, **options: Unpack[RewardOptions]
+    automaton: Automaton,
+    decisions: np.ndarray,
+    *,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
 ) -> TaskReward:
     """The reward of a task, by name.
 
@@ -97,11 +85,22 @@ def make_task_reward(
     verdict for ``"keep"``. A transition is as long as the number of propositions that hold in its
     letter, at least 1.
 
-    `decisions` are the verdicts ``int32[Q]`` of the automaton states.
+    Args:
+      automaton: of the task.
+      decisions: ``int32[Q]``, the verdicts of the automaton states.
+      reward: its name; ``"auto"`` takes ``"reach"`` for co-safe tasks, ``"keep"`` for safety,
+        ``"eventual"`` for Buchi and ``"parity"`` for other tasks.
+      discount: g; default: 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else .99.
+      ratio: of ``"two-discount"`` and ``"parity"``; default: 1 - g.
+      shaping: None, ``"distance"``, or a potential ``float[Q]``.
+      learner_discount: the learner's own discount, which shaping takes into account.
+
+    Returns:
+      :class:`TaskReward`.
+
+    Raises:
+      ValueError: a reward that does not fit the task, or a number out of its range.
     """
-    reward, ratio = options.get("reward", "auto"), options.get("ratio")
-    discount, shaping = options.get("discount"), options.get("shaping")
-    learner_discount = options.get("learner_discount", 1.0)
     reward = validation.choice("reward", reward, REWARDS)
     name = CONDITIONS[automaton.acceptance].reward if reward == "auto" else reward
     _require_fit(automaton, name)
