@@ -34,7 +34,6 @@ from jaxltl.app.job import (
 )
 from jaxltl.core.types import Status
 from jaxltl.core.automata import Automaton, to_automaton
-from jaxltl.core.continuous.certificate import ProofOptions
 from jaxltl.core.continuous import Dynamics, certify_policy, counterexample, state_policy
 from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
@@ -238,9 +237,8 @@ def prove(setup: EnvironmentSetup, agent: Agent, formula: str, say: Report) -> P
     """The certificate of an agent that was learned in dynamics, and a run if it is refuted."""
     assert setup.dynamics is not None
     table = setup.task.proof
-    options: ProofOptions = {**table.specified(), "report": say}  # type: ignore[typeddict-item]
     policy = state_policy(agent, setup.environment)
-    certificate = certify_policy(setup.dynamics, policy, formula, **options)
+    certificate = certify_policy(setup.dynamics, policy, formula, report=say, **table.specified())
     if certificate.initial_bounds[1] >= (table.threshold or 1 - (table.tolerance or 1e-3)):
         return Proof(certificate)
     say("searching a run that violates the formula")

@@ -230,14 +230,19 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class RefinementLimits:
-    """When refinement stops; see :class:`~jaxltl.core.continuous.certificate.ProofOptions`."""
+    """When refinement stops; see :func:`~jaxltl.core.continuous.certificate.certify_policy`."""
 
     tolerance: float = 1e-3
     threshold: float | None = None
     max_cells: int = 2**20
     max_sweeps: int = 1000
     upper: bool = True
-    report: Report = lambda text: None
+    report: Report | None = None
+
+    def log(self, text: str) -> None:
+        """Calls `report` with a line of progress."""
+        if self.report is not None:
+            self.report(text)
 
     def decides(self, lower: Floats, upper: Floats) -> bool:
         """True if bounds of initial states are all above the threshold, or one is below."""
@@ -340,15 +345,15 @@ class Abstraction:
             try:
                 bounds = self._improved(refined)
             except KeyboardInterrupt:
-                limits.report("interrupted: the bounds proven so far are kept")
+                limits.log("interrupted: the bounds proven so far are kept")
                 return bounds
             except TooManyProbabilitiesError as reason:
                 if refined is first:
                     raise
-                limits.report(f"the bounds proven so far are kept: {reason}")
+                limits.log(f"the bounds proven so far are kept: {reason}")
                 return bounds
             lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
-            limits.report(
+            limits.log(
                 f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "
                 f"{lower.min():.6g}, at most {upper.min():.6g}"
             )
@@ -445,7 +450,7 @@ class Abstraction:
         cells = np.flatnonzero(bounds.undecided.any(0) & bounds.needed)
         if not len(cells):
             return replace(bounds, needed=np.zeros(grid.num_cells, bool))
-        limits.report(f"{grid.num_cells:,} cells: images of {len(cells):,} cells")
+        limits.log(f"{grid.num_cells:,} cells: images of {len(cells):,} cells")
         box = noise_box(self.dynamics)
         with self.stage("images"):
             problem = _AbstractionProblem(self, *self._rows(grid, cells, box), box)

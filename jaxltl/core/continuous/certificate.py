@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
 
 import chex
 import jax
@@ -22,6 +21,7 @@ from jaxltl.core.continuous.abstraction import (
     CellBounds,
     ITERATED,
     RefinementLimits,
+    Report,
     SURE,
 )
 from jaxltl.core.continuous.dynamics import Dynamics, Step, to_environment
@@ -251,35 +251,18 @@ class Certificate:
         )
 
 
-class ProofOptions(TypedDict, total=False):
-    """Options of proofs.
-
-    Attributes:
-      cells: number of cells of the first grid along each axis; default: about 20,000 in all, at most
-        1,000 along an axis.
-      tolerance: width of the bounds of initial states at which refinement stops; default 1e-3.
-      threshold: stop as soon as the lower bounds of all initial states reach it, or the upper bound of
-        one of them is below; default None.
-      max_cells: of the finest grid; default 2^20.
-      max_sweeps: of value iteration on one grid; default 1,000.
-      upper: False to skip upper bounds.
-      report: function that is called with lines of progress.
-    """
-
-    cells: Sequence[int]
-    tolerance: float
-    threshold: float | None
-    max_cells: int
-    max_sweeps: int
-    upper: bool
-    report: Callable[[str], None]
-
-
 def certify_policy(
     dynamics: Dynamics,
     policy: Policy,
     formula: str | Formula,
-    **options: Unpack[ProofOptions],
+    *,
+    cells: Sequence[int] | None = None,
+    tolerance: float = 1e-3,
+    threshold: float | None = None,
+    max_cells: int = 2**20,
+    max_sweeps: int = 1000,
+    upper: bool = True,
+    report: Report | None = None,
 ) -> Certificate:
     """Certified bounds of the probability that a policy satisfies a formula, for each cell.
 
@@ -297,7 +280,15 @@ def certify_policy(
         :func:`state_policy` accepts: a flax module with its parameters, or the agent of a learner in
         these dynamics or in the task environment of this formula.
       formula: any LTL formula over the labels.
-      options: see :class:`ProofOptions`.
+      cells: number of cells of the first grid along each axis; default: about 20,000 in all, at most
+        1,000 along an axis.
+      tolerance: width of the bounds of initial states at which refinement stops.
+      threshold: stop as soon as the lower bounds of all initial states reach it, or the upper bound of
+        one of them is below.
+      max_cells: of the finest grid.
+      max_sweeps: of value iteration on one grid.
+      upper: False to skip upper bounds.
+      report: function that is called with lines of progress.
 
     Returns:
       :class:`Certificate`. Bounds hold for real numbers: rounding of this computation is included,
@@ -317,20 +308,25 @@ def certify_policy(
       >>> proof.initial_bounds, proof.status.name
       ((1.0, 1.0), 'CONVERGED')
     """
-    validation.keywords("certify_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     step = closed_loop(dynamics, learned_policy(policy, dynamics, formula))
-    return prove(dynamics, formula, step, np.zeros((1, 1)), options)[0]
+    limits = RefinementLimits(tolerance, threshold, max_cells, max_sweeps, upper, report)
+    return prove(dynamics, formula, step, np.zeros((1, 1)), cells, limits)[0]
 
 
 def prove(
-    dynamics: Dynamics, formula: str | Formula, step: Step, actions: Floats, options: ProofOptions
+    dynamics: Dynamics,
+    formula: str | Formula,
+    step: Step,
+    actions: Floats,
+    cells: Sequence[int] | None,
+    limits: RefinementLimits,
 ) -> tuple[Certificate, Abstraction, CellBounds]:
     """The certificate of a step under the best actions of a grid, and its parts."""
-    limits = _limits(options)
+    limits = _checked(limits)
     validation.instance("formula", formula, (str, Formula), "a formula or its text")
     _require_initial_inside(dynamics)
-    grid = first_grid(dynamics, options.get("cells"), limits.max_cells, len(actions))
+    grid = first_grid(dynamics, cells, limits.max_cells, len(actions))
     limits = replace(limits, max_cells=min(limits.max_cells, PAIRS // len(actions)))
     abstraction = Abstraction(dynamics, formula, step, actions, limits)
     reason = ""
@@ -351,21 +347,18 @@ def prove(
     return certificate, abstraction, bounds
 
 
-def _limits(options: ProofOptions) -> RefinementLimits:
-    """The checked options of a proof, without its first grid."""
-    settings: dict[str, Any] = {name: x for name, x in options.items() if name != "cells"}
-    for name, value in settings.items():
-        if name == "tolerance":
-            validation.require_in_range(name, value)
-        elif name == "threshold" and value is not None:
-            settings[name] = validation.fraction(name, value)
-        elif name in ("max_cells", "max_sweeps"):
-            settings[name] = validation.integer(name, value, least=1)
-        elif name == "upper":
-            settings[name] = validation.boolean(name, value)
-        elif name == "report":
-            validation.function(name, value)
-    return RefinementLimits(**settings)
+def _checked(limits: RefinementLimits) -> RefinementLimits:
+    """The validated limits of a refinement."""
+    validation.require_in_range("tolerance", limits.tolerance)
+    threshold, report = limits.threshold, limits.report
+    return RefinementLimits(
+        limits.tolerance,
+        None if threshold is None else validation.fraction("threshold", threshold),
+        validation.integer("max_cells", limits.max_cells, least=1),
+        validation.integer("max_sweeps", limits.max_sweeps, least=1),
+        validation.boolean("upper", limits.upper),
+        None if report is None else validation.function("report", report),
+    )
 
 
 def _require_initial_inside(dynamics: Dynamics) -> None:

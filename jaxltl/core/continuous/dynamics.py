@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypedDict, Unpack, cast
+from typing import cast
 
 import chex
 import jax
@@ -157,33 +157,16 @@ class Dynamics:
         return first + (last - first) * jax.random.uniform(place, first.shape, first.dtype)
 
 
-class DynamicsOptions(TypedDict, total=False):
-    """Optional parts of dynamics.
-
-    Attributes:
-      noise: a :class:`~jaxltl.core.continuous.noise.Distribution`, or one for each random coordinate.
-      disturbance: ``(low, high)`` of a bounded disturbance, chosen by an adversary.
-      actions: ``(low, high)``, a tuple, for a box of actions; an array ``float[A, m]`` for a grid.
-      outside: ``"violates"`` (default): leaving the domain violates every task that the labels of the run
-        have not satisfied before, whatever their continuation; ``"clip"``: successors are clipped; or
-        the name of a label that holds forever outside, where no other label holds.
-      initial: a :class:`~jaxltl.core.continuous.regions.Region` of boxes, or ``(low, high)``; default:
-        the domain.
-    """
-
-    noise: Distribution | Sequence[Distribution]
-    disturbance: tuple[ArrayLike, ArrayLike] | None
-    actions: ArrayLike | tuple[ArrayLike, ArrayLike] | None
-    outside: str
-    initial: Region | tuple[ArrayLike, ArrayLike] | None
-
-
 def make_dynamics(
     step: Step,
     *,
     domain: tuple[ArrayLike, ArrayLike],
     labels: Mapping[str, Region | tuple[ArrayLike, ArrayLike]],
-    **options: Unpack[DynamicsOptions],
+    noise: Distribution | Sequence[Distribution] = (),
+    disturbance: tuple[ArrayLike, ArrayLike] | None = None,
+    actions: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    outside: str = "violates",
+    initial: Region | tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Dynamics:
     """Checked stochastic dynamics ``x' = step(x, u, w)`` in a box.
 
@@ -193,7 +176,14 @@ def make_dynamics(
       domain: ``(low, high)``, finite.
       labels: by proposition, a :class:`~jaxltl.core.continuous.regions.Region` or ``(low, high)``. A
         box edge at or beyond the domain's edge includes the domain's closed boundary.
-      options: see :class:`DynamicsOptions`.
+      noise: a :class:`~jaxltl.core.continuous.noise.Distribution`, or one for each random coordinate.
+      disturbance: ``(low, high)`` of a bounded disturbance, chosen by an adversary.
+      actions: ``(low, high)``, a tuple, for a box of actions; an array ``float[A, m]`` for a grid.
+      outside: ``"violates"``: leaving the domain violates every task that the labels of the run have
+        not satisfied before, whatever their continuation; ``"clip"``: successors are clipped; or the
+        name of a label that holds forever outside, where no other label holds.
+      initial: a :class:`~jaxltl.core.continuous.regions.Region` of boxes, or ``(low, high)``; default:
+        the domain.
 
     Returns:
       :class:`Dynamics`.
@@ -210,10 +200,9 @@ def make_dynamics(
       >>> task_environment(lake, "F shore").actions.num
       2
     """
-    validation.keywords("make_dynamics", options, DynamicsOptions)
     validation.function("step", step)
     low, high = _bounds("domain", domain)
-    outside = validation.instance("outside", options.get("outside", "violates"), str, "a name")
+    outside = validation.instance("outside", outside, str, "a name")
     if not isinstance(labels, Mapping):
         raise ValueError(f"labels is {validation.shorten(labels)}; give a dictionary of regions.")
     regions = {}
@@ -226,24 +215,18 @@ def make_dynamics(
             if _is_outside(region, low, high):
                 raise ValueError("no state of the domain belongs to it; give a set that meets it.")
         regions[name] = region
-    noise_option = options.get("noise", ())
-    noise = (
-        [noise_option]
-        if isinstance(noise_option, Distribution)
-        else validation.sequence("noise", noise_option)
-    )
-    for i, one in enumerate(noise):
+    noises = [noise] if isinstance(noise, Distribution) else validation.sequence("noise", noise)
+    for i, one in enumerate(noises):
         validation.instance(f"noise[{i}]", one, Distribution, "gaussian(scale) or another one")
-    disturbance, actions = options.get("disturbance"), options.get("actions")
     dynamics = Dynamics(
         step,
         (low, high),
-        tuple(noise),
+        tuple(noises),
         None if disturbance is None else _bounds("disturbance", disturbance),
         _actions(actions),
         regions,
         outside,
-        _initial(options.get("initial"), low, high),
+        _initial(initial, low, high),
     )
     _check_step(dynamics)
     return dynamics

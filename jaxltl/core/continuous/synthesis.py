@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Unpack
 
 import chex
 import jax
@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.array_types import Array, Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.continuous.certificate import Certificate, ProofOptions, prove
+from jaxltl.core.continuous.abstraction import RefinementLimits, Report
+from jaxltl.core.continuous.certificate import Certificate, prove
 from jaxltl.core.continuous.dynamics import Dynamics, make_dynamics, to_environment  # noqa: F401 - of the examples
 from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.environments.environment import Environment, Finite, Timestep, make_environment
@@ -108,7 +109,14 @@ def synthesize_policy(
     dynamics: Dynamics,
     formula: str | Formula,
     actions: ArrayLike | None = None,
-    **options: Unpack[ProofOptions],
+    *,
+    cells: Sequence[int] | None = None,
+    tolerance: float = 1e-3,
+    threshold: float | None = None,
+    max_cells: int = 2**20,
+    max_sweeps: int = 1000,
+    upper: bool = True,
+    report: Report | None = None,
 ) -> CellPolicy:
     """A policy on cells with certified bounds of its satisfaction probability.
 
@@ -120,7 +128,7 @@ def synthesize_policy(
       dynamics: the world, of :func:`make_dynamics`.
       formula: any LTL formula over the labels.
       actions: ``float[A, m]``; default: the grid of the dynamics.
-      options: see :class:`ProofOptions`.
+      cells, tolerance, threshold, max_cells, max_sweeps, upper, report: see :func:`certify_policy`.
 
     Returns:
       :class:`CellPolicy`.
@@ -138,10 +146,10 @@ def synthesize_policy(
       >>> found.certificate.initial_bounds[0] > 0.999
       True
     """
-    validation.keywords("synthesize_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     grid = _actions(dynamics, actions)
-    certificate, abstraction, bounds = prove(dynamics, formula, dynamics.step, grid, options)
+    limits = RefinementLimits(tolerance, threshold, max_cells, max_sweeps, upper, report)
+    certificate, abstraction, bounds = prove(dynamics, formula, dynamics.step, grid, cells, limits)
     task, allowed = bounds.task, abstraction.safe_actions(bounds)
     states = np.array([q for q, _ in task.states])
     table = _memory_table(task)
