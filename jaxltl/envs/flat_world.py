@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,14 +56,6 @@ class Discs:
     extent: Array
 
 
-class _Starts(TypedDict, total=False):
-    """Initial positions of :func:`flat_world`, described there."""
-
-    start: Sequence[float] | None
-    num_starts: int
-    seed: int
-
-
 def flat_world(
     *,
     discs: Sequence[tuple[str, float, float, float]] = DISCS,
@@ -71,7 +63,9 @@ def flat_world(
     time_step: float = 0.08,
     horizon: int | None = 500,
     discrete: bool = False,
-    **starts: Unpack[_Starts],
+    start: Sequence[float] | None = None,
+    num_starts: int = 2**16,
+    seed: int = 0,
 ) -> Environment:
     """FlatWorld as an environment.
 
@@ -83,7 +77,7 @@ def flat_world(
       discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
         rest) instead of a box.
       start: the initial position; default: uniform outside of all discs.
-      num_starts, seed: size (default 2^16) and seed (0) of the table of initial positions.
+      num_starts, seed: size and seed of the table of initial positions.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`.
@@ -96,9 +90,6 @@ def flat_world(
     >>> world.propositions
     ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
     """
-    start, num_starts, seed = validation.options(
-        "flat_world", starts, start=None, num_starts=2**16, seed=0
-    )
     rows = [tuple(validation.sequence("discs", row)) for row in validation.sequence("discs", discs)]
     if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
         raise ValueError(

@@ -8,7 +8,7 @@ symmetries (the published drawing rejects 72 of 73 maps). Letters are drawn in e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,21 +47,6 @@ class LetterState(NamedTuple):
     place: Array
 
 
-class Maps(TypedDict, total=False):
-    """Optional settings of random maps and of observations.
-
-    Attributes:
-      connected: draw maps in which all cells are reachable across empty ones; default: True.
-      num_maps, seed: size (default: 1024, before symmetries) and seed (0) of the table of such maps.
-      flat: whether observations are vectors; default: False.
-    """
-
-    connected: bool
-    num_maps: int
-    seed: int
-    flat: bool
-
-
 def letter_world(
     *,
     size: int = 7,
@@ -70,7 +55,10 @@ def letter_world(
     horizon: int | None = 75,
     layout: str | ArrayLike | None = None,
     start: int | None = None,
-    **maps: Unpack[Maps],
+    connected: bool = True,
+    num_maps: int = 1024,
+    seed: int = 0,
+    flat: bool = False,
 ) -> Environment:
     """LetterWorld with a random map per episode, or with a given map.
 
@@ -85,7 +73,9 @@ def letter_world(
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none.
       start: the initial cell in a given layout; default: any empty one.
-      maps: see :class:`Maps`.
+      connected: draw maps in which all cells are reachable across empty ones.
+      num_maps, seed: size, before symmetries, and seed of the table of such maps.
+      flat: whether observations are vectors.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`.
@@ -98,16 +88,13 @@ def letter_world(
     >>> world.propositions[:3], world.observations.shape, world.horizon
     (('a', 'b', 'c'), (7, 7, 13), 75)
     """
-    validation.keywords("letter_world", maps, Maps)
     names, starts = _names(letters), None
-    connected = validation.boolean("connected", maps.get("connected", True))
-    flat = validation.boolean("flat", maps.get("flat", False))
+    connected = validation.boolean("connected", connected)
+    flat = validation.boolean("flat", flat)
     copies = validation.integer("copies", copies)
-    num_maps = validation.integer(
-        "num_maps", maps.get("num_maps", 1024), least=int(connected), limit=2**24
-    )
+    num_maps = validation.integer("num_maps", num_maps, least=int(connected), limit=2**24)
     size = validation.integer("size", size, limit=2**10)
-    seed = validation.integer("seed", maps.get("seed", 0))
+    seed = validation.integer("seed", seed)
     if layout is None:
         if start is not None:
             raise ValueError(f"start={start} is for a given layout; leave it out.")

@@ -10,7 +10,7 @@ the logarithm is returned; and the constraint, there ``1 - max_t max(low - u_t, 
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,14 +78,6 @@ class Optimum(NamedTuple):
     residual: float
 
 
-class _ControlLimits(TypedDict, total=False):
-    """Bounds of controls and the unit of the objective of :func:`lqr`, described there."""
-
-    low: ArrayLike
-    high: ArrayLike
-    scale: float | None
-
-
 def lqr(
     dynamics: ArrayLike = ((1, 1), (0, 1)),
     control: ArrayLike = ((1,), (1,)),
@@ -94,14 +86,16 @@ def lqr(
     control_cost: ArrayLike = ((0.3,),),
     start: ArrayLike = (1, -1),
     horizon: int = 20,
-    **limits: Unpack[_ControlLimits],
+    low: ArrayLike = -0.2,
+    high: ArrayLike = 0.2,
+    scale: float | None = None,
 ) -> LQR:
     """A regulator problem, equation (4.17); the defaults are the dissertation's.
 
     Args:
       dynamics, control, start, horizon: A, B, the initial state and N.
       state_cost, control_cost: Q, positive semidefinite, and R, positive definite.
-      low, high: ``[m]``, or one bound for all controls; default -0.2 and 0.2.
+      low, high: ``[m]``, or one bound for all controls.
       scale: the unit of J in the objective; default: J of zero controls if positive, else 1.
 
     Raises:
@@ -111,7 +105,6 @@ def lqr(
     >>> world.horizon, round(float(world.scale))
     (20, 2470)
     """
-    low, high, scale = validation.options("lqr", limits, low=-0.2, high=0.2, scale=None)
     a, b, q, r = (np.asarray(x, float) for x in (dynamics, control, state_cost, control_cost))
     x = np.asarray(start, float)
     n, m = len(a), b.shape[-1]

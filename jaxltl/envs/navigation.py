@@ -26,7 +26,7 @@ The dissertation gives the geometry only in figure 9, from which these numbers a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -98,28 +98,6 @@ class NavigationRun(NamedTuple):
     action: jax.Array
 
 
-class Settings(TypedDict, total=False):
-    """Optional settings of the robot and of the tasks.
-
-    Attributes:
-      speed, turn, time_step: see :class:`Navigation`; default: 1, pi / 6 and 0.5.
-      radii: of the sensor's circles; default: 0.5, 1, 1.5, 2 and 2.5.
-      num_directions: points on each circle, evenly spaced, the first ahead; default: 12.
-      strip, weight: see :class:`Navigation`; default: (-2, -0.2) and 30.
-
-    >>> navigation(**Settings(speed=0.5, radii=[1.0])).num_observations
-    14
-    """
-
-    speed: float
-    turn: float
-    time_step: float
-    radii: Sequence[float]
-    num_directions: int
-    strip: ArrayLike
-    weight: float
-
-
 def navigation(
     *,
     goal: ArrayLike = ((1.5, 1.0), (2.5, 2.0)),
@@ -127,14 +105,22 @@ def navigation(
     bounds: ArrayLike = ((-4.0, -4.0), (4.0, 4.0)),
     start: ArrayLike = ((-3.0, -2.5), (-1.5, -0.5)),
     horizon: int = 30,
-    **settings: Unpack[Settings],
+    speed: float = 1.0,
+    turn: float = np.pi / 6,
+    time_step: float = 0.5,
+    radii: Sequence[float] = (0.5, 1.0, 1.5, 2.0, 2.5),
+    num_directions: int = 12,
+    strip: ArrayLike = (-2.0, -0.2),
+    weight: float = 30.0,
 ) -> Navigation:
     """A map with a goal and an obstacle, and a robot.
 
     Args:
       goal, obstacle, bounds, start: boxes, each the lower left and the upper right corner.
       horizon: N.
-      settings: see :class:`Settings`.
+      speed, turn, time_step, strip, weight: see :class:`Navigation`.
+      radii: of the sensor's circles.
+      num_directions: points on each circle, evenly spaced, the first ahead.
 
     Raises:
       ValueError: an empty box or range, or a size that is not positive.
@@ -142,18 +128,12 @@ def navigation(
     >>> world = navigation()
     >>> world.num_observations, policy_network(world).num_parameters
     (62, 2882)
+    >>> navigation(speed=0.5, radii=[1.0]).num_observations
+    14
     """
     boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
     corners = {name: _box(name, box) for name, box in boxes.items()}
-    validation.keywords("navigation", settings, Settings)
-    numbers = {
-        "speed": settings.get("speed", 1.0),
-        "turn": settings.get("turn", np.pi / 6),
-        "time_step": settings.get("time_step", 0.5),
-    }
-    radii = settings.get("radii", (0.5, 1.0, 1.5, 2.0, 2.5))
-    num_directions = settings.get("num_directions", 12)
-    strip = settings.get("strip", (-2.0, -0.2))
+    numbers = {"speed": speed, "turn": turn, "time_step": time_step}
     sizes = numbers | {
         "num_directions": num_directions,
         "horizon": horizon,
@@ -169,7 +149,7 @@ def navigation(
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     offset = (np.asarray(radii, float)[:, None, None] * circle).reshape(-1, 2)
     # NumPy's, so that a computation in either precision starts from the exact numbers.
-    numbers["weight"] = settings.get("weight", 30.0)
+    numbers["weight"] = weight
     arrays = {name: np.asarray(x, float) for name, x in numbers.items()}
     return Navigation(**corners, **arrays, offset=offset, strip=low_high, horizon=int(horizon))
 

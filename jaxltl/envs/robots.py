@@ -8,7 +8,7 @@ robots' places, 0 to C - 1, and `turn` is 1 where the system moves: the inverse 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,13 +68,6 @@ def robots(size: int) -> Game:
     )
 
 
-class _GridGameOptions(TypedDict, total=False):
-    """Options of the map of :func:`grid_game`, described there."""
-
-    legend: Mapping[str, Collection[str]] | None
-    wall: str
-
-
 def grid_game(
     text: str,
     *,
@@ -83,7 +76,8 @@ def grid_game(
     slip: float = 0.0,
     system_stays: bool = True,
     environment_stays: bool = False,
-    **reading: Unpack[_GridGameOptions],
+    legend: Mapping[str, Collection[str]] | None = None,
+    wall: str = "#",
 ) -> Game:
     """The game of two robots on a text map, in turns.
 
@@ -113,7 +107,6 @@ def grid_game(
     >>> game.num_states
     50
     """
-    legend, wall = validation.options("grid_game", reading, legend=None, wall="#")
     world = gridworld(text, slip=slip, legend=legend, wall=wall)
     system_stays = validation.boolean("system_stays", system_stays)
     environment_stays = validation.boolean("environment_stays", environment_stays)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -115,51 +115,23 @@ def _assemble(
     return World(mdp, to_jax(np.asarray(colors, np.int32)), margin, (rows, columns), kinds)
 
 
-class Appearance(TypedDict, total=False):
-    """Optional settings of worlds.
-
-    Attributes:
-      shape: rows and columns; default: 10 and 10.
-      objects, obstacles, margin, slip: see :func:`colored_world`.
-
-    >>> make_world({}, 0, **Appearance(shape=(2, 3), margin=2)).colors.shape
-    (6, 7)
-    """
-
-    shape: tuple[int, int]
-    objects: Counts
-    obstacles: Counts
-    margin: int
-    slip: float
-
-
-class _CheckedAppearance(NamedTuple):
-    """The validated :class:`Appearance` of a world, with a world of no kinds."""
-
-    shape: tuple[int, int]
-    kinds: Kinds
-    num_objects: int
-    margin: int
-    blank: MDP
-
-
-def _grid(function: str, appearance: Appearance) -> _CheckedAppearance:
-    validation.keywords(function, appearance, Appearance)
-    shape, margin = appearance.get("shape", (10, 10)), appearance.get("margin", 1)
-    objects = appearance.get("objects", OBJECTS)
-    kinds = make_kinds(objects, appearance.get("obstacles", OBSTACLES))
+def _grid(shape: tuple[int, int], margin: int, slip: float) -> MDP:
+    """A world of no kinds, of validated size."""
     validation.integer("margin", margin, least=1)
     if len(shape) != 2 or min(shape) < 1:
         raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
-    return _CheckedAppearance(
-        shape, kinds, len(objects), margin, _blank(shape, appearance.get("slip", 0.0))
-    )
+    return _blank(shape, slip)
 
 
 def make_world(
     plan: Mapping[str, Sequence[tuple[int, int]]],
     seed: int | np.random.Generator,
-    **appearance: Unpack[Appearance],
+    *,
+    shape: tuple[int, int] = (10, 10),
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+    slip: float = 0.0,
 ) -> World:
     """A world with objects and obstacles in given cells and random colours elsewhere.
 
@@ -170,13 +142,14 @@ def make_world(
     Args:
       plan: cells ``(row, column)``, from 1, of each kind by its name.
       seed: of the random colours. The inner rings do not depend on the margin.
-      appearance: shape, kinds and slip, see :class:`Appearance`.
+      shape: rows and columns.
+      objects, obstacles, margin, slip: see :func:`colored_world`.
 
     >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
     >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
     ([True, False, False, False], 2)
     """
-    shape, kinds, _, margin, blank = _grid("make_world", appearance)
+    kinds, blank = make_kinds(objects, obstacles), _grid(shape, margin, slip)
     kind = plan_map(plan, kinds, shape)
     colors = filled(
         np.random.default_rng(seed), planned(kind, kinds), kind, codes_of(kinds), margin
@@ -218,7 +191,11 @@ def random_worlds(
     min_distance: int = 3,
     obstacle_distance: int = 3,
     max_tries: int = 1000,
-    **appearance: Unpack[Appearance],
+    shape: tuple[int, int] = (10, 10),
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+    slip: float = 0.0,
 ) -> list[World]:
     """The random worlds of some seeds in which the task is satisfiable from every distractor cell.
 
@@ -229,7 +206,8 @@ def random_worlds(
       min_distance, obstacle_distance: of objects from objects, and of obstacles from objects, in the
         maximum norm.
       max_tries: placements to try for each world.
-      appearance: shape, kinds and slip, see :class:`Appearance`.
+      shape: rows and columns.
+      objects, obstacles, margin, slip: see :func:`colored_world`.
 
     Raises:
       ValueError: an unknown proposition, or no placement found.
@@ -238,7 +216,8 @@ def random_worlds(
     >>> [world.shape for world in worlds]
     [(6, 8), (6, 8)]
     """
-    shape, kinds, num_objects, margin, blank = _grid("random_worlds", appearance)
+    kinds, blank = make_kinds(objects, obstacles), _grid(shape, margin, slip)
+    num_objects = len(objects)
     num_obstacles = validation.integer("num_obstacles", num_obstacles)
     automaton, step = _on_kinds(formula, kinds)
     family = _Family(blank, kinds, automaton, step)
@@ -269,13 +248,44 @@ def random_worlds(
     return worlds
 
 
-def random_world(seed: int, formula: FormulaLike = COMPLETE, **options: Any) -> World:
-    """The world of :func:`random_worlds` of one `seed` and `formula`, with the same `options`.
+def random_world(
+    seed: int,
+    formula: FormulaLike = COMPLETE,
+    *,
+    num_obstacles: int = 5,
+    min_distance: int = 3,
+    obstacle_distance: int = 3,
+    max_tries: int = 1000,
+    shape: tuple[int, int] = (10, 10),
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+    slip: float = 0.0,
+) -> World:
+    """The random world of one `seed`; see :func:`random_worlds` for all arguments.
+
+    Args:
+      seed, formula: of the random number generator, and the task that is satisfiable.
+      num_obstacles, min_distance, obstacle_distance, max_tries: of the placement.
+      shape, objects, obstacles, margin, slip: of the world.
 
     >>> random_world(3, shape=(6, 8), num_obstacles=2).shape
     (6, 8)
     """
-    return random_worlds([seed], formula, **options)[0]
+    (world,) = random_worlds(
+        [seed],
+        formula,
+        num_obstacles=num_obstacles,
+        min_distance=min_distance,
+        obstacle_distance=obstacle_distance,
+        max_tries=max_tries,
+        shape=shape,
+        objects=objects,
+        obstacles=obstacles,
+        margin=margin,
+        slip=slip,
+    )
+    return world
 
 
 def _on_kinds(formula: FormulaLike, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:

@@ -16,7 +16,7 @@ proximities; and constant sensors are omitted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,13 +69,6 @@ class _ZoneParameters:
     gain: np.float32
 
 
-class _Placements(TypedDict, total=False):
-    """The table of placements of :func:`zone_world`, described there."""
-
-    num_maps: int
-    seed: int
-
-
 def zone_world(
     *,
     colors: Sequence[str] = COLORS,
@@ -84,7 +77,8 @@ def zone_world(
     extent: float = 2.5,
     horizon: int | None = 1000,
     saturation: float = 0.05,
-    **placements: Unpack[_Placements],
+    num_maps: int = 1024,
+    seed: int = 0,
 ) -> Environment:
     """ZoneEnv as an environment.
 
@@ -100,8 +94,7 @@ def zone_world(
       radius, extent: of a zone, and half a side of the square.
       horizon: the time limit, or None.
       saturation: the action from which on the thrust is full; as published, .05.
-      num_maps, seed: size of the table of placements, before symmetries and colours (default 1024), and
-        its seed (0).
+      num_maps, seed: size of the table of placements, before symmetries and colours, and its seed.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`.
@@ -113,7 +106,6 @@ def zone_world(
     >>> world.propositions, world.observations.shape, world.actions.shape
     (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
-    num_maps, seed = validation.options("zone_world", placements, num_maps=1024, seed=0)
     names = validation.distinct_names("colors", colors)
     zones, seed = validation.integer("zones", zones), validation.integer("seed", seed)
     num_maps = validation.integer("num_maps", num_maps, limit=2**20)
