@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, TYPE_CHECKING, TypedDict, Unpack
+from typing import Literal, TYPE_CHECKING
 
 import click
 
@@ -28,6 +28,7 @@ from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jaxltl.core.automata.automaton import Automaton
+    from jaxltl.core.statistics.confidence_sets import Method
 
 _PATH = click.Path(path_type=Path)
 _task_file = click.argument("task_file", metavar="TASK.toml", type=_PATH)
@@ -81,6 +82,7 @@ def main() -> None:
 @plain_errors
 def learn(
     task_file: Path,
+    *,
     out: Path | None,
     seed: int,
     seeds: int,
@@ -304,15 +306,6 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     return plot.to_bytes(plot.automaton(result), "svg").decode()
 
 
-class _ProgramOptions(TypedDict):
-    """Options of :func:`solve` for programs and for the width of bounds."""
-
-    constants: str | None
-    max_states: int | None
-    method: str
-    relative: bool
-
-
 @main.command()
 @click.argument("model_file", metavar="MODEL", type=_PATH)
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
@@ -351,12 +344,16 @@ class _ProgramOptions(TypedDict):
 def solve(
     model_file: Path,
     properties: tuple[str, ...],
+    *,
     strategy: Path | None,
     tolerance: float,
+    relative: bool,
     as_json: bool,
+    constants: str | None,
+    max_states: int | None,
+    method: str,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
-    **reading: Unpack[_ProgramOptions],
 ) -> None:
     """Solve properties of a model, or of a program in the PRISM language, with certified bounds.
 
@@ -370,12 +367,11 @@ def solve(
     With --mesh the model is distributed over devices, also over those of several processes, each of
     which is started with the same arguments; see docs/devices.md.
     """
-    constants, max_states, method = reading["constants"], reading["max_states"], reading["method"]
     launch = processes.launched(devices)
     say = _begin(f"solving {model_file}", launch.process)
     options = (
         ("--strategy", strategy, False),
-        ("--relative", reading["relative"] or None, False),
+        ("--relative", relative or None, False),
         ("--checkpoint", checkpoint, True),
     )
     for option, value, with_mesh in options:
@@ -386,7 +382,7 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (program is None or strategy is not None or reading["relative"]):
+    if method == "partial" and (program is None or strategy is not None or relative):
         raise ValueError("--method partial is for programs, without --strategy and --relative.")
     from jaxltl.core.files import atomic_write
 
@@ -401,7 +397,7 @@ def solve(
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            answers = solving.solve(model, questions, tolerance, relative=reading["relative"])
+            answers = solving.solve(model, questions, tolerance, relative=relative)
         else:
             from jaxltl.app import solve_on_mesh
 
@@ -466,10 +462,19 @@ def solve(
 def certify(
     log: Path,
     formula: str | None,
+    *,
+    confidence: float | None,
+    initial: tuple[str, ...],
+    terminal: tuple[str, ...],
+    labels: Path | None,
+    model: Path | None,
+    graph: str | None,
+    least_probability: float | None,
+    method: Method,
+    smallest: bool,
     policy: Path | None,
     curve: Path | None,
     as_json: bool,
-    **options: Any,
 ) -> None:
     """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
@@ -480,24 +485,22 @@ def certify(
     """
     say = _begin(f"certifying {formula or 'the task'} from {log}")
     if log.suffix == ".npz":
-        others = (policy, curve, *(x for name, x in options.items() if name != "method"))
-        if any(x not in (None, (), False) for x in others):
+        others = (policy, curve, confidence, labels, model, graph, least_probability)
+        if initial or terminal or smallest or any(x is not None for x in others):
             raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
         _certify_policy(log, formula, as_json, say)
         return
-    if formula is None or options["confidence"] is None:
+    if formula is None or confidence is None:
         missing = "FORMULA" if formula is None else "--confidence, such as 0.95"
         raise ValueError(f"a LOG needs {missing}.")
     from jaxltl.app import certify as app
 
-    objective: Literal["max", "min"] = "min" if options.pop("smallest") else "max"
-    query = app.CertificateQuery(
-        formula, options.pop("confidence"), options.pop("method"), objective
+    objective: Literal["max", "min"] = "min" if smallest else "max"
+    query = app.CertificateQuery(formula, confidence, method, objective)
+    assumption = app.graph_of_options(graph, least_probability, confidence)
+    source = app.LogSource(
+        labels=labels, model=model, initial=initial, terminal=terminal, graph=assumption
     )
-    graph = app.graph_of_options(
-        options.pop("graph"), options.pop("least_probability"), query.confidence
-    )
-    source = app.LogSource(graph=graph, **options)
     result = app.certify_and_write(log, query, source, policy, curve)
     if as_json:
         _print_json(result)

@@ -42,7 +42,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -336,12 +335,19 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     return used / jnp.maximum(used.sum(-1, keepdims=True), 1).astype(moves.dtype)
 
 
-def guarantee(state: State, problem: Problem, confidence: float, **options: Any) -> DataGuarantee:
+def guarantee(
+    state: State,
+    problem: Problem,
+    confidence: float,
+    *,
+    objective: str = "max",
+    tolerance: float | None = None,
+) -> DataGuarantee:
     """The certified satisfaction probability that the counts guarantee, however sampled; on the host.
 
     By anytime intervals at a `confidence` in (0, 1), of the `state` and `problem` of one run. It assumes
-    the graph only, and holds with that confidence for all looks at once. `options` are those of
-    :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
+    the graph only, and holds with that confidence for all looks at once. `objective` and `tolerance`
+    are as for :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Raises:
       ValueError: the confidence is out of range, or an argument is of another type.
@@ -355,7 +361,8 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
         confidence,
         graph="given",
         method="anytime",
-        **options,
+        objective=objective,
+        tolerance=tolerance,
     )
 
 

@@ -45,7 +45,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypedDict, Unpack
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -376,14 +376,6 @@ class Staged:
     seconds: np.ndarray
 
 
-class _Stages(TypedDict, total=False):
-    """Options of :func:`train_in_stages`, described there."""
-
-    num_steps: int
-    enough: float | Sequence[float]
-    report: Callable[[int, int, PyTree], None] | None
-
-
 def train_in_stages(
     key: Key,
     problems: Sequence[PyTree],
@@ -392,7 +384,9 @@ def train_in_stages(
     init: Callable[..., PyTree],
     run: Callable[..., PyTree],
     num_chunks: int,
-    **options: Unpack[_Stages],
+    num_steps: int = 10,
+    enough: float | Sequence[float] = 0.9,
+    report: Callable[[int, int, PyTree], None] | None = None,
 ) -> Staged:
     """A curriculum: a learner on one problem after the other, each once the previous is mastered.
 
@@ -403,23 +397,21 @@ def train_in_stages(
       hparams: of the learner.
       init, run: the learner's, ``ppo.init`` and ``ppo.run``.
       num_chunks: number of calls of `run`.
-      num_steps: steps of the learner in each; default 10.
+      num_steps: steps of the learner in each.
       enough: mean return of a chunk's episodes at which the next problem begins; a number, or one for
-        each problem but the last; default 0.9.
+        each problem but the last.
       report: called after each chunk with its number, its stage and its metrics.
 
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    validation.keywords("train_in_stages", options, _Stages)
-    num_steps, report = options.get("num_steps", 10), options.get("report")
     problems = validation.sequence("problems", problems)
     for name, function in (("init", init), ("run", run), ("report", report)):
         if function is not None or name != "report":
             validation.function(name, function)
     count = len(problems)
     num_chunks = validation.integer("num_chunks", num_chunks, least=1)
-    bars = validation.float_array("enough", options.get("enough", 0.9))
+    bars = validation.float_array("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
     if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
         raise ValueError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Unpack
 
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +12,6 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core import validation
 from jaxltl.plot.board import (
     DIRECTIONS,
     LOSES,
@@ -39,7 +37,6 @@ from jaxltl.plot.style import (
     MUTED,
     PAPER,
     SERIES,
-    MapOptions,
     blank,
     head,
     note,
@@ -58,7 +55,10 @@ def game_values(
     *,
     policy: ArrayLike | None = None,
     environment: Sequence[int] | None = None,
-    **look: Unpack[MapOptions],
+    actions: Sequence[str] = tuple(DIRECTIONS),
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    wall: str = "#",
 ) -> Figure:
     """The values on the system's turns: one map of the system's cell per cell of the environment.
 
@@ -79,9 +79,6 @@ def game_values(
       >>> len(game_values(np.linspace(0, 1, 32), 2, label="value").axes)  # four maps and a scale
       5
     """
-    actions, label, limits, wall = validation.options(
-        "game_values", look, actions=tuple(DIRECTIONS), label="", limits=None, wall="#"
-    )
     world = board_of(board, wall)
     table = _of_turns(np.asarray(values, float), world, "values")
     allowed = None
@@ -151,7 +148,9 @@ def game_moves(
     region: ArrayLike | None = None,
     available: ArrayLike | None = None,
     system: int | None = None,
-    **look: Unpack[MapOptions],
+    actions: Sequence[str] = tuple(DIRECTIONS),
+    titles: Sequence[str] | str = "",
+    wall: str = "#",
 ) -> Figure:
     """The allowed moves of the system in each cell (a triangle, or a dot for staying).
 
@@ -171,9 +170,6 @@ def game_moves(
       >>> len(game_moves(np.ones((32, 5), bool), 2, environment=3, system=0).axes)
       1
     """
-    actions, titles, wall = validation.options(
-        "game_moves", look, actions=tuple(DIRECTIONS), titles="", wall="#"
-    )
     world = board_of(board, wall)
     _require_place(world, environment)
     require_directions(actions)

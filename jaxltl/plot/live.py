@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, TYPE_CHECKING, TypedDict, Unpack
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core import validation
 from jaxltl.core.automata import Automaton
 from jaxltl.envs.text_map import parse_map
 from jaxltl.io.templates import render
@@ -22,7 +21,7 @@ from jaxltl.plot import layout
 from jaxltl.plot.automata import edge_texts, on_the_host
 from jaxltl.plot.board import STEPS, triangle
 from jaxltl.plot.maps import kind_colors, kind_marks, TINTS
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MapOptions, MUTED, PAPER, SCALE
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, SCALE
 
 if TYPE_CHECKING:
     from jaxltl.envs.temporal_gridworld import World
@@ -154,7 +153,8 @@ def live_map(
     runs: Sequence[Sequence[int]] = (),
     marked: Iterable[tuple[int, int, int]] = (),
     pieces: int = 1,
-    **look: Unpack[MapOptions],
+    actions: Sequence[str] = tuple(STEPS),
+    wall: str = "#",
 ) -> str:
     """A map as SVG, with one layer per memory state, the first of which is visible.
 
@@ -173,7 +173,6 @@ def live_map(
       >>> text.startswith("<svg"), "data-run" in text
       (True, True)
     """
-    actions, wall = validation.options("live_map", look, actions=tuple(STEPS), wall="#")
     ground = _ground(place, wall)
     rows, columns = ground.shape
     # Numbers and marks grow with the map, so that they can be read where it is scaled down.
@@ -317,14 +316,6 @@ _COLORS = {"run": _RUN, "ink": INK, "faint": FAINT, "paper": PAPER, "muted": MUT
 _COLORS |= {"accent": ACCENT, "good": GOOD}
 
 
-class _Playing(TypedDict, total=False):
-    """Rarely needed options of :func:`playback`, described there."""
-
-    wait: float
-    times: int
-    wall: str
-
-
 def playback(
     cells: str | NDArray[np.str_],
     states: ArrayLike,
@@ -332,7 +323,9 @@ def playback(
     automaton: Automaton | None = None,
     memory: ArrayLike | None = None,
     label: str = "",
-    **playing: Unpack[_Playing],
+    wait: float = 0.4,
+    times: int = 3,
+    wall: str = "#",
 ) -> str:
     """An animated SVG of a trajectory on a map, next to the state of the task's automaton.
 
@@ -343,8 +336,7 @@ def playback(
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
       label: the text alternative; default the number of steps.
-      wait, times, wall: seconds for each step (default 0.4), the number of repetitions (3), and the
-        kind of walls.
+      wait, times, wall: seconds for each step, the number of repetitions, and the kind of walls.
 
     Raises:
       ValueError: the run is empty or leaves the map, or the automaton and its states do not fit.
@@ -353,7 +345,6 @@ def playback(
       >>> "from a to b" in playback("a . b", [0, 1, 2], label="from a to b")
       True
     """
-    wait, times, wall = validation.options("playback", playing, wait=0.4, times=3, wall="#")
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     run = _whole("states", states, kinds.size, "cells")
     panes = [_plain(live_map(kinds, "run", {}, runs=[run], wall=wall))]

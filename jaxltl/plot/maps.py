@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +15,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core import validation
 from jaxltl.envs.text_map import parse_map, plain_kind
 from jaxltl.plot.board import (
     Board,
@@ -39,7 +38,6 @@ from jaxltl.plot.style import (
     head,
     INK,
     KINDS,
-    MapOptions,
     note,
     PAPER,
     scale_bar,
@@ -64,7 +62,12 @@ def grid(
     cells: str | NDArray[np.str_],
     values: ArrayLike | None = None,
     policy: ArrayLike | None = None,
-    **look: Unpack[MapOptions],
+    *,
+    titles: Sequence[str] | str = "",
+    label: str = "",
+    limits: tuple[float, float] | None = (0.0, 1.0),
+    actions: Sequence[str] = tuple(STEPS),
+    wall: str = "#",
 ) -> Figure:
     """A map, with a value in each cell as a colour, and a policy as arrows.
 
@@ -86,9 +89,6 @@ def grid(
       >>> len(figure.axes)  # a map for each, and a scale
       3
     """
-    titles, label, limits, actions, wall = validation.options(
-        "grid", look, titles="", label="", limits=(0.0, 1.0), actions=tuple(STEPS), wall="#"
-    )
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     panels, arrows = _panels(kinds, values, policy, len(actions))
     if policy is not None:
@@ -247,7 +247,9 @@ def strategies(
     mark: str = "",
     across: int = 4,
     seldom: float = 0.01,
-    **look: Unpack[MapOptions],
+    titles: Sequence[str] | str = "",
+    actions: Sequence[str] = tuple(STEPS),
+    wall: str = "#",
 ) -> Figure:
     """The mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
 
@@ -270,9 +272,6 @@ def strategies(
       >>> len(strategies(". .", play, seldom=0.05).axes)
       1
     """
-    titles, actions, wall = validation.options(
-        "strategies", look, titles="", actions=tuple(STEPS), wall="#"
-    )
     require_directions(actions)
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     world = Board(kinds, np.argwhere(np.ones(kinds.shape, bool)), wall)
@@ -340,7 +339,9 @@ def temporal_gridworld(
     value: ArrayLike | None = None,
     *,
     title: str | Sequence[str] = "",
-    **look: Unpack[MapOptions],
+    actions: Sequence[str] = tuple(STEPS),
+    label: str = "value",
+    limits: tuple[float, float] | None = None,
 ) -> Figure:
     """The map of a coloured world and its objects, with a policy as arrows and trajectories as lines.
 
@@ -362,9 +363,6 @@ def temporal_gridworld(
       >>> len(temporal_gridworld(world, np.full((2, 4), 0.25), value=[0.5, 1.0]).axes)
       3
     """
-    label, limits, actions = validation.options(
-        "temporal_gridworld", look, label="value", limits=None, actions=tuple(STEPS)
-    )
     chosen = [memory] if isinstance(memory, int | np.integer) else list(memory)
     size, shape = int(np.prod(world.shape)), world.shape
     moves = _of_memory(policy, chosen, size, (len(actions),), "policy")

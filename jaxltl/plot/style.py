@@ -6,7 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple, TypeAlias, TypedDict
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -147,16 +147,6 @@ def scale_bar(
     bar.set_label(label, fontsize=9, color=INK)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
-
-
-class MapOptions(TypedDict, total=False):
-    """Rarely needed options of maps; the help of each function describes those that it takes."""
-
-    actions: Sequence[str]
-    label: str
-    limits: tuple[float, float] | None
-    titles: Sequence[str] | str
-    wall: str
 
 
 def head(axes: Axes, text: str, size: float = 9.5) -> None:
