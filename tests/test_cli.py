@@ -453,7 +453,7 @@ discount = 0.5'''
     [
         (("discount = 0.9", "discount = "), "line 18"),
         (("!r U y", "!r U U y"), "column 6"),
-        (("!r U y", "!red U y"), "the task mentions the proposition 'red'"),
+        (("!r U y", "!red U y"), "the formula mentions the proposition 'red'"),
         (("!r U y", "!r & r"), "[task] formula: nothing satisfies it"),
         (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 5"),
         (
