@@ -418,7 +418,7 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
         (("formula", 'safe = "true"\nformula'), r"[task] has both formula and safe"),
         (
             ("!collision", "!colision"),
-            r"[task] the task mentions the proposition 'colision', which",
+            r"[task] the formula mentions the proposition 'colision', which",
         ),
         (("!collision", "!colision"), r"Did you mean 'collision'?"),
         (("G !collision", "G (!collision"), r"[task] "),

@@ -108,8 +108,7 @@ def test_dot_marks_transitions():
     assert parity[-3:-1] == ['  0 -> 0 [label="!a {1}"];', '  0 -> 0 [label="a {2}"];']
 
 
-def test_an_automaton_says_in_one_line_what_it_is():
-    assert repr(to_automaton("G F a & G F b")) == (
-        "Automaton(buchi, 2 states, 4 letters over a, b, for G F a & G F b)"
-    )
-    assert repr(to_automaton("true")).endswith("1 letter over no propositions, for true)")
+def test_an_automaton_says_what_it_is():
+    text = repr(to_automaton("G F a & G F b"))
+    for part in ("'buchi'", "int32[2, 4]", "('a', 'b')", "'G F a & G F b'"):
+        assert part in text

@@ -259,7 +259,7 @@ def test_a_process_without_jax_runs_a_saved_policy(tmp_path):
         capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "3 states, 3 memories, deterministic" in done.stdout
+    assert "action=int32[3, 3] from 0 to 1" in done.stdout
     assert "1 [0, 0, 0]" in done.stdout  # to the right, then to the left
 
 
