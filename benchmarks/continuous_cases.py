@@ -396,7 +396,7 @@ def _reaches(policy: CellPolicy, starts: jax.Array, num_steps: int = 300) -> jax
     columns = np.array([names.index("target"), names.index("unsafe")])
 
     def run(key: jax.Array, start: jax.Array) -> jax.Array:
-        states, _, _ = simulate_cells(policy, key, start, num_steps)
+        states, _, _ = simulate_cells(key, policy, start, num_steps)
         label = jax.vmap(policy.dynamics.label)(states)[:, columns]
         lost = label[:, 1] | ~jax.vmap(policy.dynamics.inside)(states)
         first = jnp.where(label[:, 0].any(), label[:, 0].argmax(), num_steps)

@@ -687,7 +687,7 @@ def test_what_is_of_another_run_is_named():
         ),
         (lambda: cce.step(found, search(2, 2), cce.Hparams()), "with 1 costs, .* with 2"),
         (
-            lambda: cce.assess(search(2, 1), jnp.zeros(3), key),
+            lambda: cce.assess(key, search(2, 1), jnp.zeros(3)),
             r"parameters is .*; give those of one policy, float\[2\]",
         ),
         (

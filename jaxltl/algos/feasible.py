@@ -25,7 +25,7 @@ Example: a head of one coin, then a tail of another; their biases are parameters
   >>> search.within(problem, 0.25, 0.5).low.tolist()
   [0.25, 0.25]
   >>> hparams = search.Hparams()
-  >>> state = search.start_at(jnp.array([0.5, 0.5]), jax.random.key(0), problem, hparams)
+  >>> state = search.start_at(jax.random.key(0), jnp.array([0.5, 0.5]), problem, hparams)
   >>> value, status = search.evaluate(state.parameters, problem, hparams)
   >>> state, metrics = search.run(state, problem, hparams, num_steps=2)
   >>> value.item(), bool(state.best.value > value)
@@ -365,10 +365,10 @@ def evaluate(
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
     """A point drawn uniformly from the box."""
     share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
-    return start_at(problem.low + share * (problem.high - problem.low), key, problem, hparams)
+    return start_at(key, problem.low + share * (problem.high - problem.low), problem, hparams)
 
 
-def start_at(parameters: jax.Array, key: Key, problem: Problem, hparams: Hparams) -> State:
+def start_at(key: Key, parameters: jax.Array, problem: Problem, hparams: Hparams) -> State:
     """A :class:`State` at the point of the problem's box nearest to given `parameters`.
 
     As ``init(key, problem, hparams)``, which draws the point.
@@ -544,7 +544,7 @@ def _search(
 
     def one(key: jax.Array, point: jax.Array | None) -> loops.Learned:
         state = (
-            init(key, problem, hparams) if point is None else start_at(point, key, problem, hparams)
+            init(key, problem, hparams) if point is None else start_at(key, point, problem, hparams)
         )
         return run_until(state, problem, hparams, until=until, num_steps=max_steps)
 

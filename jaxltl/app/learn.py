@@ -376,7 +376,7 @@ def prepare(task: MlirlFile, seed: int) -> MlirlSetup:
         demonstrations, dropped = load_demonstrations(task, world), 0
     else:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        demonstrations, dropped = synthetic_demonstrations(task.path, table, model, key, best)
+        demonstrations, dropped = synthetic_demonstrations(key, task.path, table, model, best)
     with errors_in(f"{task.path}: [task] "):
         guarantee = ask(model, world, demonstrations, best, task.guarantee, task.over)
         actions = guarantee.actions or optimal_actions(model, best)

@@ -243,7 +243,7 @@ def prove(setup: EnvironmentSetup, agent: Agent, formula: str, say: Report) -> P
         return Proof(certificate)
     say("searching a run that violates the formula")
     key, steps = jax.random.key(0), setup.num_steps
-    run = counterexample(setup.dynamics, policy, formula, key, certificate, steps)
+    run = counterexample(key, setup.dynamics, policy, formula, certificate, steps)
     return Proof(certificate, run)
 
 

@@ -126,7 +126,7 @@ def prepare(task: TodirlFile, seed: int) -> TodirlSetup:
                     )
                 )
             else:
-                runs, lost = synthetic_demonstrations(task.path, table, model, own, bests[w])
+                runs, lost = synthetic_demonstrations(own, task.path, table, model, bests[w])
                 demonstrations, dropped = [*demonstrations, runs], dropped + lost
     if memory is not automaton:
         expert = np.tile(

@@ -176,14 +176,14 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 
 
 def start_states(
-    world: Navigation, key: Key, shape: tuple[int, ...] = (), dtype: np.dtype | type | None = None
+    key: Key, world: Navigation, shape: tuple[int, ...] = (), dtype: np.dtype | type | None = None
 ) -> State:
     """The initial states, uniform in the start box of `world` and in the heading, drawn from `key`.
 
     They are arrays of a `shape` and a `dtype` (default: JAX's).
 
     >>> drawn = jax.eval_shape(
-    ...     lambda key: start_states(navigation(), key, (5,)), jax.random.key(0))
+    ...     lambda key: start_states(key, navigation(), (5,)), jax.random.key(0))
     >>> drawn.x.shape
     (5,)
     """
@@ -345,10 +345,10 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
 
 
 def simulate(
+    key: Key,
     world: Navigation,
     network: Network,
     parameters: jax.Array,
-    key: Key,
     *,
     num_trajectories: int = 10,
     absorbing: bool = False,
@@ -356,15 +356,15 @@ def simulate(
     """The trajectories of a policy; differentiable in its parameters.
 
     Args:
+      key: of the initial states.
       world, network: as of :func:`navigation` and :func:`policy_network`.
       parameters: ``float[D]``, in the precision of the simulation.
-      key: of the initial states.
       num_trajectories: M, static.
       absorbing: make the goal absorbing; static.
 
     >>> world = navigation()
     >>> network = policy_network(world)
-    >>> run = simulate(world, network, jnp.zeros(network.num_parameters), jax.random.key(0))
+    >>> run = simulate(jax.random.key(0), world, network, jnp.zeros(network.num_parameters))
     >>> run.state.x.shape, run.action.shape
     ((10, 30), (10, 30, 2))
     """
@@ -390,7 +390,7 @@ def _simulate(
             following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), state, following)
         return following, (state, action)
 
-    first = start_states(world, key, (num_trajectories,), dtype)
+    first = start_states(key, world, (num_trajectories,), dtype)
     _, (states, actions) = lax.scan(step, first, None, length=world.horizon)
     return NavigationRun(jax.tree.map(lambda x: x.T, states), jnp.moveaxis(actions, 0, 1))
 
@@ -462,7 +462,7 @@ def _evaluate(
 ) -> tuple[jax.Array, jax.Array]:
     num_trajectories, absorbing = settings.value
     run = simulate(
-        world, network, parameters, key, num_trajectories=num_trajectories, absorbing=absorbing
+        key, world, network, parameters, num_trajectories=num_trajectories, absorbing=absorbing
     )
     objective, cost = score(world, run)
     return objective.mean(axis=0), cost.mean(axis=0)

@@ -94,7 +94,7 @@ def as_environment(
 
 
 def _reset(settings: _StepSettings, world: Navigation, key: Key) -> Place:
-    state = nav.start_states(world, key, dtype=settings.dtype)
+    state = nav.start_states(key, world, dtype=settings.dtype)
     no = jnp.bool_(False)
     return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no, jnp.int32(0))
 

@@ -319,10 +319,10 @@ def _agents(robot: Robot, run: MethodSearch, plan: CceExperimentPlan) -> Iterato
             yield tr.policy(state, robot.stepwise, run.hparams)
             continue
         result = cce.result(
+            jax.random.fold_in(key, 1),
             state,
             robot.problem,
             run.hparams,
-            jax.random.fold_in(key, 1),
             num_evaluations=max(plan.fresh // _NUM_TRAJECTORIES, 2),
         )
         least = min((result.mean, result.best), key=lambda a: float(a.excess))

@@ -64,7 +64,7 @@ def searched(given, hparams, num_steps=60, seed=0):
 def found(given, hparams=None, num_steps=60, seed=0, **options):
     hparams = Hparams() if hparams is None else hparams
     state, _ = searched(given, hparams, num_steps, seed)
-    return cce.result(state, given, hparams, jax.random.key(99), **options)
+    return cce.result(jax.random.key(99), state, given, hparams, **options)
 
 
 # --- elites and weights -----------------------------------------------------------------------
@@ -395,7 +395,7 @@ def test_noise_and_its_margin():
 def test_intervals_cover_as_often_as_they_say():
     given = problem(noisy)
     point = jnp.array([0.3, 0.7])
-    look = jax.jit(jax.vmap(lambda k: cce.assess(given, point, k, num_evaluations=5)))
+    look = jax.jit(jax.vmap(lambda k: cce.assess(k, given, point, num_evaluations=5)))
     seen = look(jax.random.split(jax.random.key(3), 2000))
     inside = (seen.lower[:, 0] <= 1.0) & (seen.upper[:, 0] >= 1.0)
     assert abs(inside.mean() - 0.95) < 0.02, "Student's interval of five"
@@ -407,7 +407,7 @@ def test_costs_at_the_limit_are_feasible_to_the_bit():
         ef.diagonal_gaussian(jnp.zeros(1, jnp.float32), 1.0),
         limit=0.1,
     )
-    seen = cce.assess(given, jnp.ones(1, jnp.float32), jax.random.key(0), num_evaluations=999)
+    seen = cce.assess(jax.random.key(0), given, jnp.ones(1, jnp.float32), num_evaluations=999)
     assert seen.feasible
     assert seen.confident
 
@@ -423,7 +423,7 @@ def test_samples_without_a_number_are_counted_and_never_elites():
     assert state.num_invalid == metrics.num_invalid.sum() > 20
     assert jnp.isfinite(state.family.mean).all()
     assert (metrics.status == Status.COMPLETED).all()
-    solved = cce.result(state, given, Hparams(), jax.random.key(0), num_evaluations=2)
+    solved = cce.result(jax.random.key(0), state, given, Hparams(), num_evaluations=2)
     assert (np.asarray(solved.solution) <= [1.5, 1.5]).all()
     np.testing.assert_allclose(solved.best.parameters, [1.5, 1.0], atol=0.05)
 
@@ -435,7 +435,7 @@ def test_all_samples_without_a_number_are_an_error():
     assert metrics.status.tolist() == [Status.NONFINITE] * 3
     assert (state.family.mean == 0).all(), "nothing moved"
     with pytest.raises(ValueError, match=r"step 2: evaluate returned NaN for all samples \(30 of "):
-        cce.result(state, given, Hparams(population=10), jax.random.key(0))
+        cce.result(jax.random.key(0), state, given, Hparams(population=10))
 
 
 @pytest.mark.slow
@@ -446,8 +446,8 @@ def test_a_batch_of_runs_is_refused_by_result_and_its_lanes_are_not():
     many = jax.jit(jax.vmap(partial(cce.run, num_steps=3), (0, None, None)))
     states, _ = jax.jit(many, compiler_options=QUICK)(start, given, hparams)
     with pytest.raises(ValueError, match=r"a batch of \(3,\) runs; take one"):
-        cce.result(states, given, hparams, keys[0])
-    one = cce.result(lane(states, 1), given, hparams, keys[0], num_evaluations=2)
+        cce.result(keys[0], states, given, hparams)
+    one = cce.result(keys[0], lane(states, 1), given, hparams, num_evaluations=2)
     alone, _ = quick_run(lane(start, 1), given, hparams, num_steps=3)
     np.testing.assert_allclose(one.mean.parameters, alone.family.mean, rtol=1e-9)
 
@@ -524,7 +524,7 @@ def test_worlds_travel_as_arguments():
             "Gamma has no mirrored samples",
         ),
         (
-            lambda: cce.assess(problem(), jnp.zeros(2), jax.random.key(0), num_evaluations=1),
+            lambda: cce.assess(jax.random.key(0), problem(), jnp.zeros(2), num_evaluations=1),
             "num_evaluations=1; a confidence interval needs",
         ),
     ],

@@ -166,7 +166,7 @@ def test_steps_are_measured_by_the_odds():
     problem = make_problem(ruin(), "won", bound=">=")
     step = jax.jit(search.step)
     for p in (0.01, 0.5, 0.99):
-        state = search.start_at(jnp.array([p]), jax.random.key(0), problem, Hparams())
+        state = search.start_at(jax.random.key(0), jnp.array([p]), problem, Hparams())
         _, metrics = step(state, problem, Hparams())
         np.testing.assert_allclose(metrics.gradient_norm, 3 * 0.98 / (p * (1 - p)), rtol=1e-8)
 
@@ -361,7 +361,7 @@ def test_the_script_of_the_page_runs(capsys):
 
 def forged(problem, points, values):
     """What a search that is wrong would say."""
-    states = jax.vmap(lambda x: search.start_at(x, jax.random.key(0), problem, Hparams()))(points)
+    states = jax.vmap(lambda x: search.start_at(jax.random.key(0), x, problem, Hparams()))(points)
     best = search.BestPoint(points, values)
     size = len(values)
     code = jnp.zeros(size, jnp.int32)

@@ -351,7 +351,7 @@ def test_an_unknown_proposition_in_a_models_initial(write):
 
 
 def simulate(task, model, key, best):
-    return synthetic_demonstrations(task.path, task.demonstrations, model, key, best)
+    return synthetic_demonstrations(key, task.path, task.demonstrations, model, best)
 
 
 @pytest.mark.slow

@@ -99,7 +99,7 @@ def test_steps_and_what_is_seen_are_the_slow_worlds():
 
 def test_an_episode_is_truncated_after_75_steps():
     def move(state, key):
-        _, found = auto_reset_step(world(), state, 0, key)
+        _, found = auto_reset_step(key, world(), state, 0)
         return found.world, found
 
     _, found = jax.lax.scan(

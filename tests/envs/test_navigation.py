@@ -162,10 +162,10 @@ def test_runs_against_a_plain_simulation(world, absorbing):
     for seed in range(5):
         parameters = random_policy(network)
         run = simulate(
+            jax.random.key(seed),
             world,
             network,
             parameters,
-            jax.random.key(seed),
             num_trajectories=6,
             absorbing=absorbing,
         )
@@ -190,7 +190,7 @@ def test_runs_against_a_plain_simulation(world, absorbing):
 
 
 def test_starts_are_uniform():
-    states = nav.start_states(WORLD, jax.random.key(0), (20_000,))
+    states = nav.start_states(jax.random.key(0), WORLD, (20_000,))
     box = [*zip(*WORLD.start, strict=True), (-math.pi, math.pi)]
     for values, (low, high) in zip(states, box, strict=True):
         share = np.histogram(values, bins=10, range=(low, high))[0] / 20_000
@@ -208,7 +208,7 @@ def test_tasks_against_table_4(task):
     costs, objectives = set(), set()
     for seed in range(12):
         parameters, key = random_policy(network), jax.random.key(seed)
-        run = simulate(world, network, parameters, key, num_trajectories=7, absorbing=task == 1)
+        run = simulate(key, world, network, parameters, num_trajectories=7, absorbing=task == 1)
         found = np.stack(run.state, axis=-1)
         expected = [judge(world, states, task) for states in found]
         each = scores(world, run.state, task)
@@ -251,7 +251,7 @@ def test_the_key_decides():
     network = policy_network(world, (6, 5))
     parameters = random_policy(network)
     one, again, other = (
-        simulate(world, network, parameters, jax.random.key(s), num_trajectories=6)
+        simulate(jax.random.key(s), world, network, parameters, num_trajectories=6)
         for s in (0, 0, 1)
     )
     np.testing.assert_array_equal(np.stack(one.state), np.stack(again.state))
@@ -280,7 +280,7 @@ def test_a_users_task_with_several_constraints():
     near = jax.tree_util.Partial(rate, jnp.array(0.5))
     parameters, key = random_policy(NETWORK), jax.random.key(3)
     objective, cost = evaluator(WORLD, near, num_trajectories=4)(parameters, key)
-    run = simulate(WORLD, NETWORK, parameters, key, num_trajectories=4)
+    run = simulate(key, WORLD, NETWORK, parameters, num_trajectories=4)
     each, both = rate(0.5, WORLD, run)
     assert cost.shape == (2,)
     np.testing.assert_allclose(objective, each.mean(), rtol=1e-9)

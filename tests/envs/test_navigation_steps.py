@@ -45,10 +45,10 @@ def test_episodes_are_trajectories(task):
     episode = jax.jit(lambda: run_episode(own, environment, agent(parameters), num_steps=9))()
     assert episode.terminated and episode.valid.sum() == 8
     run = nav.simulate(
+        jax.random.split(own)[0],
         WORLD,
         NETWORK,
         parameters,
-        jax.random.split(own)[0],
         num_trajectories=1,
         absorbing=task == 1,
     )

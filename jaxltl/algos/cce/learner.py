@@ -28,11 +28,11 @@ Example: the point nearest to (1, 1) with a first coordinate of at most 0.5.
   >>> state, metrics = cce.train(key, problem, hparams, num_steps=50)
   >>> metrics.max_deviation.shape, cce.policy(state, problem, hparams).shape
   ((50,), (2,))
-  >>> solved = cce.result(state, problem, hparams, fresh)
+  >>> solved = cce.result(fresh, state, problem, hparams)
   >>> solved.solution.round(2).tolist(), bool(solved.solution[0] <= 0.5)
   ([0.5, 1.0], True)
   >>> again = jax.eval_shape(
-  ...     lambda x, key: cce.assess(problem, x, key, num_evaluations=10), problem.family.mean, key)
+  ...     lambda key, x: cce.assess(key, problem, x, num_evaluations=10), key, problem.family.mean)
   >>> again.upper.shape
   (1,)
 """
@@ -137,7 +137,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     draw_key, evaluate_key = jax.random.split(learner.step_key(state))
     draw = families.sample_antithetic if hparams.antithetic else families.sample
     samples = draw(state.family, draw_key, hparams.population)
-    objective, cost = evaluate_all(problem, hparams, samples, evaluate_key)
+    objective, cost = evaluate_all(evaluate_key, problem, hparams, samples)
     num_samples, count = _sizes(hparams, state.step)
     active = jnp.arange(hparams.population) < num_samples
     limit = problem.limit - hparams.margin
@@ -336,7 +336,7 @@ class SearchResult(NamedTuple):
 
 
 def assess(
-    problem: Problem, parameters: jax.Array, key: Key, *, num_evaluations: int = 1000
+    key: Key, problem: Problem, parameters: jax.Array, *, num_evaluations: int = 1000
 ) -> Assessment:
     """The :class:`Assessment` of a policy `parameters`, ``float[D]``, on fresh evaluations.
 
@@ -358,17 +358,17 @@ def assess(
             f"parameters is {validation.shorten(parameters)}; give those of one policy, float{[*shape]}, "
             "such as cce.policy(state, problem, hparams). Many are a vmap."
         )
-    return _assessed(problem, parameters, require_key(key), num_evaluations)
+    return _assessed(require_key(key), problem, parameters, num_evaluations)
 
 
 @partial(jax.jit, static_argnames="num_evaluations")
 def _assessed(
-    problem: Problem, parameters: jax.Array, key: Key, num_evaluations: int
+    key: Key, problem: Problem, parameters: jax.Array, num_evaluations: int
 ) -> Assessment:
     from scipy.special import stdtrit
 
     keys = jax.random.split(key, num_evaluations)
-    objective, cost = jax.vmap(partial(scores, problem), (None, 0))(parameters, keys)
+    objective, cost = jax.vmap(lambda key: scores(key, problem, parameters))(keys)
     objective, (mean, deviation) = _moments(objective)[0], _moments(cost)
     margin = float(stdtrit(num_evaluations - 1, 0.975)) / math.sqrt(num_evaluations) * deviation
     known = jnp.isfinite(mean)
@@ -395,7 +395,7 @@ def _moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def result(
-    state: State, problem: Problem, hparams: Hparams, key: Key, *, num_evaluations: int = 1000
+    key: Key, state: State, problem: Problem, hparams: Hparams, *, num_evaluations: int = 1000
 ) -> SearchResult:
     """The :class:`SearchResult` of a search: the mean policy and the best sample on fresh evaluations.
 
@@ -420,10 +420,10 @@ def result(
         )
     keys = jax.random.split(key)
     sampled = state.best if bool(state.best.valid) else state.least
-    look = partial(assess, problem, num_evaluations=num_evaluations)
+    points = {"mean": families.center(state.family), "best": sampled.parameters}
     both = {
-        "mean": look(families.center(state.family), keys[0]),
-        "best": look(sampled.parameters, keys[1]),
+        name: assess(key, problem, point, num_evaluations=num_evaluations)
+        for key, (name, point) in zip(keys, points.items(), strict=True)
     }
     if not bool(sampled.valid):  # no step was made
         both["best"] = both["mean"]

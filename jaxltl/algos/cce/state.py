@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -164,16 +163,17 @@ def split(value: PyTree) -> tuple[jax.Array, jax.Array]:
 
 
 def evaluate_all(
-    problem: PyTree, hparams: PyTree, samples: jax.Array, key: Key
+    key: Key, problem: PyTree, hparams: PyTree, samples: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
     keys = jax.random.split(key, len(samples))
     samples, keys = lanes.split_axis((samples, keys), hparams.sharding)
+    both = jax.vmap(lambda key, x: scores(key, problem, x))(keys, samples)
     # Every device ranks them all, in one order of operations.
-    return lanes.replicate(jax.vmap(partial(scores, problem))(samples, keys), hparams.sharding)
+    return lanes.replicate(both, hparams.sharding)
 
 
-def scores(problem: PyTree, parameters: jax.Array, key: Key) -> tuple[jax.Array, jax.Array]:
+def scores(key: Key, problem: PyTree, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Objective and costs ``[C]`` of one evaluation."""
     objective, cost = split(problem.evaluate(parameters, key))
     require_shape("the cost that evaluate returned", cost, problem.limit.shape)

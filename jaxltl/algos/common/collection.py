@@ -43,12 +43,12 @@ class Transition(NamedTuple):
 
 
 def transition(
+    key: Key,
     environment: Environment,
     evaluate: Evaluate,
     squash: str | None,
     before: tuple[PyTree, PyTree],
     noise: jax.Array | None,
-    key: Key,
 ) -> tuple[PyTree, PyTree, Transition]:
     """World and memory after one transition of one environment, and its record."""
     world, memory = before

@@ -286,7 +286,7 @@ def _walk(
     def one(walker: Walkers, noise: jax.Array, key: Key) -> tuple[Walkers, _TransitionRecord]:
         before = (walker.world, walker.memory)
         world, memory, record = transition(
-            environment, partial(evaluate, run), hparams.squash, before, noise, key
+            key, environment, partial(evaluate, run), hparams.squash, before, noise
         )
         row = _TransitionRecord(
             of=record,

@@ -329,8 +329,8 @@ def _rollout(
     evaluate = partial(_evaluate, (state, problem, hparams))
 
     def move(carry: PyTree, chance: PyTree) -> PyTree:
-        world, active, cut = carry
-        after, _, record = transition(environment, evaluate, None, (world, ()), *chance)
+        (world, active, cut), (noise, key) = carry, chance
+        after, _, record = transition(key, environment, evaluate, None, (world, ()), noise)
         world = jax.tree.map(partial(jnp.where, active), after, world)
         cut |= active & record.truncated & ~record.terminated
         vectors = flat_observation(record.observation), record.raw.ravel()

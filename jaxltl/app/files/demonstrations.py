@@ -153,7 +153,7 @@ def _read_action(value: object, world: MappedModel) -> int:
 
 
 def synthetic_demonstrations(
-    path: Path, table: SyntheticTable, model: Product, key: jax.Array, best: Solution
+    key: jax.Array, path: Path, table: SyntheticTable, model: Product, best: Solution
 ) -> tuple[Trajectories, int]:
     """Rollouts of the quickest optimal policy, in the world.
 

@@ -428,10 +428,10 @@ _RUNS = 1000  # simulated at a time
 
 
 def counterexample(
+    key: chex.PRNGKey,
     dynamics: Dynamics,
     policy: Policy,
     formula: str | Formula,
-    key: chex.PRNGKey,
     certificate: Certificate | None = None,
     num_steps: int = 200,
 ) -> Floats | None:
@@ -443,8 +443,8 @@ def counterexample(
     for good; no other finite run violates ``F goal``. Disturbances are uniform, so that a worst case may be missed.
 
     Args:
-      dynamics, policy, formula: as of :func:`certify_policy`.
       key: random key.
+      dynamics, policy, formula: as of :func:`certify_policy`.
       certificate: bounds of the same policy, by which the initial cell is chosen; default: initial
         states are sampled.
       num_steps: longest run; static. One thousand runs are simulated.
@@ -461,7 +461,7 @@ def counterexample(
       >>> world = make_dynamics(
       ...     lambda x, u, w: x + u, domain=([0.0], [1.0]), actions=([-1.0], [1.0]),
       ...     labels={"pit": ([0.8], [1.0])}, initial=([0.0], [0.1]))
-      >>> run = counterexample(world, lambda x: x * 0 + 0.25, "G !pit", jax.random.key(0))
+      >>> run = counterexample(jax.random.key(0), world, lambda x: x * 0 + 0.25, "G !pit")
       >>> len(run), bool(run[-1, 0] >= 0.8)
       (4, True)
     """

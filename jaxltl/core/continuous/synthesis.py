@@ -190,13 +190,13 @@ def _actions(dynamics: Dynamics, actions: ArrayLike | None) -> Floats:
 
 
 def simulate_cells(
-    policy: CellPolicy, key: jax.Array, state: Array, num_steps: int
+    key: chex.PRNGKey, policy: CellPolicy, state: Array, num_steps: int
 ) -> tuple[Array, Array, Array]:
     """A simulated run under a policy on cells.
 
     Args:
-      policy: of :func:`synthesize_policy`.
       key: random key.
+      policy: of :func:`synthesize_policy`.
       state: ``float[n]``, the initial state.
       num_steps: T, static.
 
@@ -208,7 +208,7 @@ def simulate_cells(
       ...     lambda x, u, w: x + u, domain=([-1.0], [1.0]), actions=[[-0.2], [0.2]],
       ...     labels={"left": ([-1.0], [-0.5])}, initial=([0.0], [0.5]))
       >>> policy = synthesize_policy(world, "F left", cells=[40])
-      >>> states, _, _ = simulate_cells(policy, jax.random.key(0), jnp.array([0.1]), 4)
+      >>> states, _, _ = simulate_cells(jax.random.key(0), policy, jnp.array([0.1]), 4)
       >>> bool(jnp.allclose(states[:, 0], jnp.array([0.1, -0.1, -0.3, -0.5]), atol=1e-6))
       True
     """

@@ -145,7 +145,7 @@ def run_episode(key: Key, environment: Environment, agent: Agent, *, num_steps: 
     begin, path = begin_episode(require_key(key), environment, agent)
 
     def move(now: Underway, time: jax.Array) -> tuple[Underway, Episode]:
-        return continue_episode(now, environment, agent, jax.random.fold_in(path, time))
+        return continue_episode(jax.random.fold_in(path, time), now, environment, agent)
 
     end, steps = lax.scan(move, begin, jnp.arange(num_steps))
 
@@ -178,7 +178,7 @@ def begin_episode(key: Key, environment: Environment, agent: Agent) -> tuple[Und
 
 
 def continue_episode(
-    now: Underway, environment: Environment, agent: Agent, key: Key
+    key: Key, now: Underway, environment: Environment, agent: Agent
 ) -> tuple[Underway, Episode]:
     """One step of an episode, with the state and the label before it; the identity after the end."""
     world, active = now.world, ~(now.terminated | now.truncated)
@@ -208,12 +208,13 @@ def continue_episode(
 
 
 def auto_reset_step(
-    environment: Environment, world: PyTree, action: PyTree, key: Key
+    key: Key, environment: Environment, world: PyTree, action: PyTree
 ) -> tuple[PyTree, Timestep]:
     """A step that resets the environment where an episode ends.
 
     Args:
-      environment, world, action, key: as for ``environment.step``; the key serves the reset too.
+      key: random key, of the step and of the reset.
+      environment, world, action: as for ``environment.step``.
 
     Returns:
       The next state, after a reset if the episode ended, and the :class:`Timestep` with the state
@@ -224,7 +225,7 @@ def auto_reset_step(
     ...     lambda key: jnp.int32(0),
     ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
     ...     lambda world: world[None], actions=2)
-    >>> onward, made = auto_reset_step(coin, jnp.int32(0), jnp.int32(1), jax.random.key(0))
+    >>> onward, made = auto_reset_step(jax.random.key(0), coin, jnp.int32(0), jnp.int32(1))
     >>> int(onward), int(made.world)
     (0, 1)
     """

@@ -134,8 +134,8 @@ def test_a_counterexample_violates_the_formula_from_the_worst_initial_cell():
     key = jax.random.key(0)
     proof = certify_policy(WORLD, policy, FORMULA, cells=[40], max_cells=40)
     assert proof.initial_bounds[1] == 0.0
-    run = counterexample(WORLD, policy, FORMULA, key, proof)
+    run = counterexample(key, WORLD, policy, FORMULA, proof)
     assert 0.55 <= run[0, 0] <= 0.6 and run[-1, 0] >= 0.9
     assert ((run[:-1, 0] < 0.9) & (run[:-1, 0] > 0.2)).all()
     np.testing.assert_allclose(np.diff(run[:, 0]), 0.1, atol=0.021)
-    assert counterexample(WORLD, lambda x: -0.1 * jnp.sign(x), FORMULA, key) is None
+    assert counterexample(key, WORLD, lambda x: -0.1 * jnp.sign(x), FORMULA) is None

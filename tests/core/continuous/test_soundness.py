@@ -460,7 +460,7 @@ def test_a_shield_keeps_learners_inside_where_labels_satisfy_the_formula():
     run = run_episode(jax.random.key(0), shielded, agent, num_steps=30)
     assert int(np.asarray(run.world.verdict)[-1]) != Verdict.VIOLATED
     proof = certify_policy(world, lambda x: x * 0 + 0.4, formula, cells=[40])
-    violating = counterexample(world, lambda x: x * 0 + 0.4, formula, jax.random.key(0), proof)
+    violating = counterexample(jax.random.key(0), world, lambda x: x * 0 + 0.4, formula, proof)
     assert proof.initial_bounds == (0, 0) and violating[-1, 0] > 1 > violating[-2, 0]
 
 

@@ -316,7 +316,7 @@ def test_a_step_or_a_fresh_start():
 
     @jax.vmap
     def both(place, action, key):
-        world, found = auto_reset_step(environment, place, action, key)
+        world, found = auto_reset_step(key, environment, place, action)
         step_key, reset_key = jax.random.split(key)
         return world, found, environment.step(place, action, step_key), environment.reset(reset_key)
 

@@ -37,7 +37,7 @@ def walk(env, key, num_steps):
     def go(world, key):
         choose, step = jax.random.split(key)
         action = random_action(choose, env.actions, allowed_in(env, world))
-        after, found = auto_reset_step(env, world, action, step)
+        after, found = auto_reset_step(step, env, world, action)
         return after, (
             env.observe(world),
             action,

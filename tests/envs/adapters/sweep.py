@@ -258,7 +258,7 @@ def of_contacts(env, reset, step, steps=STEPS, walks=WALKS):
     def go(world, key):
         choose, at = jax.random.split(key)
         action = random_action(choose, env.actions)
-        after, found = auto_reset_step(env, world, action, at)
+        after, found = auto_reset_step(at, env, world, action)
         return after, (world, action, found._replace(world=env.observe(found.world)))
 
     def walked(key):

@@ -72,7 +72,7 @@ def episode_totals(
 
     def move(carry: PyTree) -> PyTree:
         now, time, paid, factor, sums = carry
-        now, transition = continue_episode(now, environment, agent, jax.random.fold_in(path, time))
+        now, transition = continue_episode(jax.random.fold_in(path, time), now, environment, agent)
         factor, read = factor * discount, accepting(now.world)
         reward, discounted, cost, visits, early = sums
         sums = (

@@ -126,7 +126,7 @@ def test_a_search_keeps_a_task_and_saves_effort():
     hparams = cce.Hparams(rate=0.5, population=60)
     key, fresh = jax.random.split(jax.random.key(0))
     state, _ = cce.train(key, problem, hparams, num_steps=12)
-    found = cce.result(state, problem, hparams, fresh, num_evaluations=50)
+    found = cce.result(fresh, state, problem, hparams, num_evaluations=50)
     assert found.solution is not None and found.solution[0] > 1.5 > found.solution[1]
     assert found.violation <= 0
 
