@@ -9,7 +9,8 @@ Henzinger 2012), but for those within k steps, which the recursion over the step
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -209,9 +210,11 @@ def recurring(matrix: np.ndarray, often: np.ndarray, *, always: bool) -> np.ndar
 # --- recursions over steps -----------------------------------------------------------------------------
 
 
-def steps(case: Case, aims: Aims, number: int, start: np.ndarray, update) -> np.ndarray:
+def steps(
+    case: Case, aims: Aims, number: int, start: np.ndarray, update, policy: np.ndarray | None = None
+) -> np.ndarray:
     """``x_{k+1}(s) = update(s, opt (r + P x_k)(s))`` from ``x_0 = start``; the reward may be 0."""
-    tables, value = options(case, aims, None), start
+    tables, value = options(case, aims, policy), start
     for _ in range(number):
         ahead = [
             max(min(update(s, row @ value, paid) for row, paid in line) for line in table)
@@ -219,3 +222,27 @@ def steps(case: Case, aims: Aims, number: int, start: np.ndarray, update) -> np.
         ]
         value = np.array(ahead)
     return value
+
+
+def within_budget(
+    case: Case,
+    aims: Aims,
+    goal: np.ndarray,
+    reward: np.ndarray,
+    budget: float,
+    policy: np.ndarray | None = None,
+) -> np.ndarray:
+    """Probability of a goal before more than a budget of positive rewards is earned."""
+    tables = options(replace(case, reward=reward), aims, policy)
+
+    @cache
+    def value(left: float) -> np.ndarray:
+        if left < 0:
+            return np.zeros(case.num_states)
+        ahead = [
+            max(min(row @ value(left - paid) for row, paid in line) for line in table)
+            for table in tables
+        ]
+        return np.where(goal, 1.0, ahead)
+
+    return value(budget)

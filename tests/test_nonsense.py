@@ -134,10 +134,13 @@ def things(folder):
             jl.optimal_satisfaction,
             {"model": model, "formula": "F a", "states": [0], "label_on": None},
         ),
-        (jl.values.robust_next_probability, asked),
-        (jl.values.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
-        (jl.values.robust_cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),
-        (jl.values.robust_instantaneous_reward, {"model": model, "reward": "r", "num_step": 2}),
+        (jl.values.next_probability, asked),
+        (
+            jl.values.bounded_reachability,
+            {**asked, "num_steps": 2, "stay": None, "policy": None, "by_step": False},
+        ),
+        (jl.values.cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),
+        (jl.values.instantaneous_reward, {"model": model, "reward": "r", "num_step": 2}),
         (
             jl.values.robust_sensitivity,
             {
@@ -747,7 +750,7 @@ def test_good_input_is_taken(tmp_path):
     ("call", "message"),
     [
         (
-            lambda m: jl.values.robust_bounded_reachability(m, "a", None),
+            lambda m: jl.values.bounded_reachability(m, "a", None),
             "num_steps=None; it must be an integer",
         ),
         (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),

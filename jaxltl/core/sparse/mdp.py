@@ -118,6 +118,13 @@ class HostMDP(HostGraph):
         arrays = self.probability, self.successor, self.entry_start
         return sparse.csr_array(arrays, shape=(self.num_rows, self.num_states))
 
+    @cached_property
+    def backup_unit(self) -> float:
+        """Relative rounding of one backup of nonnegative values, including that of row sums."""
+        # Each product and each sum adds less than one unit of rounding.
+        width = int(np.diff(self.entry_start).max(initial=1))
+        return (2 * width + 6) * float(np.finfo(np.float64).eps)
+
     def expectation(self, value: Floats) -> Floats:
         """The expected value of the next state, ``float64[R]``."""
         if self.successor.size <= _SMALL:

@@ -38,12 +38,6 @@ from .interval.sensitivity import (
     Sensitivity as Sensitivity,
     robust_sensitivity as robust_sensitivity,
 )
-from .interval.step_bounded import (
-    robust_bounded_reachability as robust_bounded_reachability,
-    robust_cumulative_reward as robust_cumulative_reward,
-    robust_instantaneous_reward as robust_instantaneous_reward,
-    robust_next_probability as robust_next_probability,
-)
 from .multi_objective.multi_objective import (
     Achievable as Achievable,
     ConstrainedOptimum as ConstrainedOptimum,

@@ -12,7 +12,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.io.drn.drn import read_drn
 from jaxltl.io.storm import to_stormpy
-from tests.core.sparse.interval.test_step_bounded import random_interval, vertices
+from tests.core.sparse.bounded.test_uncertain_steps import random_interval, vertices
 
 BOTH = ("maxmin", "maxmax", "minmin", "minmax")
 
@@ -77,6 +77,9 @@ def test_the_robot_of_prism(delta, p, q, tmp_path):
     first = 'F "goal1" | "goal2"'
     assert_enclosed(model, f'R{{"time"}}minmin=? [ {first} ]', min(109 / 90, 6 / 5 + p / 10))
     assert_enclosed(model, f'R{{"time"}}minmax=? [ {first} ]', 98 / 80)
+    for aim in ("maxmin", "minmax"):
+        steps = solve_property(model, f'P{aim}=? [ F<=4 "goal1" ]').value[0]
+        assert_enclosed(model, f'P{aim}=? [ F{{"time"}}<=4 "goal1" ]', steps)
     if delta == 0.05:
         assert_enclosed(model, 'Rminmax=? [ F "goal2" ]', 31 / 24)
         assert_enclosed(model, 'Tminmax=? [ F "goal2" ]', 31 / 24)
@@ -380,7 +383,6 @@ def test_what_has_no_intervals_takes_one_direction():
         ),
         ("Rminmax=? [ S ]", r"averages in the long run"),
         ('LRAminmax=? [ "goal1" ]', r"averages in the long run"),
-        ('Pmaxmin=? [ F{"time"}<=5 "goal1" ]', r"bounds on rewards"),
         ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
         ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),
     ],

@@ -23,6 +23,7 @@ from tests import reference_matrix as reference
 from tests.model_kinds import KINDS, Subject
 
 DISCOUNT, STEPS, RELATIVE = 0.75, 3, 1e-8
+BUDGET, UNIT = 3.0, 0.25  # of rewards that are at least one unit
 
 # --- the questions --------------------------------------------------------------------------------------
 
@@ -94,7 +95,7 @@ for objective in ("max", "min"):
         )
 
 
-def within(s: Subject, objective: str, nature=None) -> np.ndarray:
+def within(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
     """Recursion over the steps."""
     a, b = s.case.a, s.case.b
     return reference.steps(
@@ -103,34 +104,27 @@ def within(s: Subject, objective: str, nature=None) -> np.ndarray:
         STEPS,
         b.astype(float),
         lambda state, ahead, _: 1.0 if b[state] else ahead * a[state],
+        policy,
     )
 
 
-def cumulated(s: Subject, objective: str) -> np.ndarray:
-    start = np.zeros(s.case.num_states)
-    return reference.steps(
-        s.case, s.aims(objective), STEPS, start, lambda _, ahead, paid: paid + ahead
-    )
+def cumulated(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
+    aims, start = s.aims(objective, nature), np.zeros(s.case.num_states)
+    return reference.steps(s.case, aims, STEPS, start, lambda _, ahead, paid: paid + ahead, policy)
 
 
-def next_step(s: Subject, objective: str) -> np.ndarray:
-    start = s.case.b.astype(float)
-    return reference.steps(s.case, s.aims(objective), 1, start, lambda _, ahead, __: ahead)
+def next_step(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
+    aims, start = s.aims(objective, nature), s.case.b.astype(float)
+    return reference.steps(s.case, aims, 1, start, lambda _, ahead, __: ahead, policy)
+
+
+def affordable(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
+    aims = s.aims(objective, nature)
+    return reference.within_budget(s.case, aims, s.case.b, s.case.reward + UNIT, BUDGET, policy)
 
 
 for objective in ("max", "min"):
     direction = {"objective": objective}
-    question(f"within {STEPS} {objective}", partial(within, **direction))(
-        lambda s, m, o=direction: jl.values.bounded_reachability(
-            m, s.mask(s.case.b), STEPS, stay=s.mask(s.case.a), **o
-        )
-    )
-    question(f"next {objective}", partial(next_step, **direction))(
-        lambda s, m, o=direction: jl.values.next_probability(m, s.mask(s.case.b), **o)
-    )
-    question(f"reward of {STEPS} steps {objective}", partial(cumulated, **direction))(
-        lambda s, m, o=direction: jl.values.cumulative_reward(m, s.reward, STEPS, **o)
-    )
     question(f"prepared reach {objective}", partial(reaching, **direction))(
         lambda s, m, o=direction: jl.solve_prepared(jl.prepare(m, s.mask(s.case.b), **o))
     )
@@ -139,6 +133,22 @@ for objective in ("max", "min"):
         name = objective + (", helped" if nature else "")
         question(f"average {name}", partial(averaging, **aims))(
             lambda s, m, aims=aims: jl.average_reward(m, s.reward, **aims)
+        )
+        question(f"within {STEPS} {name}", partial(within, **aims))(
+            lambda s, m, aims=aims: jl.values.bounded_reachability(
+                m, s.mask(s.case.b), STEPS, stay=s.mask(s.case.a), **aims
+            )
+        )
+        question(f"next {name}", partial(next_step, **aims))(
+            lambda s, m, aims=aims: jl.values.next_probability(m, s.mask(s.case.b), **aims)
+        )
+        question(f"reward of {STEPS} steps {name}", partial(cumulated, **aims))(
+            lambda s, m, aims=aims: jl.values.cumulative_reward(m, s.reward, STEPS, **aims)
+        )
+        question(f"within a budget {name}", partial(affordable, **aims))(
+            lambda s, m, aims=aims: jl.values.reward_bounded_reachability(
+                m, s.mask(s.case.b), s.reward + UNIT, BUDGET, **aims
+            )
         )
 
 question("discounted", partial(discounting, objective="max"))(
@@ -167,6 +177,22 @@ question("policy: discounted", of_policy(discounting))(
 )
 question("policy: average", of_policy(averaging))(
     lambda s, m: jl.average_reward(m, s.reward, policy=s.policy)
+)
+question(f"policy: within {STEPS}", of_policy(within))(
+    lambda s, m: jl.values.bounded_reachability(
+        m, s.mask(s.case.b), STEPS, stay=s.mask(s.case.a), policy=s.policy
+    )
+)
+question("policy: next", of_policy(next_step))(
+    lambda s, m: jl.values.next_probability(m, s.mask(s.case.b), policy=s.policy)
+)
+question(f"policy: reward of {STEPS} steps", of_policy(cumulated))(
+    lambda s, m: jl.values.cumulative_reward(m, s.reward, STEPS, policy=s.policy)
+)
+question("policy: within a budget", of_policy(affordable))(
+    lambda s, m: jl.values.reward_bounded_reachability(
+        m, s.mask(s.case.b), s.reward + UNIT, BUDGET, policy=s.policy
+    )
 )
 question("policy: discounted, worst case", of_policy(discounting))(
     lambda s, m: jl.values.strategy_value(m, s.policy, s.reward, DISCOUNT)
@@ -309,18 +335,28 @@ robust reach min, helped          .....++ +..++++ ....... .......
 reward min, helped                .....++ ....... ....... .......
 robust reward min, helped         .....++ +..++++ ....... .......
 robust discounted min, helped     .....++ +..++++ ....... .......
-within 3 max                      +++++++ ....... +++++.. .......
-next max                          +++++++ ....... +++++.. .......
-reward of 3 steps max             +++++++ ....... +++++.. .......
 prepared reach max                +++++++ ....... +++++.. .......
 average max                       +++++++ +++++++ +++++++ +++++++
+within 3 max                      +++++++ +++++++ +++++++ +++++++
+next max                          +++++++ +++++++ +++++++ +++++++
+reward of 3 steps max             +++++++ +++++++ +++++++ +++++++
+within a budget max               +++++++ +++++++ +++++++ +++++++
 average max, helped               .....++ .....++ .....++ .....++
-within 3 min                      +++++++ ....... +++++.. .......
-next min                          +++++++ ....... +++++.. .......
-reward of 3 steps min             +++++++ ....... +++++.. .......
+within 3 max, helped              .....++ .....++ .....++ .....++
+next max, helped                  .....++ .....++ .....++ .....++
+reward of 3 steps max, helped     .....++ .....++ .....++ .....++
+within a budget max, helped       .....++ .....++ .....++ .....++
 prepared reach min                +++++++ ....... +++++.. .......
 average min                       +++++++ +++++++ +++++++ +++++++
+within 3 min                      +++++++ +++++++ +++++++ +++++++
+next min                          +++++++ +++++++ +++++++ +++++++
+reward of 3 steps min             +++++++ +++++++ +++++++ +++++++
+within a budget min               +++++++ +++++++ +++++++ +++++++
 average min, helped               .....++ .....++ .....++ .....++
+within 3 min, helped              .....++ .....++ .....++ .....++
+next min, helped                  .....++ .....++ .....++ .....++
+reward of 3 steps min, helped     .....++ .....++ .....++ .....++
+within a budget min, helped       .....++ .....++ .....++ .....++
 discounted                        +++++++ ....... +++++.. .......
 discounted of both players        +++++.. +++++.. +++++.. +++++..
 policy: reach                     +++++++ ....... +++++.. .......
@@ -328,6 +364,10 @@ policy: robust reach              .....++ +..++++ ....... .......
 policy: reward                    +++++++ ....... +++++.. .......
 policy: discounted                +++++++ ....... +++++.. .......
 policy: average                   +++++++ +++++++ +++++++ +++++++
+policy: within 3                  +++++++ +++++++ +++++++ +++++++
+policy: next                      +++++++ +++++++ +++++++ +++++++
+policy: reward of 3 steps         +++++++ +++++++ +++++++ +++++++
+policy: within a budget           +++++++ +++++++ +++++++ +++++++
 policy: discounted, worst case    +++++.. +++++.. +++++.. +++++..
 F b max                           +++++++ +++++++ +++++++ .......
 F b min                           +++++++ +++++++ +++++++ .......

@@ -36,7 +36,6 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import mask_of, offsets_from_counts, positions
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.reachability import quotient_policy
-from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -221,7 +220,7 @@ class Submodel:
     @cached_property
     def unit(self) -> float:
         """The rounding of one backup."""
-        return backup_unit(self.mdp) + self.scale.depth * _EPS
+        return self.mdp.backup_unit + self.scale.depth * _EPS
 
     def change(self, v: Floats) -> Floats:
         """``T v - v``."""

@@ -3,37 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Unpack, cast
+from typing import Unpack
 
 import numpy as np
 
 from jaxltl.core import validation
-from jaxltl.core.array_types import Booleans
-from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel, Array, Model
-from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, reward_structure
+from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP
 from jaxltl.core.sparse.interval.average_reward import AverageGame, AverageGoal, optimal_average
 from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 
 from jaxltl.core.sparse.solvers.average_reward import RewardRange, Scale, average, within_range
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
-from jaxltl.core.types import Solution, row_tolerance
-from jaxltl.core.values.engine.host_solution import induced_chain, is_sparse, with_given_policy
+from jaxltl.core.types import Solution
+from jaxltl.core.values.engine.host_solution import induced_chain
+from jaxltl.core.values.engine.model_rows import ModelRows, model_rows
 from jaxltl.core.values.engine.state_quantities import (
     finite_reward,
-    reduction_for,
     reward_span,
-    row_reward,
     solution_from_error,
     transition_reward,
 )
 from jaxltl.core.values.engine.validated import SolverOptions, validated
-from jaxltl.core.values.interval.robust import nature_direction, refuse_nature
 
 
 @validated(games=True, host=True)
@@ -87,50 +80,33 @@ def average_reward(
       ([5.0, 8.0, 4.0], [0, 2, 3])
     """
     (max_steps,) = validation.options("average_reward", options, max_steps=1_000_000)
-    reduction_for(objective)
-    lazy = model.mdp if isinstance(model, Game) else model
-    world = lazy.mdp if isinstance(lazy, Product) else lazy
-    sets = None
-    if isinstance(world, IntervalMDP):
-        nature = nature_direction(nature, objective)
-        if isinstance(lazy, Product):
-            product = lazy
-            world = world.changed(lambda nominal: to_sparse(replace(product, mdp=nominal)))
-        sparse, sets = world.nominal, world.host
-        rewards = reward_structure(sparse, reward)
-    else:
-        refuse_nature(nature)
-        sparse = to_sparse(lazy)
-        rewards = reward_structure(sparse, row_reward(lazy, sparse, reward))
+    world = model_rows(model, objective, nature)
+    sparse, sets, rewards = world.sparse, world.sets, world.rewards(reward)
     earned, magnitude = finite_reward(sparse, rewards)
     goal = AverageGoal(_range(rewards), tolerance, max_steps)
     if sets is None and not isinstance(model, Game):
         enclosure = _of_one_player(model, sparse, (earned, magnitude), objective, policy, goal)
     else:
-        game, row = _game(model, sparse, sets, rewards, (objective, nature), policy)
+        game, row = _game(world, rewards, policy)
         values = optimal_average(game, goal)
         enclosure = _original(values, row, sparse.num_states)
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(enclosure.upper - enclosure.value, enclosure.value - enclosure.lower)
     least = small * float(magnitude.max())
-    by_rows = is_sparse(lazy) or sets is not None
-    choice = enclosure.row if by_rows else np.asarray(sparse.action)[enclosure.row]
     solution = solution_from_error(
         enclosure.value,
         error,
-        choice.astype(np.int32).reshape(model.state_shape),
+        enclosure.row,
         enclosure.rounds,
         enough=tolerance / 2 * np.maximum(np.abs(enclosure.value), least),
         span=(goal.ends.least, goal.ends.largest),
     )
-    parts: dict[str, Array] = {
-        name: getattr(solution, name).reshape(model.state_shape)
-        for name in ("value", "lower", "upper")
-    }
-    parts["residual"] = np.float64(enclosure.residual)
+    nature_choice: Array | None = None
     if sets is not None and policy is None:
-        parts["nature"] = values.probability
-    return with_given_policy(replace(solution, **parts, method=enclosure.method), policy)
+        nature_choice = values.probability
+    residual: Array = np.float64(enclosure.residual)
+    solution = replace(solution, residual=residual, nature=nature_choice, method=enclosure.method)
+    return world.shaped(solution, policy)
 
 
 def _range(rewards: Rewards) -> RewardRange:
@@ -175,55 +151,25 @@ def _of_one_player(
     return replace(enclosure, value=-enclosure.value, lower=low, upper=high)
 
 
-def _game(
-    model: Model,
-    sparse: SparseMDP,
-    sets: UncertainMDP | None,
-    rewards: Rewards,
-    directions: tuple[str, str | None],
-    policy: Array | None,
-) -> tuple[AverageGame, Array]:
+def _game(world: ModelRows, rewards: Rewards, policy: Array | None) -> tuple[AverageGame, Array]:
     """The game of a model, under a policy of the system, and the original row of each row."""
-    host, (objective, nature) = sparse.host, directions
-    is_system = np.ones(sparse.num_states, bool)
-    if isinstance(model, Game):
-        is_system, model = np.asarray(model.system, bool).ravel(), model.mdp
+    sparse, host, is_system = world.sparse, world.sparse.host, world.is_system
     game = AverageGame(
-        UncertainMDP(host, host.probability, host.probability) if sets is None else sets,
+        UncertainMDP(host, host.probability, host.probability)
+        if world.sets is None
+        else world.sets,
         transition_reward(sparse, rewards),
-        is_system == (objective == "max"),
-        None if nature is None else nature == "max",
+        world.maximizes,
+        None if world.nature is None else world.nature == "max",
     )
     if policy is None:
         return game, np.arange(sparse.num_rows)
-    weight = _weights(model, sparse, sets is not None, np.asarray(policy), is_system)
+    weight = world.weights(policy)
     if np.isin(weight[is_system[host.state]], (0, 1)).all():
         small, row, _ = game.restricted(~is_system[host.state] | (weight > 0))
         return small, row
     weight = weight / np.where(is_system, host.over_choices(np.add, weight), 1)[host.state]
     return game.with_half_steps(is_system, weight)
-
-
-def _weights(
-    model: Model, sparse: SparseMDP, has_sets: bool, policy: Array, where: Booleans
-) -> Array:
-    """A policy as checked weights of rows, ``float64[R]``."""
-    if has_sets or is_sparse(model):
-        flat = policy.ravel() if is_deterministic(policy) else policy
-        return row_weights(sparse, flat, where)
-    num_actions = cast(ActionModel, model).num_actions
-    actions = (*model.state_shape, num_actions)
-    if is_deterministic(policy) and policy.shape == actions[:-1]:
-        policy = np.eye(num_actions)[policy]
-    if policy.shape != actions:
-        raise ValueError(
-            f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
-            f"or {actions} of their probabilities."
-        )
-    flat = policy.reshape(sparse.num_states, -1).astype(np.float64)
-    weight = flat[sparse.host.state, np.asarray(sparse.action)]
-    require_weights(sparse.host, weight, row_tolerance(np.float64), where)
-    return weight
 
 
 def _original(values: RobustValues, row: Array, num_states: int) -> Enclosure:

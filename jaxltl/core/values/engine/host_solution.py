@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.compiled import flatten_policy, is_sparse as is_sparse
+from jaxltl.core.models.compiled import is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.protocols import ActionModel, Array, Model
@@ -121,11 +121,7 @@ class PolicyChain(NamedTuple):
 def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> PolicyChain:
     """Markov chain induced by a policy."""
     host = sparse.host
-    if is_sparse(model):
-        weight = row_weights(sparse, flatten_policy(model, policy))
-    else:
-        weight = _weights(cast(ActionModel, model), sparse, np.asarray(policy))
-        require_weights(host, weight, row_tolerance(np.float64))
+    weight = policy_weights(model, sparse, policy, by_rows=is_sparse(model))
     total = host.over_choices(np.add, weight)
     from scipy.sparse import csr_array
 
@@ -144,19 +140,27 @@ def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> PolicyChain
     return PolicyChain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
 
-def _weights(model: ActionModel, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
-    """A padded model's policy as weights of its rows."""
-    actions = (*model.state_shape, model.num_actions)
+def policy_weights(
+    model: Model, sparse: SparseMDP, policy: Array, *, by_rows: bool, where: Array = True
+) -> np.ndarray:
+    """A policy of some states as checked weights of rows, ``float64[R]``."""
+    policy = np.asarray(policy)
+    if by_rows:
+        flat = policy.ravel() if policy.shape == model.state_shape else policy
+        return row_weights(sparse, flat, where)
+    num_actions = cast(ActionModel, model).num_actions
+    actions = (*model.state_shape, num_actions)
     if is_deterministic(policy) and policy.shape == actions[:-1]:
-        policy = np.eye(model.num_actions)[policy]
+        policy = np.eye(num_actions)[policy]
     if policy.shape != actions:
         raise ValueError(
             f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
             f"or {actions} of their probabilities."
         )
-    flat = policy.reshape(sparse.num_states, -1)
-    result: np.ndarray = flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
-    return result
+    flat = policy.reshape(sparse.num_states, -1).astype(np.float64)
+    weight: np.ndarray = flat[sparse.host.state, np.asarray(sparse.action)]
+    require_weights(sparse.host, weight, row_tolerance(np.float64), where)
+    return weight
 
 
 def with_given_policy(solution: Solution, policy: Array) -> Solution:

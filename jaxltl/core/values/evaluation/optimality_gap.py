@@ -25,13 +25,12 @@ from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.bounded.row_game import RowGame
+from jaxltl.core.sparse.bounded.step_bounded import until
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
-from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    sparse_mdp_of_product,
     at_states,
     product_satisfaction,
 )
@@ -281,7 +280,9 @@ def _bounded(
     at_end = lasso_verdicts(automaton)[reachable.memory, letter[reachable.base_state]]
     target = np.where(ended, at_end, decisions[reachable.memory]) == Verdict.SATISFIED
     going = ~np.asarray(table.truncated)[reachable.base_state]
-    best = host.until(reachable.host, target, going, steps, np.maximum)
+    every = np.ones(target.size, bool)
+    game = RowGame(reachable.host, every)
+    best = until(game, target, going, steps)
     single = np.diff(base.row_start)[reachable.base_state] == 1
     fixed = reachable.still | (single & (ended | ~going))
     weight = _weights(
@@ -292,16 +293,10 @@ def _bounded(
         reachable.host,
         fixed,
     )
-    written = sparse_mdp_of_product(reachable)
-    chain = induced_chain(written, written, weight)
-    own = host.until(chain.mdp, target, going, steps, np.maximum)
-    # The chain's numbers are rounded before the sweeps begin.
-    unit = host.backup_unit(chain.mdp) + chain.depth * float(np.finfo(np.float64).eps)
-    wide = np.minimum(own.value * host.relative_error(unit, steps) + host.UNDERFLOW, 1)
-    error = np.where(own.error > 0, wide, 0)
+    own = until(game.under(weight, every)[0], target, going, steps)
     at = reachable.start
     return (
-        solution_from_error(own.value[at], error[at], None, own.num_steps, span=PROBABILITY),
+        solution_from_error(own.value[at], own.error[at], None, own.num_steps, span=PROBABILITY),
         solution_from_error(
             best.value[at],
             best.error[at],

@@ -19,7 +19,7 @@ from jaxltl.core.sparse.exact import bounded
 from jaxltl.core.sparse.exact.average import average
 from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP, TooLarge, Values, Work, flags
 from jaxltl.core.sparse.exact.total import least_total, reachability, until_end
-from jaxltl.core.sparse.solvers.reward_bounded import in_units
+from jaxltl.core.sparse.bounded.reward_bounded import in_units
 from jaxltl.core.values.engine.state_quantities import transition_reward
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,

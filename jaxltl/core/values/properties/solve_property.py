@@ -438,10 +438,8 @@ class _ModelQuery(NamedTuple):
 
     def result(self, solution: Solution, by: str = "") -> _Result:
         """A solution at all states, at those that are asked for."""
-        method = {"steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
         nature = None if solution.nature is None else np.asarray(solution.nature)
         strategy = PropertyStrategy(np.asarray(solution.policy), by, nature=nature)
-        solution = replace(solution, method=solution.method or method)
         return _Result(at_states(solution, self.states), strategy)
 
     def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
@@ -554,9 +552,8 @@ class _ModelQuery(NamedTuple):
         target, stay = self.where(path.right), self.where(path.left)
         if path.reward is not None:
             limit = reward_limit(path)
-            model = _without_intervals(self.model, self.text, "bounds on rewards")
             solution = bounded.reward_bounded_reachability(
-                model, target, path.reward or None, limit, stay=stay, objective=aim.policy
+                self.model, target, path.reward or None, limit, stay=stay, **aim.directions
             )
             result = self.result(solution, by="reward")
             return _opposite(result) if complement else result
@@ -571,7 +568,7 @@ class _ModelQuery(NamedTuple):
             )
         if complement and isinstance(tolerance, RelativeTolerance):
             avoided = bounded.bounded_avoidance(
-                self.model, target, path.upper, stay=stay, objective=asked.policy
+                self.model, target, path.upper, stay=stay, **asked.directions
             )
             if avoided is not None:
                 return self.result(avoided, by="steps")

@@ -6,63 +6,61 @@ Solved in double precision; bounds include all rounding.
 from __future__ import annotations
 
 import math
-from typing import TypeGuard
+from dataclasses import replace
+from typing import NamedTuple, cast
 
 import numpy as np
 
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import SparseMDP, reward_structure
-from jaxltl.core.sparse.solvers import step_bounded as host
-from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
+from jaxltl.core.models.sparse import Reward, reward_structure
+from jaxltl.core.sparse.bounded.backup import StepReward
+from jaxltl.core.sparse.bounded.reward_bounded import BudgetLevel, in_units, until_at_cost
+from jaxltl.core.sparse.bounded.row_game import RowGame
+from jaxltl.core.sparse.bounded.step_bounded import (
+    StepBoundedValues,
+    avoidance,
+    next_step,
+    total,
+    until,
+)
 from jaxltl.core.types import Solution
-from jaxltl.core.values.interval import step_bounded as robust
-from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.engine.model_rows import ModelRows, model_rows
 from jaxltl.core.values.engine.state_quantities import (
     PROBABILITY,
-    reduction_for,
+    Span,
+    finite_reward,
     reward_span,
+    solution_from_error,
     state_mask,
-    row_reward,
     state_reward,
     transition_reward,
-    finite_reward,
-    solution_from_error,
 )
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core import validation
 
 
-def _has_intervals(
-    model: Model, nature: str | None, by_step: bool = False
-) -> TypeGuard[IntervalMDP]:
-    """True for a model with intervals; raises ValueError for an option that is not for the model."""
-    if not isinstance(model, IntervalMDP):
-        refuse_nature(nature)
-        return False
-    if by_step:
-        raise ValueError(
-            "by_step is not for models with intervals; solve for each number of steps."
-        )
-    return True
-
-
-@validated(host=True)
+@validated(games=True, host=True)
 def next_probability(
-    model: Model, target: Array | str, *, objective: str = "max", nature: str | None = None
+    model: Model,
+    target: Array | str,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    policy: Array | None = None,
 ) -> Solution:
     """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
     Args:
-      model, target, objective, nature: as for :func:`bounded_reachability`.
+      model, target, objective, nature, policy: as for :func:`bounded_reachability`.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, `policy` the row of each state ``int32[S]``.
-      Concrete arrays only; not differentiable.
+      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      differentiable.
 
     Raises:
-      ValueError: the shape of the target or the objective.
+      ValueError: the shape of the target, the objective, the policy, or `nature` of a model without
+        intervals.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -71,27 +69,12 @@ def next_probability(
       >>> found.value.tolist(), found.policy.tolist()
       ([0.25, 1.0], [0, 2])
     """
-    if _has_intervals(model, nature):
-        return robust.robust_next_probability(model, target, objective=objective, nature=nature)
-    model, operation = _problem(model, objective)
-    mdp, target = model.host, state_mask(model, target, "target")
-    # One step of "until" in which the target counts only once it is entered.
-    image = mdp.expectation(target.astype(np.float64))
-    value = mdp.over_choices(operation, image)
-    choose = np.logical_or if operation is np.maximum else np.logical_and
-    positive = mdp.over_choices(choose, mdp.support.some_successor_in(target))
-    sure = mdp.over_choices(choose, ~mdp.support.some_successor_in(~target))
-    error = value * host.relative_error(host.backup_unit(mdp), 1)
-    value = np.where(sure, 1, np.where(positive, value, 0))
-    _, row = mdp.first_choice(
-        image == np.repeat(mdp.over_choices(operation, image), np.diff(mdp.row_start))
-    )
-    return solution_from_error(
-        value, np.where(sure | ~positive, 0, error), row, 1, span=PROBABILITY
-    )
+    problem = _problem(model, objective, nature, policy)
+    values = next_step(problem.game, problem.states(target, "target"))
+    return problem.solution(values, PROBABILITY)
 
 
-@validated(host=True)
+@validated(games=True, host=True)
 def bounded_reachability(
     model: Model,
     target: Array | str,
@@ -100,31 +83,38 @@ def bounded_reachability(
     stay: Array | str | None = None,
     objective: str = "max",
     nature: str | None = None,
+    policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
     """Step-bounded reachability probability, within n steps through the states of `stay`.
 
     ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` in
-    `stay`, else 0 (Baier and Katoen 2008, section 10.1.1). For large n the iteration ends once the
-    effect of further steps is bounded.
+    `stay`, else 0 (Baier and Katoen 2008, section 10.1.1); in models with intervals nature picks P
+    anew in each step (Givan, Leach and Dean 2000). For large n the iteration ends once the effect of
+    further steps is bounded.
 
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      model: any concrete model. In a game the environment has the opposite objective.
       target: ``bool[S]``, or the name of a label.
       num_steps: n.
       stay: ``bool[S]`` or a label that must hold before the target is reached; default everywhere.
-      objective: ``"max"`` or ``"min"``; irrelevant for chains.
-      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
+      objective: ``"max"`` or ``"min"``, of the system; irrelevant for chains.
+      nature: of models with intervals: ``"adversarial"`` (default), against the objective, or
+        ``"cooperative"``.
+      policy: evaluate this policy, of a game the system's: actions ``int32[S]`` or ``float[S, A]``;
+        rows or ``float[R]`` for sparse rows. Default: optimise.
       by_step: return the choices of all steps.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph decides. `policy`
-      is the first choice, as a row, ``int32[S]``; with `by_step` the choices of all steps in order,
-      ``int32[n, S]``. `num_steps` is the number of computed steps. Concrete arrays only; not
-      differentiable.
+      :class:`Solution`; `value` is ``float64`` in the shape of the states, exactly 0 or 1 where the
+      graph decides. `policy` is the first choice of each state, an action, or a row for sparse rows;
+      with `by_step` the choices of all steps in order, with an axis ``[n]`` in front. `num_steps` is
+      the number of computed steps, `nature` has the distributions of the first step. Concrete arrays
+      only; not differentiable.
 
     Raises:
-      ValueError: a shape, the objective, or a negative number of steps.
+      ValueError: a shape, the objective, a negative number of steps, the policy, or `nature` of a
+        model without intervals.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -132,40 +122,36 @@ def bounded_reachability(
       >>> bounded_reachability(model, [False, True], 3).value.tolist()
       [0.875, 1.0]
     """
-    if _has_intervals(model, nature, by_step):
-        return robust.robust_bounded_reachability(
-            model, target, num_steps, stay=stay, objective=objective, nature=nature
-        )
-    model, operation = _problem(model, objective, num_steps)
-    target = state_mask(model, target, "target")
-    stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
-    values = host.until(model.host, target, stay, num_steps, operation, by_step)
-    return solution_from_error(
-        values.value, values.error, values.row, values.num_steps, span=PROBABILITY
-    )
+    steps = validation.integer("num_steps", num_steps)
+    problem = _problem(model, objective, nature, policy)
+    goal, free = problem.states(target, "target"), problem.passable(stay)
+    return problem.solution(until(problem.game, goal, free, steps, by_step), PROBABILITY)
 
 
 def bounded_avoidance(
-    model: Model, target: Array, num_steps: int, *, stay: Array, objective: str = "max"
+    model: Model,
+    target: Array,
+    num_steps: int,
+    *,
+    stay: Array,
+    objective: str = "max",
+    nature: str | None = None,
 ) -> Solution | None:
     """Complement of :func:`bounded_reachability`, relatively exact; None for many steps."""
-    model, operation = _problem(model, objective, num_steps)
-    values = host.avoidance(model.host, target, stay, num_steps, operation)
-    if values is None:
-        return None
-    return solution_from_error(
-        values.value, values.error, values.row, values.num_steps, span=PROBABILITY
-    )
+    problem = _problem(model, objective, nature, None)
+    values = avoidance(problem.game, target, stay, num_steps)
+    return None if values is None else problem.solution(values, PROBABILITY)
 
 
-@validated(host=True)
+@validated(games=True, host=True)
 def cumulative_reward(
     model: Model,
-    reward: Array | str,
+    reward: Reward,
     num_steps: int,
     *,
     objective: str = "max",
     nature: str | None = None,
+    policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
     """Expected reward of the next n steps.
@@ -173,15 +159,15 @@ def cumulative_reward(
     ``x_{k+1}(s) = opt_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
 
     Args:
-      model, num_steps, objective, nature, by_step: as for :func:`bounded_reachability`.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
+      model, num_steps, objective, nature, policy, by_step: as for :func:`bounded_reachability`.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite, of any sign.
 
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
       differentiable.
 
     Raises:
-      ValueError: the reward, the objective, or a negative number of steps.
+      ValueError: the reward, or as for :func:`bounded_reachability`.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -189,26 +175,30 @@ def cumulative_reward(
       >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
       [1.75, 0.0]
     """
-    if _has_intervals(model, nature, by_step):
-        return robust.robust_cumulative_reward(
-            model, reward, num_steps, objective=objective, nature=nature
-        )
-    sparse, operation = _problem(model, objective, num_steps)
-    structure = reward_structure(sparse, row_reward(model, sparse, reward))
-    rewards = *finite_reward(sparse, structure), np.zeros(sparse.num_states)
-    values = host.total(sparse.host, rewards, num_steps, operation, by_step)
-    span = reward_span(structure, num_steps)
-    return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
+    steps = validation.integer("num_steps", num_steps)
+    problem = _problem(model, objective, nature, policy)
+    rewards = problem.world.rewards(reward)
+    earned, magnitude = finite_reward(problem.world.sparse, rewards)
+    entry = None
+    if problem.game.sets is not None:
+        entry = transition_reward(problem.world.sparse, rewards)
+        magnitude = np.maximum.reduceat(np.abs(entry), problem.world.sparse.host.entry_start[:-1])
+        entry = entry[problem.entry]
+    paid = StepReward(earned[problem.row], magnitude[problem.row], entry)
+    start = np.zeros(problem.game.mdp.num_states)
+    values = total(problem.game, paid, start, steps, by_step)
+    return problem.solution(values, reward_span(rewards, steps))
 
 
-@validated(host=True)
+@validated(games=True, host=True)
 def instantaneous_reward(
     model: Model,
-    reward: Array | str,
+    reward: Reward,
     num_step: int,
     *,
     objective: str = "max",
     nature: str | None = None,
+    policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
     """Expected reward of the state after n steps.
@@ -216,7 +206,7 @@ def instantaneous_reward(
     ``x_{k+1}(s) = opt_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
 
     Args:
-      model, objective, nature, by_step: as for :func:`bounded_reachability`.
+      model, objective, nature, policy, by_step: as for :func:`bounded_reachability`.
       reward: the name of a reward, a structure, of which only the rewards of states count, or an
         array ``[S]``. None is the only reward of the model.
       num_step: n.
@@ -226,7 +216,7 @@ def instantaneous_reward(
       differentiable.
 
     Raises:
-      ValueError: the reward has no part on states, or as for :func:`cumulative_reward`.
+      ValueError: the reward has no part on states, or as for :func:`bounded_reachability`.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -234,27 +224,25 @@ def instantaneous_reward(
       >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
       [0.125, 0.0]
     """
-    if _has_intervals(model, nature, by_step):
-        return robust.robust_instantaneous_reward(
-            model, reward, num_step, objective=objective, nature=nature
-        )
-    sparse, operation = _problem(model, objective, num_step)
-    zero = np.zeros(sparse.num_rows)
-    final = state_reward(sparse, row_reward(model, sparse, reward))
-    values = host.total(sparse.host, (zero, zero, final), num_step, operation, by_step)
-    span = float(final.min()), float(final.max())
-    return solution_from_error(values.value, values.error, values.row, values.num_steps, span=span)
+    steps = validation.integer("num_steps", num_step)
+    problem = _problem(model, objective, nature, policy)
+    final = state_reward(problem.world.sparse, problem.world.rewards(reward))
+    zero = np.zeros(problem.game.mdp.num_rows)
+    values = total(problem.game, StepReward(zero, zero), final, steps, by_step)
+    return problem.solution(values, (float(final.min()), float(final.max())))
 
 
-@validated(host=True)
+@validated(games=True, host=True)
 def reward_bounded_reachability(
     model: Model,
     target: Array | str,
-    reward: Array | str,
+    reward: Reward,
     bound: float,
     *,
     stay: Array | str | None = None,
     objective: str = "max",
+    nature: str | None = None,
+    policy: Array | None = None,
     by_level: bool = False,
 ) -> Solution:
     """Probability of reaching a set before more than a bound of reward is earned.
@@ -264,20 +252,22 @@ def reward_bounded_reachability(
     (Andova, Hermanns and Katoen 2003). Rewards in the target do not count.
 
     Args:
-      model, target, stay, objective: as for :func:`bounded_reachability`.
+      model, target, stay, objective, nature, policy: as for :func:`bounded_reachability`.
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative, multiples of one
         unit; numbers are read as the simplest fractions that round to them.
       bound: the largest reward.
       by_level: return the choices for all amounts left.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``. `policy` is the first choice, ``int32[S]``; with
-      `by_level`, row l has the choices with l units left, ``int32[L + 1, S]``. `num_steps` is the
-      number of levels, L + 1. Concrete arrays only; not differentiable.
+      :class:`Solution`, as of :func:`bounded_reachability`; with `by_level`, row l of the policy has
+      the choices with l units left, ``[L + 1]`` in front. `num_steps` is the number of levels, L + 1.
+      Games and models with intervals are unfolded over the levels. Concrete arrays only; not
+      differentiable.
 
     Raises:
-      ValueError: a shape, the objective, a negative reward, or rewards without a common unit of
-        which the bound has at most 10^7.
+      ValueError: a negative reward, rewards without a common unit of which the bound has at most
+        10^7, a game or a model with intervals that is too large on all levels, or as for
+        :func:`bounded_reachability`.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -285,28 +275,65 @@ def reward_bounded_reachability(
       >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
       [0.875, 1.0]
     """
-    if np.ndim(reward) < 3:  # rewards of transitions are not their expectation here
-        reward = row_reward(model, to_sparse(model), reward)
-    model, operation = _problem(model, objective)
-    mdp, target = model.host, state_mask(model, target, "target")
-    stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
+    problem = _problem(model, objective, nature, policy)
+    goal, free = problem.states(target, "target"), problem.passable(stay)
     validation.require_in_range("bound", bound, validation.Range(0, math.inf, open_above=True))
-    cost = transition_reward(model, reward_structure(model, reward))
+    sparse, host = problem.world.sparse, problem.world.sparse.host
+    # Rewards of transitions are not their expectation here.
+    if np.ndim(cast(Array, reward)) < len(problem.world.shape) + 2:
+        reward = problem.world.rewards(reward)
+    cost = transition_reward(sparse, reward_structure(sparse, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
         raise ValueError(
-            f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
-            f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0."
+            f"the reward is {cost[e]:.9g} from state {host.state[host.row[e]]} to "
+            f"{host.successor[e]}; a bound on rewards needs rewards of at least 0."
         )
-    budget = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
-    values = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
-    error = np.where(values.undecided, values.error, 0)
-    return solution_from_error(values.value, error, values.row, budget[1] + 1, span=PROBABILITY)
+    counted = np.where((free & ~goal)[host.state[host.row]], cost, 0)
+    units, limit = in_units(counted, bound)
+    values = until_at_cost(problem.game, goal, free, (units[problem.entry], limit), by_level)
+    return problem.solution(values, PROBABILITY, limit + 1)
 
 
-# --- what these and other host solvers share -----------------------------------------------------
+# --- any model as a game on rows ---------------------------------------------------------------
 
 
-def _problem(model: Model, objective: str, num_steps: int = 0) -> tuple[SparseMDP, np.ufunc]:
-    validation.integer("num_steps", num_steps)
-    return to_sparse(model), reduction_for(objective)
+class _Problem(NamedTuple):
+    """A model as a game on rows, under the given policy."""
+
+    world: ModelRows
+    game: RowGame
+    row: Integers  # int[R'], int[T'], the model's rows and entries
+    entry: Integers
+    policy: Array | None
+
+    def states(self, states: Array | str, name: str) -> Booleans:
+        return state_mask(self.world.sparse, states, name)
+
+    def passable(self, stay: Array | str | None) -> Booleans:
+        everywhere = np.ones(self.world.sparse.num_states, bool)
+        return everywhere if stay is None else self.states(stay, "stay")
+
+    def solution(
+        self, values: StepBoundedValues | BudgetLevel, span: Span, num_levels: int | None = None
+    ) -> Solution:
+        """The :class:`Solution` of values of the rows."""
+        steps = values.num_steps if isinstance(values, StepBoundedValues) else num_levels
+        solution = solution_from_error(
+            values.value, values.error, self.row[values.row], steps or 0, span=span
+        )
+        solution = self.world.shaped(solution, self.policy)
+        nature: Array | None = None if self.policy is not None else values.probability
+        method = "step by step" if num_levels is None else "level by level of the reward"
+        return replace(solution, nature=nature, method=method)
+
+
+def _problem(model: Model, objective: str, nature: str | None, policy: Array | None) -> _Problem:
+    world = model_rows(model, objective, nature)
+    host = world.sparse.host
+    game = RowGame(host, world.maximizes, world.sets, world.nature == "max")
+    if policy is None:
+        return _Problem(
+            world, game, np.arange(host.num_rows), np.arange(host.num_transitions), None
+        )
+    return _Problem(world, *game.under(world.weights(policy), world.is_system), policy)

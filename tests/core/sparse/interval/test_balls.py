@@ -8,9 +8,10 @@ import pytest
 from scipy.optimize import linprog
 
 from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.sparse.bounded.row_game import RowGame
+from jaxltl.core.sparse.bounded.step_bounded import until
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
 from jaxltl.core.sparse.interval.parity import optimal_face, parity_against_nature
 from jaxltl.core.sparse.interval.qualitative import zero_one_states
@@ -230,7 +231,8 @@ def test_discounted_and_steps():
             value = goal * 1.0
             for _ in range(3):
                 value = np.where(goal, 1, backup(model, value[mdp.successor], maximize, large))
-            steps = interval_bounded.until(model, goal, ~goal, 3, Query(maximize, large))
+            rows = RowGame(mdp, np.full(4, maximize), model, large)
+            steps = until(rows, goal, ~goal, 3)
             assert (np.abs(steps.value - value) <= steps.error + 1e-15).all()
             np.testing.assert_array_equal(steps.value > 0, value > 0)
 

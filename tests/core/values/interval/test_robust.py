@@ -20,12 +20,6 @@ from jaxltl.core.values.interval.robust import (
     robust_total_reward,
 )
 from jaxltl.core.values.interval.satisfaction import _solved, _Verdicts
-from jaxltl.core.values.interval.step_bounded import (
-    robust_bounded_reachability,
-    robust_cumulative_reward,
-    robust_instantaneous_reward,
-    robust_next_probability,
-)
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
@@ -36,6 +30,7 @@ from jaxltl.core.values.undiscounted.step_bounded import (
     cumulative_reward,
     instantaneous_reward,
     next_probability,
+    reward_bounded_reachability,
 )
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.reference_intervals import chains, parity, random_model, reach, reward
@@ -488,16 +483,18 @@ def test_general_functions_answer_for_intervals():
     target, reward = model.states_with_label("a"), np.arange(4.0)
     for nature in ("adversarial", "cooperative"):
         ask = {"nature": nature}
-        for general, robust, given in (
-            (next_probability, robust_next_probability, (target,)),
-            (bounded_reachability, robust_bounded_reachability, (target, 3)),
-            (cumulative_reward, robust_cumulative_reward, (reward, 3)),
-            (instantaneous_reward, robust_instantaneous_reward, (reward, 3)),
-            (optimal_value, robust_discounted_value, (reward, 0.9)),
+        np.testing.assert_array_equal(
+            optimal_value(model, reward, 0.9, **ask).value,
+            robust_discounted_value(model, reward, 0.9, **ask).value,
+        )
+        for general, given in (
+            (next_probability, (target,)),
+            (bounded_reachability, (target, 3)),
+            (cumulative_reward, (reward, 3)),
+            (instantaneous_reward, (reward, 3)),
+            (reward_bounded_reachability, (target, reward, 3)),
+            (optimal_value, (reward, 0.9)),
         ):
-            np.testing.assert_array_equal(
-                general(model, *given, **ask).value, robust(model, *given, **ask).value
-            )
             with pytest.raises(ValueError, match="intervals"):
                 general(model.nominal, *given, **ask)
         policy = np.asarray(model.nominal.host.row_start[:-1])

@@ -7,8 +7,8 @@ import pytest
 
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.core.sparse.solvers import reward_bounded
-from jaxltl.core.sparse.solvers import step_bounded as bounded
+from jaxltl.core.sparse.bounded import backup, reward_bounded
+from jaxltl.core.sparse.bounded import step_bounded as bounded
 from jaxltl.core.types import Status, check
 from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.core.values.undiscounted.step_bounded import (
@@ -321,8 +321,8 @@ def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
 
     whole = list(answers())
     for long, close, work in ((2, 1e-9, 2.0**38), (2, 1e-2, 2.0**38), (2, 0.0, 80_000.0)):
-        for name, x in (("_LONG", long), ("_CLOSE", close), ("_WORK", work)):
-            monkeypatch.setattr(bounded, name, x)
+        for name, x in (("LONG", long), ("CLOSE", close), ("_WORK", work)):
+            monkeypatch.setattr(backup, name, x)
         for exact, found in zip(whole, answers(), strict=True):
             assert (found.lower <= exact.upper + 1e-12).all()
             assert (exact.lower <= found.upper + 1e-12).all()
@@ -334,7 +334,7 @@ def test_choices_of_too_many_steps_are_refused_with_their_size():
 
 
 def test_a_state_without_reward_ahead_is_worth_zero_where_remaining_steps_are_bounded(monkeypatch):
-    monkeypatch.setattr(bounded, "_WORK", 1e8)
+    monkeypatch.setattr(backup, "_WORK", 1e8)
     stay = 1 - 1e-6
     model = make_sparse([0, 2, 3], [0, 2, 4, 5], [0, 1, 0, 1, 1], [stay, 1e-6, stay, 1e-6, 1.0])
     found = cumulative_reward(model, [-1.0, 0.0], 10**7)

@@ -7,9 +7,21 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.interval import interval_rows
-from jaxltl.core.sparse.interval import step_bounded as bounded
-from jaxltl.core.sparse.interval.robust_values import Query
-from jaxltl.core.sparse.interval.step_bounded import next_step, total, until
+from jaxltl.core.sparse.bounded import backup
+from jaxltl.core.sparse.bounded.backup import StepReward
+from jaxltl.core.sparse.bounded.row_game import RowGame
+from jaxltl.core.sparse.bounded.step_bounded import next_step, total, until
+
+
+def game(model, maximize, helpful):
+    """The model of one player, with the directions of the policy and of nature."""
+    sets = model.host
+    return RowGame(sets.mdp, np.full(sets.mdp.num_states, bool(maximize)), sets, bool(helpful))
+
+
+def paid(model, earned):
+    largest = np.maximum.reduceat(np.abs(earned), model.host.mdp.entry_start[:-1])
+    return StepReward(largest, largest, earned)
 
 
 def vertices(lower, upper):
@@ -78,14 +90,14 @@ def test_bounds_hold_the_exact_value(seed):
         policy, nature = (max if x else min for x in (maximize, helpful))
         value = [Fraction(int(x)) for x in target]
         for steps in range(6):
-            found = until(model.host, target, stay, steps, Query(maximize, helpful))
+            found = until(game(model, maximize, helpful), target, stay, steps)
             assert_holds(found, value)
             ahead = exact_backup(model, value, policy, nature)
             value = [
                 Fraction(1) if t else a if ok else Fraction(0)
                 for t, ok, a in zip(target, stay, ahead, strict=True)
             ]
-        found = next_step(model.host, target, Query(maximize, helpful))
+        found = next_step(game(model, maximize, helpful), target)
         assert_holds(found, exact_backup(model, [Fraction(int(x)) for x in target], policy, nature))
 
 
@@ -99,13 +111,8 @@ def test_bounds_hold_the_exact_reward(seed):
         policy, nature = (max if x else min for x in (maximize, helpful))
         value = [Fraction(int(x)) for x in start]
         for steps in range(5):
-            found = total(
-                model.host,
-                earned.astype(float),
-                start.astype(float),
-                steps,
-                Query(maximize, helpful),
-            )
+            reward = paid(model, earned.astype(float))
+            found = total(game(model, maximize, helpful), reward, start.astype(float), steps)
             for approximate, error, true in zip(found.value, found.error, value, strict=True):
                 assert abs(Fraction(float(approximate)) - true) <= Fraction(float(error)) <= 1e-10
             value = exact_backup(model, value, policy, nature, earned)
@@ -114,12 +121,12 @@ def test_bounds_hold_the_exact_reward(seed):
 def test_a_reward_that_changes_no_more_keeps_its_rounding():
     model = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
     few, many = (
-        total(model.host, np.zeros(3), np.array([0, 1.0]), n, Query(True, False))
+        total(game(model, True, False), paid(model, np.zeros(3)), np.array([0, 1.0]), n)
         for n in (2000, 10**9)
     )
     assert few.value.tolist() == many.value.tolist() and many.num_steps < 200
-    assert 0 < few.error[0] < many.error[0] < 1e-3
-    nothing = total(model.host, np.zeros(3), np.zeros(2), 10**9, Query(True, False))
+    assert 0 < few.error[0] < 1e-9 and 0 < many.error[0] < 1e-3
+    nothing = total(game(model, True, False), paid(model, np.zeros(3)), np.zeros(2), 10**9)
     assert nothing.error.tolist() == [0, 0]
 
 
@@ -137,7 +144,7 @@ def test_what_nature_picks_lies_in_the_intervals_and_attains_the_value():
     for _ in range(20):
         model = random_interval(rng)
         target = np.arange(5) == 0
-        found = until(model.host, target, np.ones(5, bool), 1, Query(True, False))
+        found = until(game(model, True, False), target, np.ones(5, bool), 1)
         p = found.probability
         assert ((model.lower <= p) & (p <= model.upper)).all()
         image = model.host.sum_rows(p * target[model.host.mdp.successor])
@@ -152,7 +159,7 @@ def test_what_nature_picks_lies_in_the_intervals_and_attains_the_value():
 def test_many_steps_are_as_few_that_changed_something():
     model = random_interval(np.random.default_rng(1))
     target, stay = np.arange(5) == 2, np.ones(5, bool)
-    found = until(model.host, target, stay, 10**9, Query(True, False))
+    found = until(game(model, True, False), target, stay, 10**9)
     assert found.num_steps < 10**4
     assert ((found.error >= 0) & (found.error <= 1)).all()
 
@@ -169,14 +176,14 @@ def test_a_huge_number_of_steps_is_answered_by_the_limit(maximize, helpful):
         [1 - 1e-7, 2e-7, 0.5, 0.75, 1, 1],
     )
     target, stay = np.arange(4) == 2, np.ones(4, bool)
-    found = until(model.host, target, stay, 10**10, Query(maximize, helpful))
+    found = until(game(model, maximize, helpful), target, stay, 10**10)
     exact = 0.5 if helpful else 0.25
     assert abs(found.value[0] - exact) <= found.error[0] <= 1e-8
     assert found.num_steps < 10**5
     # Before the limit holds, backups or wide bounds enclose the closed form.
     rate = 2e-7 if helpful else 1e-7
     steps = 3 * 10**4
-    found = until(model.host, target, stay, steps, Query(maximize, helpful))
+    found = until(game(model, maximize, helpful), target, stay, steps)
     assert abs(found.value[0] + exact * np.expm1((steps - 1) * np.log1p(-rate))) <= found.error[0]
 
 
@@ -186,7 +193,7 @@ def test_average_growth_bounds_a_huge_reward():
     )
     earned = np.array([1.0, 1.0, 0.0, 0.0])
     for helpful, share in ((True, 0.6), (False, 0.4)):
-        found = total(model.host, earned, np.zeros(2), 10**11, Query(helpful, helpful))
+        found = total(game(model, helpful, helpful), paid(model, earned), np.zeros(2), 10**11)
         assert np.allclose(found.value / 10**11, share, rtol=1e-9)
         assert (found.error <= 1e-2 * found.value).all() and found.num_steps < 10**5
 
@@ -194,22 +201,22 @@ def test_average_growth_bounds_a_huge_reward():
 @pytest.mark.parametrize("seed", range(24))
 def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
     rng = np.random.default_rng(seed)
-    model = random_interval(rng, chain=seed % 4 == 0).host
-    size = model.mdp.num_transitions
+    model = random_interval(rng, chain=seed % 4 == 0)
+    size = model.num_transitions
     target, stay, num_steps = rng.random(5) < 0.3, rng.random(5) < 0.8, int(rng.integers(3, 300))
     earned = rng.random(size) * (rng.random(size) < 0.4) - 0.5 * (seed % 3 == 1)
     start = rng.random(5) - 0.5
 
     def answers():
-        for query in (Query(*x) for x in product((False, True), repeat=2)):
-            yield until(model, target, stay, num_steps, query)
-            yield total(model, earned, np.zeros(5), num_steps, query)
-            yield total(model, np.zeros(size), start, num_steps, query)
+        for rows in (game(model, *x) for x in product((False, True), repeat=2)):
+            yield until(rows, target, stay, num_steps)
+            yield total(rows, paid(model, earned), np.zeros(5), num_steps)
+            yield total(rows, paid(model, np.zeros(size)), start, num_steps)
 
     whole = list(answers())
-    for long, close, work in ((2, 1e-9, 2.0**34), (2, 1e-2, 2.0**34), (2, 0.0, 80_000.0)):
-        for name, x in (("_LONG", long), ("_CLOSE", close), ("_WORK", work)):
-            monkeypatch.setattr(bounded, name, x)
+    for long, close, work in ((2, 1e-9, 2.0**38), (2, 1e-2, 2.0**38), (2, 0.0, 600_000.0)):
+        for name, x in (("LONG", long), ("CLOSE", close), ("_WORK", work)):
+            monkeypatch.setattr(backup, name, x)
         for exact, found in zip(whole, answers(), strict=True):
             width = exact.error + found.error + 1e-13
             assert (np.abs(exact.value - found.value) <= width).all()

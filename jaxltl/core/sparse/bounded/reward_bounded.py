@@ -3,27 +3,30 @@
 By induction over the remaining budget: with l units left, a step of cost c leads to level ``l - c``
 (Andova, Hermanns and Katoen 2003). Steps without cost stay on a level, as a linear system that is
 the same on every level: it is factored once, and one bound on the number of consecutive steps
-without cost bounds the error of all levels.
+without cost bounds the error of all levels. Games and uncertain models are unfolded over the levels.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.bounded.row_game import RowGame
 from jaxltl.core.sparse.graph.qualitative import (
     end_components,
     backward_reachable,
     shortest_path_rows,
 )
+from jaxltl.core.sparse.interval.l1_ball import Ball
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, first_hits
-from jaxltl.core.sparse.solvers.step_bounded import backup_unit
+from jaxltl.core.sparse.rows import concatenated_ranges, first_hits, offsets_from_counts
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 
 _LEVELS = 10**7  # amounts of reward at most
 _LARGEST = 8 * 2**30  # bytes of the levels that are kept
+_UNFOLDED = 2 * 10**7  # entries of a game or an uncertain model on all levels
+_WIDTH = 1e-8  # of the bounds of such a model
 _DENOMINATOR = 10**9  # of the fractions that rewards are taken for
 _GAIN = 1e-13  # relative gain that may be rounding
 _ROUNDS = 100
@@ -41,10 +46,10 @@ class BudgetLevel(NamedTuple):
     """Probabilities with the whole budget left."""
 
     value: Floats  # float64[S]
-    undecided: Booleans  # bool[S], where the value is not exact
-    error: float  # of the value there
+    error: Floats  # float64[S]
     # int32[S], the choices with the whole budget left; int32[L + 1, S] with `by_level`
     row: Integers
+    probability: Floats | None = None  # float64[T], nature's distributions with the whole budget
 
 
 def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
@@ -87,16 +92,17 @@ def _simplest(x: float) -> Fraction:
     return exact
 
 
-def bounded_cost(
-    mdp: HostMDP,
+def until_at_cost(
+    game: RowGame,
     target: Booleans,
     stay: Booleans,
     budget: tuple[Integers, int],
-    maximal: bool,
     by_level: bool = False,
 ) -> BudgetLevel:
-    """Optimal probability of a target through `stay`, within a budget of :func:`in_units`."""
-    cost, limit = budget
+    """Probability of a target through `stay`, within a budget of :func:`in_units`."""
+    if not game.is_mdp:
+        return _unfolded(game, target, stay, budget, by_level)
+    mdp, maximal, (cost, limit) = game.mdp, bool(game.sole_direction), budget
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
     parts = _parts(mdp, shape, target, cost, limit)
@@ -116,14 +122,82 @@ def bounded_cost(
                 break
             b += matrix @ ring[(level - c) % size]
             b += hit
-        value, off = system.solve(b, backup_unit(mdp) * (len(parts) + 1))
+        value, off = system.solve(b, mdp.backup_unit * (len(parts) + 1))
         error += off
         ring[level % size] = value
         if by_level or level == limit:
             every.append(_policy(mdp, shape, system.policy(b, value)))
     probability = target.astype(np.float64)
     probability[shape.member] = ring[limit % size][shape.node[shape.member]]
-    return BudgetLevel(probability, shape.member, error, np.stack(every) if by_level else every[-1])
+    errors = np.where(shape.member, error, 0.0)
+    return BudgetLevel(probability, errors, np.stack(every) if by_level else every[-1])
+
+
+def _unfolded(
+    game: RowGame,
+    target: Booleans,
+    stay: Booleans,
+    budget: tuple[Integers, int],
+    by_level: bool,
+) -> BudgetLevel:
+    """Reachability in the model of pairs of an amount left and a state.
+
+    The first block of states has nothing left, the last one the whole budget; those before have
+    spent more than it, and are absorbing.
+    """
+    mdp, (cost, limit) = game.mdp, budget
+    size, levels = mdp.num_states, limit + 1
+    if levels * mdp.num_transitions > _UNFOLDED:
+        raise ValueError(
+            f"{levels} levels of {mdp.num_transitions} transitions are more than {_UNFOLDED}, which is "
+            "the most for games and models with intervals; round the rewards to a larger unit."
+        )
+    encoded, query = game.encoded()
+    model, source = encoded.model, encoded.source
+    size = source.size
+    paid = np.where(encoded.entry < 0, 0, cost[encoded.entry])
+    level = np.repeat(np.arange(levels), paid.size)
+    left = np.maximum(level - np.tile(paid, levels), -1) + 1
+    after = left * size + np.tile(model.mdp.successor, levels)
+    # Successors ascend in each row.
+    row = np.tile(model.mdp.row, levels) + level * model.mdp.num_rows
+    order = np.lexsort((after, row))
+
+    def entries(inner: Floats, loop: float) -> Floats:
+        return np.append(np.full(size, loop), np.tile(inner, levels)[order])
+
+    def starts(inner: Integers) -> Integers:
+        return offsets_from_counts(
+            np.append(np.ones(size, np.int64), np.tile(np.diff(inner), levels))
+        )
+
+    host = HostMDP(
+        starts(model.mdp.row_start),
+        starts(model.mdp.entry_start),
+        np.append(np.arange(size), after[order]).astype(np.int32),
+        entries(model.mdp.probability, 1.0),
+    )
+    ball = model.ball
+    if ball is not None:
+        gain = np.append(np.zeros(size), np.tile(ball.gain, levels))
+        ball = Ball(entries(ball.center, 1.0), gain)
+    sets = UncertainMDP(host, entries(model.lower, 1.0), entries(model.upper, 1.0), ball)
+    spent = np.zeros(size, bool)
+    goal = np.append(spent, np.tile(target[source], levels))
+    passable = np.append(spent, np.tile((stay | target)[source], levels))
+    values = reachability(sets, goal, replace(query, tolerance=_WIDTH), stay=passable)
+    num_rows, num_entries = model.mdp.num_rows, model.mdp.num_transitions
+    chance = np.empty((levels, num_entries))
+    chance.ravel()[order] = values.probability[size:]
+    rows = values.row[size:].reshape(levels, size) - size - np.arange(levels)[:, None] * num_rows
+    policy = [encoded.policy(x, p) for x, p in zip(rows, chance, strict=True)]
+    low, high = (x[-size:][: mdp.num_states] for x in (values.lower, values.upper))
+    return BudgetLevel(
+        (low + high) / 2,
+        (high - low) / 2,
+        np.stack(policy) if by_level else policy[-1],
+        None if game.sets is None else encoded.nature(chance[-1], mdp.probability),
+    )
 
 
 class _Shape(NamedTuple):

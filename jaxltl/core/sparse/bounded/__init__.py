@@ -1,0 +1,1 @@
+"""Step-bounded and reward-bounded values of MDPs, games and uncertain models."""
