@@ -79,10 +79,14 @@ class Subject:
 
     @property
     def reward(self) -> np.ndarray:
-        paid = np.repeat(self.case.reward[:, None], self.memory, 1)  # [S, Q, A]
+        return self.of_actions(self.case.reward)
+
+    def of_actions(self, table: np.ndarray) -> np.ndarray:
+        """A quantity of the actions of the world, ``[S, A]``."""
+        table = np.repeat(table[:, None], self.memory, 1)  # [S, Q, A]
         if self.by_rows:
-            return paid[np.repeat(self.case.available[:, None], self.memory, 1)]
-        return paid if self.is_product else paid[:, 0]
+            return table[np.repeat(self.case.available[:, None], self.memory, 1)]
+        return table if self.is_product else table[:, 0]
 
     @property
     def world_policy(self) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.construct.padded import to_padded
+from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.sparse.bounded import backup, reward_bounded
 from jaxltl.core.sparse.bounded import step_bounded as bounded
@@ -155,10 +156,11 @@ def by_levels(model, target, stay, cost, most, best, sweeps=400):
     return found
 
 
-@pytest.mark.parametrize("depth", [1, 64])
+@pytest.mark.parametrize("depth", [1, 64, None])
 @pytest.mark.parametrize("seed", range(16))
 def test_rewards_are_spent_level_by_level(seed, depth, monkeypatch):
     monkeypatch.setattr(reward_bounded, "_DEPTH", depth)  # 1 leaves no substitution
+    unfolded = depth is None
     rng = np.random.default_rng(seed)
     model = random_sparse(rng, 7, chain=seed % 4 == 0)
     target, stay = rng.random(7) < 0.25, rng.random(7) < 0.9
@@ -170,7 +172,7 @@ def test_rewards_are_spent_level_by_level(seed, depth, monkeypatch):
         expected = by_levels(model, target, stay, cost, most, best)
         found = check(
             reward_bounded_reachability(
-                model,
+                make_interval(model, *[model.probability] * 2) if unfolded else model,
                 target,
                 Rewards(transition=cost * 0.1),
                 most * 0.1,
