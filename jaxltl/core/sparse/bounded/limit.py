@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,19 +12,18 @@ from jaxltl.core.sparse.bounded.row_game import RowGame
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies
 from jaxltl.core.sparse.interval import reachability as uncertain
 from jaxltl.core.sparse.interval.qualitative import zero_one_states
-from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distribution_depth
+from jaxltl.core.sparse.interval.robust_values import Query, distribution_depth
 from jaxltl.core.sparse.interval.total_reward import total_reward as uncertain_reward
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.reachability import reachability, total_reward
-from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 
 _WIDTH = 2.5e-10  # of the unbounded probabilities, below the effect at which backups end
 
 
 def unbounded_limit(
     game: RowGame, target: Booleans, undecided: Booleans, num_steps: int
-) -> UnboundedLimit | _UncertainLimit:
+) -> tuple[Floats, Floats]:
     """Bounds ``float64[S]`` of the probability of reaching a target in n steps, for many steps.
 
     With T a bound on the expected time until the target or a state of value zero is met, from every
@@ -37,104 +35,55 @@ def unbounded_limit(
     """
     if game.is_mdp:
         maximize = bool(game.sole_direction)
-        return UnboundedLimit(game.mdp, target, undecided, num_steps, maximize)
-    encoded, query = game.encoded()
+        return _of_mdp(game.mdp, target, undecided, num_steps, Query(maximize, maximize))
+    encoded, query = game.encoded()  # whose steps are at least as many
     source = encoded.source
-    return _UncertainLimit(
-        encoded.model, target[source], undecided[source], num_steps, query, target.size
+    lower, upper = _of_sets(encoded.model, target[source], undecided[source], num_steps, query)
+    return lower[: target.size], upper[: target.size]
+
+
+def _of_mdp(
+    mdp: HostMDP, target: Booleans, undecided: Booleans, num_steps: int, query: Query
+) -> tuple[Floats, Floats]:
+    best = reachability(
+        mdp,
+        target,
+        maximize=query.maximize,
+        stay=undecided | target,
+        tolerance=_WIDTH,
+        depth=query.depth,
     )
+    if query.maximize and not mdp.is_chain:
+        mdp = mdp.chain(best.row)
+    ended = ~undecided | ~positive_under_all_policies(mdp, target, among=undecided)
+    one = np.ones(mdp.num_rows)
+    time = total_reward(mdp, one, ended, maximize=True, tolerance=0.1, depth=query.depth)
+    return best.lower - _unfinished(time.upper, num_steps), best.upper
 
 
-@dataclass(frozen=True)
-class UnboundedLimit:
-    """Bounds for an MDP."""
-
-    mdp: HostMDP
-    target: Booleans
-    undecided: Booleans
-    num_steps: int
-    maximize: bool
-    depth: int = 0  # roundings behind each number of the model
-
-    @cached_property
-    def unbounded(self) -> Enclosure:
-        """The unbounded probability."""
-        return reachability(
-            self.mdp,
-            self.target,
-            maximize=self.maximize,
-            stay=self.undecided | self.target,
-            tolerance=_WIDTH,
-            depth=self.depth,
-        )
-
-    @property
-    def upper(self) -> Floats:
-        return self.unbounded.upper
-
-    @cached_property
-    def lower(self) -> Floats:
-        mdp = self.mdp
-        if self.maximize and not mdp.is_chain:
-            mdp = mdp.chain(self.unbounded.row)
-        ended = ~self.undecided | ~positive_under_all_policies(
-            mdp, self.target, among=self.undecided
-        )
-        one = np.ones(mdp.num_rows)
-        time = total_reward(mdp, one, ended, maximize=True, tolerance=0.1, depth=self.depth)
-        return self.unbounded.lower - _unfinished(time.upper, self.num_steps)
-
-
-@dataclass(frozen=True)
-class _UncertainLimit:
-    """Bounds for the encoding of a game; its steps are at least those of the game."""
-
-    model: UncertainMDP
-    target: Booleans
-    undecided: Booleans
-    num_steps: int
-    query: Query
-    num_states: int  # of the game
-
-    @cached_property
-    def unbounded(self) -> RobustValues:
-        """The unbounded probability."""
-        query = replace(self.query, tolerance=_WIDTH)
-        return uncertain.reachability(
-            self.model, self.target, query, stay=self.undecided | self.target
-        )
-
-    @property
-    def upper(self) -> Floats:
-        return self.unbounded.upper[: self.num_states]
-
-    @cached_property
-    def lower(self) -> Floats:
-        return self._lower()[: self.num_states]
-
-    def _lower(self) -> Floats:
-        part, chance = self.model, self.unbounded.probability
-        if self.query.maximize:
-            part, entry = part.under_policy(self.unbounded.row)
-            chance = chance[entry]
-        depth = self.query.depth + distribution_depth(part.mdp)
-        if self.query.nature_maximizes:
-            chance, able = part.nearest_distributions(chance)
-            if not able:
-                return np.zeros(self.target.size)
-            fixed = part.resolve(chance)
-            return UnboundedLimit(
-                fixed, self.target, self.undecided, self.num_steps, maximize=False, depth=depth
-            ).lower
-        least = Query(False, False, tolerance=_WIDTH, depth=self.query.depth)
-        value = uncertain.reachability(
-            part, self.target, least, stay=self.undecided | self.target
-        ).lower
-        absorbing = part.with_absorbing(~self.undecided)[0]
-        ended = ~self.undecided | zero_one_states(absorbing, self.target, least).zero
-        longest = Query(True, True, tolerance=0.1, depth=self.query.depth)
-        time = uncertain_reward(part, np.ones(part.mdp.num_rows), ended, longest).upper
-        return value - _unfinished(time, self.num_steps)
+def _of_sets(
+    model: UncertainMDP, target: Booleans, undecided: Booleans, num_steps: int, query: Query
+) -> tuple[Floats, Floats]:
+    stay, query = undecided | target, replace(query, tolerance=_WIDTH)
+    best = uncertain.reachability(model, target, query, stay=stay)
+    chance = best.probability
+    if query.maximize:
+        model, entry = model.under_policy(best.row)
+        chance = chance[entry]
+    least = Query(False, False, tolerance=_WIDTH)
+    if query.nature_maximizes:
+        chance, able = model.nearest_distributions(chance)
+        if not able:
+            return np.zeros(target.size), best.upper
+        least = replace(least, depth=distribution_depth(model.mdp))
+        fixed = model.resolve(chance)
+        return _of_mdp(fixed, target, undecided, num_steps, least)[0], best.upper
+    value = uncertain.reachability(model, target, least, stay=stay).lower
+    absorbing = model.with_absorbing(~undecided)[0]
+    ended = ~undecided | zero_one_states(absorbing, target, least).zero
+    longest = Query(True, True, tolerance=0.1)
+    time = uncertain_reward(model, np.ones(model.mdp.num_rows), ended, longest).upper
+    return value - _unfinished(time, num_steps), best.upper
 
 
 def _unfinished(time: Floats, num_steps: int) -> float:

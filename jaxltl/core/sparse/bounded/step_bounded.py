@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -81,8 +80,8 @@ def _probability(
     limit = cache(partial(unbounded_limit, game, known, undecided, num_steps))
 
     def enough(x: Iterate) -> bool:
-        low = np.maximum(limit().lower[places], x.value)
-        return bool((limit().upper[places] - low <= iteration.CLOSE).all())
+        low, high = limit()
+        return bool((high[places] - np.maximum(low[places], x.value) <= iteration.CLOSE).all())
 
     start = known[places].astype(np.float64)
     iterate = backup.iterate(start, num_steps, enough if has_limit else None, every)
@@ -93,7 +92,8 @@ def _probability(
     size = value if game.sets is None else 1.0
     error = np.where(undecided & (num_steps > 0), np.minimum(size * relative + UNDERFLOW, 1), 0)
     if has_limit and places.size and (not complete or relative > iteration.CLOSE):
-        low, high = np.maximum(limit().lower, value - error), limit().upper
+        low, high = limit()
+        low = np.maximum(low, value - error)
         # Of fewer backups the value is a lower bound, as a target is reached once.
         high = np.minimum(high, value + error) if complete else high
         value = np.where(undecided, (low + high) / 2, value)
@@ -151,8 +151,34 @@ def total(
     places, unit = backup.places, backup.unit(num_steps)
     signed = bool((start < 0).any() or (magnitude != reward.row).any())
     largest_reward, largest = float(magnitude.max(initial=0)), float(np.abs(start).max(initial=0))
-    rest = _Remainder(game, reward, backup, num_steps, (largest_reward, largest, signed))
-    iterate = backup.iterate(start[places], num_steps, rest.is_small, every)
+
+    def bounds(x: Iterate) -> tuple[Floats, Floats]:
+        """Bounds after all steps: ``T v - v`` is at least, and at most, what each further one adds.
+
+        T is monotone and ``T (v + c) = T v + c`` for constants c (Puterman 1994, section 8.5).
+        """
+        size = x.num_steps * largest_reward + largest
+        relative = relative_error(unit, 2 * x.num_steps + 1)
+        step, remaining = x.value - x.before, num_steps - x.num_steps + 1
+        slack = size * (relative + unit * remaining)
+        low = x.before + remaining * step.min() - slack
+        high = x.before + remaining * step.max() + slack
+        if not largest_reward:
+            slack = size * relative
+            low = np.maximum(low, x.value.min() - slack)
+            high = np.minimum(high, x.value.max() + slack)
+        if game.sets is None and not signed and not largest and num_steps > iteration.LONG:
+            most = game.mixed is not None or game.sole_direction is not False
+            forever = reward_forever(mdp, reward.row, maximize=most, tolerance=iteration.CLOSE / 4)
+            low = np.maximum(low, x.value * (1 - relative))
+            high = np.minimum(high, forever.upper[places])
+        return low, high
+
+    def enough(x: Iterate) -> bool:
+        low, high = bounds(x)
+        return bool((high - low <= iteration.CLOSE * np.maximum(np.abs(low), 1)).all())
+
+    iterate = backup.iterate(start[places], num_steps, enough, every)
     complete = iterate.is_fixed or iterate.num_steps == num_steps
     # Rounding is relative to the largest sum of absolute values.
     size: Floats | float = iterate.value
@@ -166,7 +192,7 @@ def total(
     if not complete or (
         num_steps > iteration.LONG and relative > iteration.CLOSE and every is None
     ):
-        low, high = rest.bounds(iterate)
+        low, high = bounds(iterate)
         if complete:
             low = np.maximum(low, iterate.value - off[places])
             high = np.minimum(high, iterate.value + off[places])
@@ -181,55 +207,6 @@ def total(
         zero = ~_earning(game, reward.row > 0, start > 0, num_steps)
         value[zero] = off[zero] = 0
     return _result(backup, iterate, num_steps, (value, off), every)
-
-
-@dataclass(frozen=True)
-class _Remainder:
-    """Bounds of a sum of rewards, from those of its first steps."""
-
-    game: RowGame
-    reward: StepReward
-    backup: RowBackup
-    num_steps: int
-    sizes: tuple[float, float, bool]  # the largest reward and terminal reward; if some are negative
-
-    def bounds(self, x: Iterate) -> tuple[Floats, Floats]:
-        """Bounds after all steps: ``T v - v`` is at least, and at most, what each further one adds.
-
-        T is monotone and ``T (v + c) = T v + c`` for constants c (Puterman 1994, section 8.5).
-        """
-        largest_reward, largest, signed = self.sizes
-        unit = self.backup.unit(self.num_steps)
-        size, relative = (
-            x.num_steps * largest_reward + largest,
-            relative_error(unit, 2 * x.num_steps + 1),
-        )
-        step = x.value - x.before
-        remaining = self.num_steps - x.num_steps + 1
-        slack = size * (relative + unit * remaining)
-        low = x.before + remaining * step.min() - slack
-        high = x.before + remaining * step.max() + slack
-        if not largest_reward:
-            slack = size * relative
-            low = np.maximum(low, x.value.min() - slack)
-            high = np.minimum(high, x.value.max() + slack)
-        if (
-            self.game.sets is None
-            and not signed
-            and not largest
-            and self.num_steps > iteration.LONG
-        ):
-            maximize = self.game.mixed is not None or self.game.sole_direction is not False
-            forever = reward_forever(
-                self.game.mdp, self.reward.row, maximize=maximize, tolerance=iteration.CLOSE / 4
-            )
-            low = np.maximum(low, x.value * (1 - relative))
-            high = np.minimum(high, forever.upper[self.backup.places])
-        return low, high
-
-    def is_small(self, x: Iterate) -> bool:
-        low, high = self.bounds(x)
-        return bool((high - low <= iteration.CLOSE * np.maximum(np.abs(low), 1)).all())
 
 
 def _earning(game: RowGame, rows: Booleans, start: Booleans, num_steps: int) -> Booleans:
