@@ -122,7 +122,7 @@ def _network_row(given: mlirl.Problem, weights) -> dict[str, Any]:
     count = sum(x.size for x in jax.tree.leaves(start))
     # The same rewards from both, so that the solves are the same.
     reward = lambda p, f: mlirl.linear_reward(weights, f) + 1e-3 * network.apply(p, f)  # noqa: E731
-    learned = given.replace(reward=reward, start=start)
+    learned = given.replace(reward=reward, guess=start)
     ours = partial(exact_gradient, start, learned, hparams)
     peer = partial(exact_gradient, weights, given, hparams)
     forward = jax.jit(jax.grad(lambda p: jnp.sum(reward(p, given.features))))

@@ -148,9 +148,9 @@ def post_office_runs() -> tuple[Runs, dict[float, float], int]:
         restart=1 / 50,
         moves_per_step=1024,
     )
-    start = np.asarray(problem.start, float)
+    initial = np.asarray(problem.initial, float)
     best = minimax_value(problem.game, problem.reward, 0.6, allowed=problem.allowed)
-    optimum = float(start @ np.asarray(best.value))
+    optimum = float(initial @ np.asarray(best.value))
     epsilon = {share: (1 - share) * optimum for share in SHARES}
     visits = {
         share: float(
@@ -173,7 +173,7 @@ def post_office_runs() -> tuple[Runs, dict[float, float], int]:
     def bound(state: Any) -> tuple[int, float]:
         found = rmax.evidence(state, problem, hparams, confidence=CONFIDENCE).data
         assert found is not None
-        return int(state.moves), float(start @ np.where(start > 0, found.secured, 0))
+        return int(state.moves), float(initial @ np.where(initial > 0, found.secured, 0))
 
     return _followed(Runs(optimum), states, go_on, bound), visits, int(chance.sum())
 

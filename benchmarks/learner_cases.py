@@ -124,7 +124,7 @@ def _ppo() -> Case:
 
 
 def _many_tasks() -> Case:
-    world = jl.envs.letter_world(size=4, letters=3, copies=1, horizon=30)
+    world = jl.envs.letter_world(size=4, letters=3, num_copies=1, horizon=30)
     events = jl.environments.make_events(world.propositions)
     network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen, hidden=(16,))
     sampler = jl.environments.sequence_sampler(

@@ -117,9 +117,9 @@ def run(populations: tuple[int, ...] = (100, 500)) -> list[dict[str, Any]]:
             jax.random.key(0), (size, network.num_parameters), "float32"
         )
         keys = jax.random.split(jax.random.key(1), size)
-        states = jax.vmap(lambda k: navigation.start_states(k, world, (_TRAJECTORIES,), "float32"))(
-            keys
-        )
+        states = jax.vmap(
+            lambda k: navigation.initial_states(k, world, (_TRAJECTORIES,), "float32")
+        )(keys)
         starts = np.stack([np.asarray(x) for x in states], axis=-1)
         lists = jax.vmap(lambda p: layers(network, p))(parameters)
         weights = jax.tree.map(np.asarray, lists)

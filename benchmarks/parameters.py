@@ -95,7 +95,7 @@ def ours(path: Path, threshold: float, chosen: Any) -> tuple[dict[str, Any], Any
         return feasible(
             problem,
             threshold,
-            starts=chosen.starts,
+            num_starts=chosen.starts,
             key=jax.random.key(key),
             budget=Budget(num_steps=chosen.steps, num_proofs=enough),
         )

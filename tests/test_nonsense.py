@@ -248,7 +248,7 @@ def things(folder):
             {
                 "problem": problem,
                 "threshold": 0.5,
-                "starts": 2,
+                "num_starts": 2,
                 "budget": feasible.Budget(num_steps=3),
                 "hparams": None,
             },
@@ -419,13 +419,13 @@ def simulated():
         *taught(world, key),
         (
             partial(letter_world, connected=False),
-            {"size": 4, "letters": 2, "copies": 1, "horizon": 5, "num_maps": 4, "seed": 0},
+            {"size": 4, "letters": 2, "num_copies": 1, "horizon": 5, "num_maps": 4, "seed": 0},
         ),
         (
-            partial(letter_world, size=3, letters=1, copies=1, num_maps=2),
+            partial(letter_world, size=3, letters=1, num_copies=1, num_maps=2),
             {"connected": True, "flat": False},
         ),
-        (partial(letter_world, layout="a.\n..", letters=1), {"start": 1, "horizon": 5}),
+        (partial(letter_world, layout="a.\n..", letters=1), {"initial": 1, "horizon": 5}),
         (
             flat_world,
             {
@@ -434,7 +434,7 @@ def simulated():
                 "time_step": 0.1,
                 "horizon": 5,
                 "discrete": False,
-                "start": None,
+                "initial": None,
                 "num_starts": 4,
                 "seed": 0,
             },
@@ -443,7 +443,7 @@ def simulated():
             zone_world,
             {
                 "colors": ("a", "b"),
-                "zones": 1,
+                "num_zones": 1,
                 "radius": 0.4,
                 "extent": 2.5,
                 "saturation": 0.05,
@@ -485,7 +485,7 @@ def taught(world, key):
             )
         )
 
-    hidden = {"num_trajectories": 2, "value_batches": 2, "hidden": (2,), "value_hidden": ()}
+    hidden = {"num_trajectories": 2, "num_value_batches": 2, "hidden": (2,), "value_hidden": ()}
     bold = {"problem": there, "hparams": trust_region.Hparams(discount=0.9, **hidden)}
     bold["state"] = blank(jax.eval_shape(lambda: trust_region.init(key, **bold)))
     seeking = {"problem": cce.make_problem(score, family), "hparams": cce.Hparams(population=10)}
@@ -546,7 +546,10 @@ def taught(world, key):
             },
         ),
         (searched, {"elite_reuse": False, "antithetic": False, "population": 10, "rho": 0.5}),
-        (trusted, {"normalize": True, "num_trajectories": 4, "value_batches": 2, "hidden": (4,)}),
+        (
+            trusted,
+            {"normalize": True, "num_trajectories": 4, "num_value_batches": 2, "hidden": (4,)},
+        ),
         (
             many_tasks.train_in_stages,
             {
@@ -634,7 +637,10 @@ def test_nonsense_given_to_adapters_is_told(name):
 
 def test_what_is_of_another_run_is_named():
     """Of settings, states, parameters and observations; nothing is compiled."""
-    key, world = jax.random.key(0), jl.envs.letter_world(size=3, letters=2, copies=1, num_maps=2)
+    key, world = (
+        jax.random.key(0),
+        jl.envs.letter_world(size=3, letters=2, num_copies=1, num_maps=2),
+    )
     plane = navigation.navigation()
     small = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(2,)))
     large = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(3,)))
@@ -720,7 +726,7 @@ def test_flags_are_named():
         with pytest.raises(ValueError, match=message):
             call()
     assert letter_world(
-        size=3, letters=1, num_maps=2, copies=1, flat=jnp.bool_(True)
+        size=3, letters=1, num_maps=2, num_copies=1, flat=jnp.bool_(True)
     ).observations.shape == (18,)
 
 

@@ -74,7 +74,7 @@ def test_a_penalty_changes_what_is_learned():
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_steps_add_up_to_the_scores(task):
     """The rewards and costs of steps are those of whole trajectories, from the same robot."""
-    world = nav.navigation(start=((-1.5, 0.0), (2.0, 1.5)))
+    world = nav.navigation(initial=((-1.5, 0.0), (2.0, 1.5)))
     steps = as_environment(world, task)
     key, noise = jax.random.split(jax.random.key(task))
     places = jax.jit(jax.vmap(steps.reset))(jax.random.split(key, 50))

@@ -19,7 +19,7 @@ Example: a head of one coin, then a tail of another; their biases are parameters
   ...     return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
   >>> model = jl.make_parametric(chain, numbers, [0.1, 0.2], [0.9, 0.8], parameters=["p", "q"])
   >>> problem = search.make_problem(model, "both", bound=">=")
-  >>> found = search.feasible(problem, 0.7, starts=4, budget=search.Budget(num_steps=100))
+  >>> found = search.feasible(problem, 0.7, num_starts=4, budget=search.Budget(num_steps=100))
   >>> found.feasible.all().item(), sorted(found.valuation())
   (True, ['p', 'q'])
   >>> search.within(problem, 0.25, 0.5).low.tolist()
@@ -481,7 +481,8 @@ def feasible(
     problem: Problem,
     threshold: float,
     *,
-    starts: int | ArrayLike = 100,
+    num_starts: int = 100,
+    guess: ArrayLike | None = None,
     key: Key | None = None,
     hparams: Hparams | None = None,
     budget: Budget | None = None,
@@ -495,8 +496,9 @@ def feasible(
     Args:
       problem: the question.
       threshold: finite.
-      starts: number of random starts, or starting points, ``float[N, D]``.
-      key: of the random starts; default ``jax.random.key(0)``.
+      num_starts: number of random starting points.
+      guess: ``float[N, D]``, starting points instead of random ones.
+      key: of the random points; default ``jax.random.key(0)``.
       hparams: settings of the search.
       budget: steps, proofs and their tolerance; default :class:`Budget`.
 
@@ -515,14 +517,12 @@ def feasible(
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
     goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
     max_steps = np.int32(budget.num_steps)
+    num_starts = validation.integer("num_starts", num_starts, least=1, limit=loops.MAX_STEPS)
     points = None
-    if np.ndim(starts) == 0:
-        keys = jax.random.split(
-            key, validation.integer("starts", starts, least=1, limit=loops.MAX_STEPS)
-        )
-    else:
-        points = problem.model.valid_points("start", starts).astype(problem.low.dtype)
-        keys = jax.random.split(key, len(points))
+    if guess is not None:
+        points = problem.model.valid_points("guess", guess).astype(problem.low.dtype)
+        num_starts = len(points)
+    keys = jax.random.split(key, num_starts)
     # Only what the search reads, so that other models of the same shape do not recompile it.
     nothing: PyTree = None
     numbers = ParametricMDP(nothing, problem.model.numbers, None, None, None, ())

@@ -90,7 +90,7 @@ class Problem:
       component: ``int32[S * Q]``, the maximal end component of each undecided state, or its own
         number.
       staying: ``bool[S, Q, A]``, the actions of undecided states that stay in it.
-      start_table: ``uint32[S]``, the initial distribution as cumulative weights.
+      initial_table: ``uint32[S]``, the initial distribution as cumulative weights.
       num_claims: ``int[]``, number of unknown probabilities.
     """
 
@@ -100,7 +100,7 @@ class Problem:
     allowed: jax.Array
     component: jax.Array
     staying: jax.Array
-    start_table: jax.Array
+    initial_table: jax.Array
     num_claims: jax.Array
 
 
@@ -143,7 +143,7 @@ def make_problem(world: Model, formula: FormulaLike) -> Problem:
         allowed=_allowed(model, winning, accepting),
         component=to_jax(np.asarray(between.component, np.int32).reshape(-1)),
         staying=to_jax(between.inside),
-        start_table=to_jax(np.asarray(cumulative(np.asarray(padded.initial, float)))),
+        initial_table=to_jax(np.asarray(cumulative(np.asarray(padded.initial, float)))),
         num_claims=to_jax(np.int32(max(int(claims), 1))),
     )
 
@@ -533,7 +533,7 @@ def _sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Arr
         words = [splitmix.words(stream, 4 * number + i) for i in range(1, 5)]
         ends = splitmix.uniform(words[0], dtype) < restart
         restarts = take(problem.losing, (s, q)) | (take(problem.winning, (s, q)) & ends)
-        s = jnp.where(restarts, draw(problem.start_table, words[1]), s)
+        s = jnp.where(restarts, draw(problem.initial_table, words[1]), s)
         q = jnp.where(restarts, start, q)
         explores = (splitmix.uniform(words[2], dtype) < explore)[:, None]
         moves = jnp.where(explores, take(problem.allowed, (s, q)), take(state.best, (s, q)))
@@ -542,7 +542,7 @@ def _sampled_counts(state: State, problem: Problem, hparams: Hparams) -> jax.Arr
         t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
         return (t, take(next_memory, (s, q))), (s, a, successor_slot(as_game(world), s, a, t))
 
-    first = draw(problem.start_table, splitmix.words(stream, jnp.uint32(0)))
+    first = draw(problem.initial_table, splitmix.words(stream, jnp.uint32(0)))
     keys = jax.random.split(jax.random.fold_in(key, 1), hparams.length)
     number = jnp.arange(hparams.length, dtype=jnp.uint32)
     states = first, jnp.broadcast_to(start, (num_runs,))

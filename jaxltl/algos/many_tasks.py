@@ -15,7 +15,7 @@ shapes are shown; nothing is trained.)
   >>> import jaxltl as jl
   >>> from jaxltl.algos import many_tasks, ppo
   >>> from jaxltl.envs.letter_world import events_seen
-  >>> world = jl.envs.letter_world(size=4, letters=3, copies=1, horizon=30)
+  >>> world = jl.envs.letter_world(size=4, letters=3, num_copies=1, horizon=30)
   >>> events = jl.environments.make_events(world.propositions)  # nothing, a, b, c
   >>> network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen, hidden=(8,))
   >>> def problem(longest):  # sequences of up to so many steps

@@ -58,7 +58,7 @@ from jaxltl.algos.common.explicit_games import (
     environment_policy,
     explicit_game,
     observed_reward,
-    start_distribution,
+    initial_distribution,
     take,
     uniform_rows,
 )
@@ -81,11 +81,11 @@ class Problem:
       reward: ``float[S, A]`` or ``float[S, A, K]``.
       allowed: ``bool[S, A]``: the mask at the system's states, all actions at the environment's.
       behavior: ``float[S, A]``, the exploring policy of both players.
-      start: ``float[S]``, distribution over the chains' initial states.
+      initial: ``float[S]``, distribution over the chains' initial states.
       exact: ``float[S]``, the minimax value, to measure the error; or None.
       measured: ``bool[S]``, the states over which the error is measured; None with `exact`.
       behavior_table: ``uint32[S, A]``, `behavior` as cumulative weights.
-      start_table: ``uint32[S]``, `start` as cumulative weights.
+      initial_table: ``uint32[S]``, `initial` as cumulative weights.
       method: ``"generalized"`` or ``"maximin"``; static.
     """
 
@@ -93,11 +93,11 @@ class Problem:
     reward: jax.Array
     allowed: jax.Array
     behavior: jax.Array
-    start: jax.Array
+    initial: jax.Array
     exact: Array
     measured: Array
     behavior_table: jax.Array
-    start_table: jax.Array
+    initial_table: jax.Array
     method: str = struct.field(pytree_node=False, default="generalized")
 
     @property
@@ -112,7 +112,7 @@ def make_problem(
     *,
     allowed: ArrayLike | None = None,
     environment: ArrayLike | None = None,
-    start: ArrayLike | None = None,
+    initial: ArrayLike | None = None,
     method: Literal["generalized", "maximin"] = "generalized",
 ) -> Problem:
     """A checked :class:`Problem`.
@@ -124,19 +124,19 @@ def make_problem(
         actions. Read at the system's states only.
       environment: ``float[S, A]``, exploring policy of the environment; default uniform. It should
         try every action, because the learned value is a minimum over all of them.
-      start: ``float[S]``, distribution of the chains' initial states; default the game's.
+      initial: ``float[S]``, distribution of the chains' initial states; default the game's.
       method: ``"generalized"`` or ``"maximin"``.
 
     Raises:
       ValueError: a wrong shape, a reward that is not finite, a mask that allows an unavailable
-        action or none in a reachable state, rows or a start that are no distributions, or a game
+        action or none in a reachable state, rows or an initial distribution that are no distributions, or a game
         that does not fit the method.
     """
     choice("method", method, ("generalized", "maximin"))
     game = explicit_game(game)
     system, mask = np.asarray(game.system), _mask(game, allowed)
-    start = start_distribution(game, start)
-    reachable = np.asarray(restrict(game, start, allowed=mask).base_state)
+    initial = initial_distribution(game, initial)
+    reachable = np.asarray(restrict(game, initial, allowed=mask).base_state)
     if method == "maximin":
         _check_alternating(game, reachable)
     behavior = (
@@ -147,11 +147,11 @@ def make_problem(
         reward=check_reward(game, reward),
         allowed=jnp.asarray(mask),
         behavior=jnp.asarray(behavior, game.dtype),
-        start=jnp.asarray(start, game.dtype),
+        initial=jnp.asarray(initial, game.dtype),
         exact=None,
         measured=None,
         behavior_table=jnp.asarray(cumulative(behavior)),
-        start_table=jnp.asarray(cumulative(start)),
+        initial_table=jnp.asarray(cumulative(initial)),
         method=method,
     )
 
@@ -169,7 +169,7 @@ def with_exact_value(
         measured = problem.allowed.any(-1) & (problem.game.system | (not problem.is_maximin))
     measured = jnp.asarray(measured, bool)
     for name, array in (("exact", exact), ("measured", measured)):
-        require_shape(name, array, problem.start.shape)
+        require_shape(name, array, problem.initial.shape)
     return replace(problem, exact=exact, measured=measured)
 
 
@@ -178,7 +178,7 @@ def recurrent_states(problem: Problem) -> jax.Array:
 
     Chains of the `problem` without restarts and greedy moves visit exactly these infinitely often.
     """
-    part = restrict(problem.game, problem.start, allowed=problem.behavior > 0)
+    part = restrict(problem.game, problem.initial, allowed=problem.behavior > 0)
     inside = bottom_components(part.model, part.model.available).inside.any(-1)
     recurrent = np.zeros(problem.game.num_states, bool)
     recurrent[np.asarray(part.base_state)[np.asarray(inside)]] = True
@@ -327,7 +327,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         value=value(q, problem),
         residual=jnp.asarray(jnp.inf, dtype),
         violations=jnp.int32(0),
-        position=draw(problem.start_table, words),
+        position=draw(problem.initial_table, words),
         pending=jnp.full(num_chains, -1, jnp.int32) if problem.is_maximin else None,
         pending_reward=jnp.zeros(num_chains, dtype) if problem.is_maximin else None,
     )
@@ -555,7 +555,7 @@ def _restart(key: jax.Array, state: State, problem: Problem, hparams: Hparams) -
     """Chains restart with probability ``restart``, and drop their pending action."""
     words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
     anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
-    position = jnp.where(anew, draw(problem.start_table, words[1]), state.position)
+    position = jnp.where(anew, draw(problem.initial_table, words[1]), state.position)
     pending = None if state.pending is None else jnp.where(anew, -1, state.pending)
     return replace(state, position=position, pending=pending)
 

@@ -278,24 +278,24 @@ class Metrics:
 
 
 def solve(
-    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, guess: jax.Array | None = None
 ) -> Solution:
     """The soft values and policies of `parameters` in all worlds of a `problem`.
 
     ``float[W, S, Q]`` and ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``, by `hparams`, with
-    initial values `initial`; differentiable in the parameters.
+    the iteration starting from `guess`; differentiable in the parameters.
     """
 
-    def world(model: Product, observation: jax.Array, initial: jax.Array) -> Solution:
+    def world(model: Product, observation: jax.Array, guess: jax.Array) -> Solution:
         rewards = reward(problem.network, parameters, model, observation)
-        return _soft_plan(rewards, model, hparams, initial)
+        return _soft_plan(rewards, model, hparams, guess)
 
-    return trees.each_world(world, problem.model, problem.observation, _initial(problem, initial))
+    return trees.each_world(world, problem.model, problem.observation, _guess(problem, guess))
 
 
-def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
-    if initial is not None:
-        return initial
+def _guess(problem: Problem, guess: jax.Array | None) -> jax.Array:
+    if guess is not None:
+        return guess
     return jnp.zeros((*problem.model.letter.shape, problem.model.num_memory), problem.model.dtype)
 
 
@@ -320,12 +320,12 @@ class TodirlObjective:
 
 
 def objective(
-    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, guess: jax.Array | None = None
 ) -> tuple[jax.Array, TodirlObjective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
     The loss ``float[]``, in nats, and :class:`TodirlObjective`, for `parameters`, `problem`, `hparams` and
-    `initial` as in :func:`solve`; with ``hparams.mu`` minus mu times the satisfaction probability in
+    `guess` as in :func:`solve`; with ``hparams.mu`` minus mu times the satisfaction probability in
     each world, as in (2.6). Differentiable in the parameters by one transposed linear solve (implicit
     function theorem), instead of one system (3.6) for each parameter.
 
@@ -356,7 +356,7 @@ def objective(
         problem.model,
         rewards,
         (counts, held_out),
-        _initial(problem, initial),
+        _guess(problem, guess),
         problem.predecessors,
     )
     demonstrated, other, satisfaction, value, error, status = likelihoods
@@ -387,14 +387,14 @@ def _likelihoods(
     model: Product,
     rewards: jax.Array,
     counts: tuple[jax.Array, jax.Array],
-    initial: jax.Array,
+    guess: jax.Array,
     predecessors: PredecessorTable | None,
 ) -> tuple[jax.Array, ...]:
     """Log-likelihoods of demonstrated and held-out pairs in a world, and the solver's results.
 
     That of the demonstrated ones is differentiable.
     """
-    satisfaction, value = jnp.full((), jnp.nan, model.dtype), initial
+    satisfaction, value = jnp.full((), jnp.nan, model.dtype), guess
     if hparams.horizon is not None:
         solution = _backward_induction(rewards, model, hparams)
         after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
@@ -402,7 +402,7 @@ def _likelihoods(
         demonstrated = jnp.sum(counts[0] * log_policy)
     else:
         constant = lax.stop_gradient(rewards)
-        solution = lax.stop_gradient(_soft_plan(constant, model, hparams, initial))
+        solution = lax.stop_gradient(_soft_plan(constant, model, hparams, guess))
         value = solution.value
         log_policy = _log_policy(model, constant, hparams.discount, value)
         policy = jnp.where(model.available, jnp.exp(log_policy), 0)
@@ -444,7 +444,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         key=key,
         step=jnp.int32(0),
         parameters=parameters,
-        value=_initial(problem, None),
+        value=_guess(problem, None),
         optimizer=optimizers.start(hparams, parameters),
         best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
@@ -545,16 +545,16 @@ def plan(
 
 
 def _soft_plan(
-    rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None = None
+    rewards: jax.Array, model: Product, hparams: Hparams, guess: jax.Array | None = None
 ) -> Solution:
-    """The soft value and policy of `rewards` in a `model`, by `hparams`, started at `initial`."""
+    """The soft value and policy of `rewards` in a `model`, by `hparams`, started at `guess`."""
     if hparams.horizon is not None:
         return _backward_induction(rewards, model, hparams)
     return soft_value(
         model,
         rewards,
         hparams.discount,
-        initial=initial,
+        initial=guess,
         method=hparams.method,
         tolerance=hparams.tolerance,
     )

@@ -86,17 +86,17 @@ class LearnedPolicies:
 def _problem(setup: MlirlSetup, allowed: np.ndarray | None) -> mlirl.Problem:
     """The learning problem of inverse RL, with some of the actions or all."""
     table, model, features = setup.task.learner, setup.model, setup.features
-    start = table.start
-    if start is not None and len(start) != len(features.names):
+    guess = table.guess
+    if guess is not None and len(guess) != len(features.names):
         raise ValueError(
-            f"start has {len(start)} numbers; there are {len(features.names)} "
+            f"guess has {len(guess)} numbers; there are {len(features.names)} "
             f"features: {', '.join(features.names)}."
         )
     return mlirl.make_problem(
         model.mdp if table.in_world else model,
         features.values,
         setup.used,
-        start=start,
+        guess=guess,
         satisfaction_over=table.satisfaction_over,
         allowed=None if allowed is None else to_jax(allowed),
     )

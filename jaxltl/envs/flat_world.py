@@ -63,7 +63,7 @@ def flat_world(
     time_step: float = 0.08,
     horizon: int | None = 500,
     discrete: bool = False,
-    start: Sequence[float] | None = None,
+    initial: Sequence[float] | None = None,
     num_starts: int = 2**16,
     seed: int = 0,
 ) -> Environment:
@@ -76,14 +76,14 @@ def flat_world(
       horizon: the time limit, or None.
       discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
         rest) instead of a box.
-      start: the initial position; default: uniform outside of all discs.
+      initial: the initial position; default: uniform outside of all discs.
       num_starts, seed: size and seed of the table of initial positions.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`.
 
     Raises:
-      ValueError: no disc, a number that is not positive, a start outside of the square, or discs that
+      ValueError: no disc, a number that is not positive, an initial position outside of the square, or discs that
         leave hardly any initial position.
 
     >>> world = flat_world()
@@ -110,16 +110,16 @@ def flat_world(
         raise ValueError(
             f"extent={extent}, time_step={time_step}; both must be positive, and below a million."
         )
-    if start is not None and not (
-        np.shape(place := validation.float_array("start", start)) == (2,)
+    if initial is not None and not (
+        np.shape(place := validation.float_array("initial", initial)) == (2,)
         and np.abs(place).max() <= extent
     ):
-        raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
+        raise ValueError(f"initial={initial!r}; give a place (x, y) within {extent} of the middle.")
     color = np.array([[name == one for one in names] for name, *_ in rows])
     scene = Discs(numbers[:, :2], numbers[:, 2], color, np.float32(extent))
     number = np.array([extent, time_step], np.float32)
-    if start is not None:
-        reset = Partial(_begin_at, np.asarray(start, np.float32))
+    if initial is not None:
+        reset = Partial(_begin_at, np.asarray(initial, np.float32))
     else:
         reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
     bound = extent + time_step  # of the step that leaves the square the place outside is seen
@@ -149,11 +149,11 @@ class EventsAround:
     discs: tuple[tuple[float, float, float, int], ...]
     extent: float
     radii: tuple[float, ...]
-    directions: int
+    num_directions: int
 
     def __call__(self, observation: jax.Array) -> jax.Array:
         """``float[1 + R K, E]``: events at the agent's place and at R distances in K directions."""
-        turn = np.arange(self.directions) * (2 * np.pi / self.directions)
+        turn = np.arange(self.num_directions) * (2 * np.pi / self.num_directions)
         ways = np.stack([np.cos(turn), np.sin(turn)], -1)
         there = np.concatenate([[[0.0, 0.0]], *(ways * r for r in self.radii)]).astype(np.float32)
         place = observation + there
@@ -172,19 +172,19 @@ def events_around(
     events: ArrayLike,
     *,
     radii: Sequence[float] = (0.08, 0.16, 0.28, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5),
-    directions: int = 16,
+    num_directions: int = 16,
 ) -> EventsAround:
     """Egocentric event encoding from known discs, ``observation -> float[X, E]``.
 
-    The `events` ``bool[E, P]``, one-hot, at the position and at distances `radii` in evenly spaced
-    `directions`; outside of the square none holds. For
+    The `events` ``bool[E, P]``, one-hot, at the position and at distances `radii` in
+    `num_directions` evenly spaced directions; outside of the square none holds. For
     :class:`~jaxltl.algos.many_tasks.SequenceNetwork`'s `events_seen`.
 
     Raises:
       ValueError: events of another shape, distances that are not positive, or no direction.
 
     >>> world = flat_world()
-    >>> look = events_around(world, np.eye(7, dtype=bool), radii=[0.5], directions=4)
+    >>> look = events_around(world, np.eye(7, dtype=bool), radii=[0.5], num_directions=4)
     >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
     [0, 0, 0, 0, 0, 0, 1]
     """
@@ -211,7 +211,7 @@ def events_around(
         tuple(discs),
         float(scene.extent),
         tuple(distances.tolist()),
-        validation.integer("directions", directions, least=1, limit=2**10),
+        validation.integer("num_directions", num_directions, least=1, limit=2**10),
     )
 
 
@@ -220,7 +220,7 @@ def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarr
     random, free, rounds = np.random.default_rng(seed), [np.zeros((0, 2), np.float32)], 0
     while (have := sum(map(len, free))) < count:
         if (rounds := rounds + 1) > 20 and have < 0.01 * rounds * count:
-            raise ValueError("flat_world: the discs hardly leave a place to begin; give start.")
+            raise ValueError("flat_world: the discs hardly leave a place to begin; give initial.")
         places = random.uniform(-extent, extent, (count, 2)).astype(np.float32)
         apart = ((places[:, None] - scene.center) ** 2).sum(axis=-1)
         free.append(places[(apart >= scene.radius**2).all(axis=1)])

@@ -51,10 +51,10 @@ def letter_world(
     *,
     size: int = 7,
     letters: int | Sequence[str] = 12,
-    copies: int = 2,
+    num_copies: int = 2,
     horizon: int | None = 75,
     layout: str | ArrayLike | None = None,
-    start: int | None = None,
+    initial: int | None = None,
     connected: bool = True,
     num_maps: int = 1024,
     seed: int = 0,
@@ -68,11 +68,11 @@ def letter_world(
     Args:
       size: cells along a side.
       letters: the number of letters a, b, c, ...; or their names.
-      copies: the number of cells of each letter.
+      num_copies: the number of cells of each letter.
       horizon: the time limit, or None.
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none.
-      start: the initial cell in a given layout; default: any empty one.
+      initial: the initial cell in a given layout; default: any empty one.
       connected: draw maps in which all cells are reachable across empty ones.
       num_maps, seed: size, before symmetries, and seed of the table of such maps.
       flat: whether observations are vectors.
@@ -81,7 +81,7 @@ def letter_world(
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`.
 
     Raises:
-      ValueError: letters that do not fit on the map, a malformed layout, an invalid start, or too few
+      ValueError: letters that do not fit on the map, a malformed layout, an invalid initial cell, or too few
         connected maps of this size.
 
     >>> world = letter_world()
@@ -91,32 +91,34 @@ def letter_world(
     names, starts = _names(letters), None
     connected = validation.boolean("connected", connected)
     flat = validation.boolean("flat", flat)
-    copies = validation.integer("copies", copies)
+    num_copies = validation.integer("num_copies", num_copies)
     num_maps = validation.integer("num_maps", num_maps, least=int(connected), limit=2**24)
     size = validation.integer("size", size, limit=2**10)
     seed = validation.integer("seed", seed)
     if layout is None:
-        if start is not None:
-            raise ValueError(f"start={start} is for a given layout; leave it out.")
-        used = len(names) * copies
-        if size < 2 or copies < 1 or used >= size * size:
+        if initial is not None:
+            raise ValueError(f"initial={initial} is for a given layout; leave it out.")
+        used = len(names) * num_copies
+        if size < 2 or num_copies < 1 or used >= size * size:
             raise ValueError(
-                f"letter_world: {len(names)} letters on {copies} cells each do not fit on "
+                f"letter_world: {len(names)} letters on {num_copies} cells each do not fit on "
                 f"{size} x {size} cells with one left for the agent."
             )
         if connected:
             cells = connected_cells(size, used, num_maps, seed)
-            reset = Partial(_draw_connected, *_orders(cells, size), np.zeros((copies, len(names))))
+            reset = Partial(
+                _draw_connected, *_orders(cells, size), np.zeros((num_copies, len(names)))
+            )
         else:
-            reset = Partial(_draw_any, np.zeros((size, size)), np.zeros((copies, len(names))))
+            reset = Partial(_draw_any, np.zeros((size, size)), np.zeros((num_copies, len(names))))
     else:
         letter, size, names = _given(layout, names, letters)
         empty = np.flatnonzero(letter == len(names))
-        if start is None and not len(empty):
-            raise ValueError("layout: no cell is empty; say where to begin, start=0.")
-        if start is not None:
-            start = validation.integer("start", start, limit=size * size - 1)
-        places = (empty if start is None else np.array([start])).astype(np.int32)
+        if initial is None and not len(empty):
+            raise ValueError("layout: no cell is empty; say where to begin, initial=0.")
+        if initial is not None:
+            initial = validation.integer("initial", initial, limit=size * size - 1)
+        places = (empty if initial is None else np.array([initial])).astype(np.int32)
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
     shape = (size * size * (count + 1),) if flat else (size, size, count + 1)
@@ -232,24 +234,24 @@ def _views(size: int) -> np.ndarray:
 
 
 def _draw_connected(slot: Array, empty: Array, each: Array, key: Key) -> LetterState:
-    copies, count = each.shape
-    used = copies * count
+    num_copies, count = each.shape
+    used = num_copies * count
     bits = jax.random.bits(key, used + 2, jnp.uint32)
     drawn, place = bits[0] % np.uint32(slot.shape[0]), bits[1] % np.uint32(empty.shape[1])
     # The rank of random numbers is a uniform permutation. Comparing all of them, and of slots and
     # cells too, is several times faster than sorting and looking up. Low bits make them distinct.
     low = np.uint32((1 << (used - 1).bit_length()) - 1)
     number = (bits[2:] & ~low) | np.arange(used, dtype=np.uint32)
-    shuffled = (number[:, None] > number).sum(axis=1, dtype=jnp.int32) // copies - count
+    shuffled = (number[:, None] > number).sum(axis=1, dtype=jnp.int32) // num_copies - count
     taken = jnp.asarray(slot)[drawn][:, None] == np.arange(used, dtype=slot.dtype)
     letter = count + jnp.where(taken, shuffled.astype(jnp.int8), 0).sum(axis=1, dtype=jnp.int8)
     return LetterState(letter, jnp.asarray(empty)[drawn, place].astype(jnp.int32))
 
 
 def _draw_any(cells: Array, each: Array, key: Key) -> LetterState:
-    copies, count = each.shape
+    num_copies, count = each.shape
     order = jax.random.permutation(key, cells.size)
-    letter = jnp.where(order < copies * count, order // copies, count).astype(jnp.int8)
+    letter = jnp.where(order < num_copies * count, order // num_copies, count).astype(jnp.int8)
     # Of a uniform permutation, the cell of the last number is a uniform empty one.
     return LetterState(letter, jnp.argmax(order).astype(jnp.int32))
 

@@ -34,7 +34,7 @@ class LQR:
       dynamics, control: A ``float[n, n]`` and B ``float[n, m]``.
       state_cost, control_cost: Q ``float[n, n]`` and R ``float[m, m]``.
       low, high: ``float[m]``, bounds of the controls.
-      start: ``float[n]``.
+      initial: ``float[n]``.
       scale: the unit of J in the objective.
       horizon: N, the number of controls; static.
     """
@@ -45,7 +45,7 @@ class LQR:
     control_cost: Array
     low: Array
     high: Array
-    start: Array
+    initial: Array
     scale: Array
     horizon: int = struct.field(pytree_node=False)
 
@@ -84,7 +84,7 @@ def lqr(
     *,
     state_cost: ArrayLike = ((1, 0), (0, 0)),
     control_cost: ArrayLike = ((0.3,),),
-    start: ArrayLike = (1, -1),
+    initial: ArrayLike = (1, -1),
     horizon: int = 20,
     low: ArrayLike = -0.2,
     high: ArrayLike = 0.2,
@@ -93,7 +93,7 @@ def lqr(
     """A regulator problem, equation (4.17); the defaults are the dissertation's.
 
     Args:
-      dynamics, control, start, horizon: A, B, the initial state and N.
+      dynamics, control, initial, horizon: A, B, the initial state and N.
       state_cost, control_cost: Q, positive semidefinite, and R, positive definite.
       low, high: ``[m]``, or one bound for all controls.
       scale: the unit of J in the objective; default: J of zero controls if positive, else 1.
@@ -106,14 +106,14 @@ def lqr(
     (20, 2470)
     """
     a, b, q, r = (np.asarray(x, float) for x in (dynamics, control, state_cost, control_cost))
-    x = np.asarray(start, float)
+    x = np.asarray(initial, float)
     n, m = len(a), b.shape[-1]
     for name, matrix, shape in (
         ("dynamics", a, (n, n)),
         ("control", b, (n, m)),
         ("state_cost", q, (n, n)),
         ("control_cost", r, (m, m)),
-        ("start", x, (n,)),
+        ("initial", x, (n,)),
     ):
         require_shape(name, matrix, shape)
     _check_definite(q, r)
@@ -221,7 +221,7 @@ def _as(world: LQR, parameters: jax.Array) -> LQR:
 
 def _start(world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     lanes = parameters.shape[1:]
-    state = world.start.reshape(-1, *(1,) * len(lanes))
+    state = world.initial.reshape(-1, *(1,) * len(lanes))
     zero = jnp.zeros(lanes, state.dtype)
     return jnp.broadcast_to(state, (len(state), *lanes)), zero, zero
 
@@ -320,7 +320,7 @@ def as_environment(world: LQR, dtype: DTypeLike | None = None) -> Environment:
 
 
 def _first_state(world: LQR, key: object) -> Plant:
-    start = jnp.asarray(world.start)
+    start = jnp.asarray(world.initial)
     return Plant(start, jnp.zeros((), start.dtype), jnp.int32(0))
 
 
@@ -353,7 +353,7 @@ def optimum(world: LQR) -> Optimum:
     """
     from scipy.optimize import lsq_linear
 
-    names = ("dynamics", "control", "state_cost", "control_cost", "low", "high", "start")
+    names = ("dynamics", "control", "state_cost", "control_cost", "low", "high", "initial")
     a, b, q, r, low, high, start = (np.asarray(getattr(world, x), float) for x in names)
     matrix, offset = _least_squares(a, b, q, r, start, world.horizon)
     bounds = np.tile(low, world.horizon), np.tile(high, world.horizon)

@@ -55,7 +55,7 @@ class Navigation:
 
     Attributes:
       goal, obstacle, bounds: boxes.
-      start: the box of the initial positions; headings are uniform.
+      initial: the box of the initial positions; headings are uniform.
       speed, turn, time_step: the largest speed and turn (radians) of a step, and its duration.
       offset: ``float[M, 2]``, the sensor's points, ahead being (1, 0).
       strip: ``float[2]``, the least and largest y that earn ``2 |y|``.
@@ -66,7 +66,7 @@ class Navigation:
     goal: Array
     obstacle: Array
     bounds: Array
-    start: Array
+    initial: Array
     speed: Array
     turn: Array
     time_step: Array
@@ -103,7 +103,7 @@ def navigation(
     goal: ArrayLike = ((1.5, 1.0), (2.5, 2.0)),
     obstacle: ArrayLike = ((-1.0, 0.2), (1.0, 2.0)),
     bounds: ArrayLike = ((-4.0, -4.0), (4.0, 4.0)),
-    start: ArrayLike = ((-3.0, -2.5), (-1.5, -0.5)),
+    initial: ArrayLike = ((-3.0, -2.5), (-1.5, -0.5)),
     horizon: int = 30,
     speed: float = 1.0,
     turn: float = np.pi / 6,
@@ -116,7 +116,7 @@ def navigation(
     """A map with a goal and an obstacle, and a robot.
 
     Args:
-      goal, obstacle, bounds, start: boxes, each the lower left and the upper right corner.
+      goal, obstacle, bounds, initial: boxes, each the lower left and the upper right corner.
       horizon: N.
       speed, turn, time_step, strip, weight: see :class:`Navigation`.
       radii: of the sensor's circles.
@@ -131,7 +131,7 @@ def navigation(
     >>> navigation(speed=0.5, radii=[1.0]).num_observations
     14
     """
-    boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
+    boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "initial": initial}
     corners = {name: _box(name, box) for name, box in boxes.items()}
     numbers = {"speed": speed, "turn": turn, "time_step": time_step}
     sizes = numbers | {
@@ -175,20 +175,20 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 # --- the robot --------------------------------------------------------------------------------
 
 
-def start_states(
+def initial_states(
     key: Key, world: Navigation, shape: tuple[int, ...] = (), dtype: np.dtype | type | None = None
 ) -> State:
-    """The initial states, uniform in the start box of `world` and in the heading, drawn from `key`.
+    """The initial states, uniform in the initial box of `world` and in the heading, drawn from `key`.
 
     They are arrays of a `shape` and a `dtype` (default: JAX's).
 
     >>> drawn = jax.eval_shape(
-    ...     lambda key: start_states(key, navigation(), (5,)), jax.random.key(0))
+    ...     lambda key: initial_states(key, navigation(), (5,)), jax.random.key(0))
     >>> drawn.x.shape
     (5,)
     """
     dtype = dtype or jnp.result_type(float)
-    low, high = jnp.asarray(world.start, dtype)
+    low, high = jnp.asarray(world.initial, dtype)
     u = jax.random.uniform(key, (3, *shape), dtype)
     x, y = (low[i] + (high[i] - low[i]) * u[i] for i in range(2))
     return State(x, y, (2 * u[2] - 1) * jnp.asarray(np.pi, dtype))
@@ -390,7 +390,7 @@ def _simulate(
             following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), state, following)
         return following, (state, action)
 
-    first = start_states(key, world, (num_trajectories,), dtype)
+    first = initial_states(key, world, (num_trajectories,), dtype)
     _, (states, actions) = lax.scan(step, first, None, length=world.horizon)
     return NavigationRun(jax.tree.map(lambda x: x.T, states), jnp.moveaxis(actions, 0, 1))
 

@@ -68,7 +68,7 @@ def as_environment(
     Raises:
       ValueError: an unknown task.
 
-    >>> task = as_environment(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
+    >>> task = as_environment(nav.navigation(initial=((2, 1.5), (2, 1.5))), 2)
     >>> place = task.reset(jax.random.key(0))
     >>> made = task.step(place, jnp.zeros(2), None)
     >>> float(made.reward), float(made.cost)
@@ -94,7 +94,7 @@ def as_environment(
 
 
 def _reset(settings: _StepSettings, world: Navigation, key: Key) -> Place:
-    state = nav.start_states(key, world, dtype=settings.dtype)
+    state = nav.initial_states(key, world, dtype=settings.dtype)
     no = jnp.bool_(False)
     return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no, jnp.int32(0))
 

@@ -448,23 +448,26 @@ def expert_policy(
     return soft_value(model, reward, discount, method=method, tolerance=tolerance).policy
 
 
-@partial(jax.jit, static_argnames=("num", "horizon"))
+@partial(jax.jit, static_argnames=("num_trajectories", "horizon"))
 def demonstrations(
-    key: Key, model: Product, policy: jax.Array, num: int, horizon: int = 100
+    key: Key, model: Product, policy: jax.Array, num_trajectories: int, horizon: int = 100
 ) -> Trajectories:
     """The trajectories of a policy in the world, cut where the task is satisfied or violated.
 
     Args:
       key, model, policy: the random key, the product, and ``float[S, Q, A]``.
-      num, horizon: the number of trajectories and the largest number of steps; static.
+      num_trajectories, horizon: the number of trajectories and the largest number of steps; static.
 
     >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
     >>> model = product(world.mdp, "F o1", label_on="exit")
     >>> policy = jnp.full((*model.state_shape, 4), 0.25)
     >>> runs = jax.eval_shape(
-    ...     lambda key: demonstrations(key, model, policy, num=3, horizon=5), jax.random.key(0))
+    ...     lambda key: demonstrations(key, model, policy, num_trajectories=3, horizon=5), jax.random.key(0))
     >>> runs.state.shape, runs.state_shape
     ((3, 5), (16,))
     """
-    runs = rollout(model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model))
+    stop = is_over(model)
+    runs = rollout(
+        model, policy, key, num_trajectories=num_trajectories, num_steps=horizon, stop=stop
+    )
     return project_trajectories(model, runs)

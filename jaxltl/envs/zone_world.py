@@ -72,7 +72,7 @@ class _ZoneParameters:
 def zone_world(
     *,
     colors: Sequence[str] = COLORS,
-    zones: int = 2,
+    num_zones: int = 2,
     radius: float = 0.4,
     extent: float = 2.5,
     horizon: int | None = 1000,
@@ -90,7 +90,7 @@ def zone_world(
 
     Args:
       colors: the propositions, each true in the zones of its colour.
-      zones: the number of zones of each colour.
+      num_zones: the number of zones of each colour.
       radius, extent: of a zone, and half a side of the square.
       horizon: the time limit, or None.
       saturation: the action from which on the thrust is full; as published, .05.
@@ -107,23 +107,23 @@ def zone_world(
     (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
     names = validation.distinct_names("colors", colors)
-    zones, seed = validation.integer("zones", zones), validation.integer("seed", seed)
+    num_zones, seed = validation.integer("num_zones", num_zones), validation.integer("seed", seed)
     num_maps = validation.integer("num_maps", num_maps, limit=2**20)
     sizes = {"radius": radius, "extent": extent, "saturation": saturation}
-    counts = {"zones": zones, "num_maps": num_maps, "colors": len(names)}
+    counts = {"num_zones": num_zones, "num_maps": num_maps, "colors": len(names)}
     for name, number in (sizes | counts).items():
         if not 0 < validation.finite_number(name, number) < 1e7:
             raise ValueError(
                 f"zone_world: {name}={number}; it must be positive, and below ten million."
             )
     radius, extent, saturation = float(radius), float(extent), float(saturation)
-    places = draw_places(len(names) * zones, extent, num_maps, seed)
+    places = draw_places(len(names) * num_zones, extent, num_maps, seed)
     thrust, drag = 0.3 * 0.05 / _MASS, 0.01 / _MASS
     values = (radius, extent, 0.02, thrust, saturation, drag, 0.3 / 0.095, 3.0, 0.5)
     numbers = _ZoneParameters(*map(np.float32, values))
     count = len(names) * _BINS + 11
     world = make_environment(
-        Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
+        Partial(_begin, places.astype(np.float32), np.zeros((num_zones, len(names)))),
         Partial(_move, numbers),
         Partial(_see, numbers),
         actions=make_box(-1, 1, (2,), np.float32),

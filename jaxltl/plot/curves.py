@@ -271,14 +271,14 @@ def paths(
     boxes: Mapping[str, ArrayLike],
     *,
     bounds: ArrayLike,
-    columns: int = 4,
+    num_columns: int = 4,
 ) -> Figure:
     """The trajectories in the plane, a map for each title.
 
     Args:
       maps: by title, coordinates x and y of M trajectories, ``[M, T]`` each.
       boxes: by name, regions ``((x, y), (x, y))``, the lower left corner first; drawn in all maps.
-      bounds, columns: the box that is shown, and the number of maps in a row.
+      bounds, num_columns: the box that is shown, and the number of maps in a row.
 
     Raises:
       ValueError: there is nothing to show.
@@ -291,10 +291,10 @@ def paths(
     """
     if not maps:
         raise ValueError("paths: nothing to show; give at least one map.")
-    columns = min(columns, len(maps))
-    count = -(-len(maps) // columns)
-    figure = blank(2.3 * columns, 2.4 * count + 0.3)
-    every = figure.subplots(count, columns, squeeze=False).ravel()
+    num_columns = min(num_columns, len(maps))
+    count = -(-len(maps) // num_columns)
+    figure = blank(2.3 * num_columns, 2.4 * count + 0.3)
+    every = figure.subplots(count, num_columns, squeeze=False).ravel()
     low, high = np.asarray(bounds, float)
     handles: list[Artist] = []
     for i, axes in enumerate(every):

@@ -152,7 +152,7 @@ def live_map(
     *,
     runs: Sequence[Sequence[int]] = (),
     marked: Iterable[tuple[int, int, int]] = (),
-    pieces: int = 1,
+    num_pieces: int = 1,
     actions: Sequence[str] = tuple(STEPS),
     wall: str = "#",
 ) -> str:
@@ -166,7 +166,7 @@ def live_map(
       runs: the cells of each run, a line from a dot, ``data-run``.
       marked: (state, memory, action) to be highlighted: ``g.marked``.
       actions, wall: as for :func:`jaxltl.plot.grid`.
-      pieces: number of moving pieces, ``circle.token``.
+      num_pieces: number of moving pieces, ``circle.token``.
 
     Example:
       >>> text = live_map(np.array([[".", "g"]]), "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
@@ -218,7 +218,7 @@ def live_map(
             [(s % columns * CELL + CELL // 2, s // columns * CELL + CELL // 2) for s in cells]
             for cells in runs
         ],
-        pieces=pieces,
+        pieces=num_pieces,
         stride=-(-max(ground.shape) // 16),
         edge=-beyond - margin / 2,
     )
@@ -324,19 +324,19 @@ def playback(
     memory: ArrayLike | None = None,
     label: str = "",
     wait: float = 0.4,
-    times: int = 3,
+    num_plays: int = 3,
     wall: str = "#",
 ) -> str:
     """An animated SVG of a trajectory on a map, next to the state of the task's automaton.
 
-    It plays `times` times and then shows the whole way; at once if reduced motion is preferred.
+    It plays `num_plays` times and then shows the whole way; at once if reduced motion is preferred.
 
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
       label: the text alternative; default the number of steps.
-      wait, times, wall: seconds for each step, the number of repetitions, and the kind of walls.
+      wait, num_plays, wall: seconds for each step, the number of repetitions, and the kind of walls.
 
     Raises:
       ValueError: the run is empty or leaves the map, or the automaton and its states do not fit.
@@ -400,7 +400,7 @@ def playback(
         label=label or f"A run of {len(run) - 1} steps on a map",
         animations=[(n, p, _timed(f, wait), f[-1], how) for n, p, f, how in animations],
         seconds=(len(run) - 1) * wait + _REST,
-        times=times,
+        times=num_plays,
         length=max(done[-1], 1),
         **_COLORS,
     )

@@ -245,7 +245,7 @@ def strategies(
     *,
     marked: ArrayLike | None = None,
     mark: str = "",
-    across: int = 4,
+    num_columns: int = 4,
     seldom: float = 0.01,
     titles: Sequence[str] | str = "",
     actions: Sequence[str] = tuple(STEPS),
@@ -260,7 +260,7 @@ def strategies(
       marked, mark: cells ``bool[S]`` (or with M panels first) with a coloured background, and the
         legend of that colour.
       titles: one per panel.
-      across: the maximal number of panels in a row.
+      num_columns: the maximal number of panels in a row.
       seldom: moves of a smaller probability get a small arrow.
       actions, wall: as for :func:`grid`; an action may also be stay.
 
@@ -290,7 +290,7 @@ def strategies(
         )
     colored = np.broadcast_to(colored, panels.shape[:2])
     titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
-    figure, every = rows_of_maps(kinds.shape, len(panels), min(len(panels), across))
+    figure, every = rows_of_maps(kinds.shape, len(panels), min(len(panels), num_columns))
     for axes, chance, here, title in zip(every, panels, colored, titles, strict=True):
         blank = np.isnan(chance).any(-1)
         fill_cells(

@@ -203,7 +203,7 @@ _TRUST = tr.Hparams(
     # meet the limit, and stays above it.
     damping=0.1,
     fisher_stride=4,
-    value_epochs=3,
+    num_value_epochs=3,
 )
 
 
@@ -447,8 +447,8 @@ def pictures(result: Record) -> Record:
     world = nav.navigation()
     drawn["maps"] = plot.paths(
         {f"task {x['task']}: {x['method']}": (x["x"], x["y"]) for x in result["maps"]},
-        {"goal": world.goal, "obstacle": world.obstacle, "start": world.start},
+        {"goal": world.goal, "obstacle": world.obstacle, "start": world.initial},
         bounds=world.bounds,
-        columns=len({x["method"] for x in result["maps"]}),
+        num_columns=len({x["method"] for x in result["maps"]}),
     )
     return drawn

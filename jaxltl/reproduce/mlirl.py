@@ -79,11 +79,11 @@ def learn_cases(
     """Weights ``[F]``, policy and negative log-likelihood for each mu, from the best of three starts."""
     starts = jnp.tile(jnp.asarray(STARTS, problem.features.dtype), (len(mus), 1))
     mu = None if None in mus else jnp.repeat(jnp.asarray(mus), len(STARTS))
-    hparams = irl.Hparams(discount=DISCOUNT, mu=mu, l2=L2, start_scale=0.0)
-    one = irl.Hparams(discount=DISCOUNT, l2=L2, start_scale=0.0)
+    hparams = irl.Hparams(discount=DISCOUNT, mu=mu, l2=L2, guess_scale=0.0)
+    one = irl.Hparams(discount=DISCOUNT, l2=L2, guess_scale=0.0)
 
-    def begin(start: jax.Array) -> irl.State:
-        return irl.init(jax.random.key(0), replace(problem, start=start), one)
+    def begin(guess: jax.Array) -> irl.State:
+        return irl.init(jax.random.key(0), replace(problem, guess=guess), one)
 
     learned = run_in_chunks(
         irl.step,

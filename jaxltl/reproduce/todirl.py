@@ -88,7 +88,7 @@ def _setting(num_seeds: int, plan: TodirlExperimentPlan) -> Setting:
     models = _stacked(train, task)
     policies = jax.vmap(lambda m: grid.expert_policy(m, _DISCOUNT))(models)
     keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
-    draw = partial(grid.demonstrations, num=max(plan.demonstrations), horizon=100)
+    draw = partial(grid.demonstrations, num_trajectories=max(plan.demonstrations), horizon=100)
     demonstrations = jax.vmap(draw)(keys, models, policies)
     return Setting(train, test, task, [_lane(demonstrations, i) for i in range(num_seeds)])
 

@@ -87,7 +87,7 @@ def ruin():
 @pytest.mark.slow
 def test_a_quarter_is_the_most_that_a_head_and_a_tail_have(tmp_path):
     problem = make_problem(coins(tmp_path).over(1e-3, 1 - 1e-3), "goal", bound=">=")
-    found = feasible(problem, 0.2499, starts=40)
+    found = feasible(problem, 0.2499, num_starts=40)
     assert found.feasible.all() and (found.status == Status.CONVERGED).all()
     p = found.parameters[:, 0]
     assert (p * (1 - p) >= 0.2499).all() and (abs(p - 0.5) <= 0.01 + 1e-9).all()
@@ -99,9 +99,9 @@ def test_a_quarter_is_the_most_that_a_head_and_a_tail_have(tmp_path):
     assert found.num_steps.max() < 60
 
     with counted_traces() as traced:
-        none = feasible(problem, 0.25 + 1e-9, starts=40)
-        easy = feasible(problem, 0.01, starts=40, budget=Budget(num_steps=3))
-        other = feasible(within(problem, 0.1, 0.2), 0.1599, starts=40)
+        none = feasible(problem, 0.25 + 1e-9, num_starts=40)
+        easy = feasible(problem, 0.01, num_starts=40, budget=Budget(num_steps=3))
+        other = feasible(within(problem, 0.1, 0.2), 0.1599, num_starts=40)
     assert not traced, "thresholds, boxes and numbers of steps are arguments"
     assert not none.feasible.any() and (none.num_steps == 200).all()
     assert (none.status != Status.CONVERGED).all() and (none.value > 0.249).all()
@@ -116,10 +116,10 @@ def test_at_most_and_expected_rewards(tmp_path):
     model = coins(tmp_path).over(1e-3, 1 - 1e-3)
     ends = np.array([False, False, True, True])
     problem = make_problem(model, ends, reward="cost", bound="<=")
-    found = feasible(problem, 1.25, starts=20)
+    found = feasible(problem, 1.25, num_starts=20)
     assert found.feasible.all() and (found.parameters <= 0.25).all()
     assert (found.lower <= 1 + found.parameters[:, 0]).all() and (found.upper <= 1.25).all()
-    assert not feasible(problem, 1.0, starts=20).feasible.any(), "p is at least a thousandth"
+    assert not feasible(problem, 1.0, num_starts=20).feasible.any(), "p is at least a thousandth"
 
 
 @pytest.mark.slow
@@ -128,15 +128,15 @@ def test_walks_with_circles():
     problem = make_problem(model, "won", bound=">=")
     odds = 0.9 / 0.1
     least = odds ** (1 / 3) / (1 + odds ** (1 / 3))  # of p
-    found = feasible(problem, 0.9, starts=20)
+    found = feasible(problem, 0.9, num_starts=20)
     assert found.feasible.all() and (found.parameters[:, 0] >= least).all()
     # From where the probability is 1e-6 too: steps are measured by the odds.
-    low = feasible(problem, 0.999, starts=np.array([[0.01], [0.02]]), budget=Budget(num_steps=40))
+    low = feasible(problem, 0.999, guess=np.array([[0.01], [0.02]]), budget=Budget(num_steps=40))
     assert low.feasible.all()
     longest = make_problem(model, "over", reward="steps", bound=">=")
-    found = feasible(longest, 8.999, starts=20)
+    found = feasible(longest, 8.999, num_starts=20)
     assert found.feasible.all() and (abs(found.parameters - 0.5) < 0.02).all()
-    assert not feasible(longest, 9.001, starts=20).feasible.any()
+    assert not feasible(longest, 9.001, num_starts=20).feasible.any()
 
 
 @pytest.mark.slow
@@ -157,8 +157,8 @@ def test_what_may_be_passed_before(tmp_path):
     problem = make_problem(model, "goal", bound=">=", stay=stay)
     lower, upper = certify(problem, [0.25])
     assert lower <= 0.1875 <= upper and upper - lower < 1e-6
-    assert feasible(problem, 0.2499, starts=4).feasible.all()
-    assert not feasible(problem, 0.2501, starts=4).feasible.any()
+    assert feasible(problem, 0.2499, num_starts=4).feasible.all()
+    assert not feasible(problem, 0.2501, num_starts=4).feasible.any()
 
 
 def test_steps_are_measured_by_the_odds():
@@ -174,11 +174,13 @@ def test_steps_are_measured_by_the_odds():
 @pytest.mark.slow
 def test_keys_and_starts_decide():
     problem = make_problem(ruin(), "won", bound=">=")
-    one, same, other = (feasible(problem, 0.9, starts=20, key=jax.random.key(k)) for k in (1, 1, 2))
+    one, same, other = (
+        feasible(problem, 0.9, num_starts=20, key=jax.random.key(k)) for k in (1, 1, 2)
+    )
     for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True):
         np.testing.assert_array_equal(x, y)
     assert (one.parameters != other.parameters).any()
-    alone = feasible(problem, 0.9, starts=np.array([[0.3], [0.95]]), budget=Budget(num_steps=200))
+    alone = feasible(problem, 0.9, guess=np.array([[0.3], [0.95]]), budget=Budget(num_steps=200))
     assert alone.num_steps[1] == 1 and alone.parameters[1] == 0.95, "it is there already"
     assert alone.num_steps[0] > 1
 
@@ -279,14 +281,14 @@ def test_values_over_policies(tmp_path):
         value = both(p, q * (1 - p))
         for bound, best, sign in ((">=", value.max(), 1), ("<=", value.min(), -1)):
             problem = make_problem(model, "goal", bound=bound, objective=objective)
-            found = feasible(problem, best - sign * 0.02, starts=6)
+            found = feasible(problem, best - sign * 0.02, num_starts=6)
             assert found.feasible.any(), (objective, bound)
             at = found.parameters[found.feasible]
             own = both(at[:, 0], at[:, 1] * (1 - at[:, 0]))
             assert (sign * (own - best + sign * 0.02) >= 0).all()
             assert (found.lower[found.feasible] <= own * (1 + 1e-12)).all()
             assert (own * (1 - 1e-12) <= found.upper[found.feasible]).all()
-            none = feasible(problem, best + sign * 0.02, starts=6)
+            none = feasible(problem, best + sign * 0.02, num_starts=6)
             assert not none.feasible.any(), (objective, bound)
 
 
@@ -311,10 +313,10 @@ def test_points_without_a_model_are_left_again():
     """Half of the square is no simplex; who starts there comes back."""
     problem = make_problem(simplex(), np.arange(5) == 3, bound=">=")
     starts = np.array([[0.9, 0.9], [0.34, 0.32], [0.1, 0.1], [0.98, 0.98]])
-    found = feasible(problem, 0.0369, starts=starts)
+    found = feasible(problem, 0.0369, guess=starts)
     assert found.feasible.all() and found.num_steps[1] == 1
     assert (abs(found.parameters - 1 / 3) < 0.04).all() and (found.upper <= 1 / 27 + 1e-9).all()
-    stopped = feasible(problem, 0.0369, starts=starts, budget=Budget(num_steps=1))
+    stopped = feasible(problem, 0.0369, guess=starts, budget=Budget(num_steps=1))
     assert stopped.status.tolist() == [
         Status.INVALID,
         Status.CONVERGED,
@@ -328,7 +330,7 @@ def test_points_without_a_model_are_left_again():
 @pytest.mark.parametrize("optimizer", ["rmsprop", "sgd", "sign"])
 def test_other_optimisers(optimizer):
     problem = make_problem(ruin(), "won", bound=">=")
-    found = feasible(problem, 0.8, starts=4, hparams=Hparams(optimizer=optimizer))
+    found = feasible(problem, 0.8, num_starts=4, hparams=Hparams(optimizer=optimizer))
     assert found.feasible.all()
 
 
@@ -337,7 +339,7 @@ def test_single_precision(tmp_path):
         model = coins(tmp_path).over(1e-9, 1 - 1e-9)
         problem = make_problem(model, "goal", bound=">=")
         assert problem.high.dtype == np.float32 and (problem.high < 1).all()
-        found = feasible(problem, 0.2499, starts=8)
+        found = feasible(problem, 0.2499, num_starts=8)
         assert found.feasible.all()
         assert (found.upper - found.lower <= 1e-12).all(), "the proof is in double precision"
         with pytest.raises(ValueError, match="interval of p has no two numbers in float32"):
@@ -399,8 +401,8 @@ def test_a_search_that_is_wrong_claims_nothing(tmp_path):
 
 def test_as_many_are_prove_as_are_enough():
     problem = make_problem(ruin(), "won", bound=">=")
-    every = feasible(problem, 0.9, starts=20)
-    some = feasible(problem, 0.9, starts=20, budget=Budget(num_proofs=3))
+    every = feasible(problem, 0.9, num_starts=20)
+    some = feasible(problem, 0.9, num_starts=20, budget=Budget(num_proofs=3))
     best = np.argsort(-every.value, kind="stable")[:3]
     assert set(np.flatnonzero(some.feasible)) == set(best)
     np.testing.assert_array_equal(some.parameters, every.parameters)
@@ -430,7 +432,7 @@ def test_storm_finds_the_same_at_what_was_found(tmp_path):
     model = random_chain(tmp_path, 0).over(0.05, 0.95)
     problem = make_problem(model, "goal", reward="cost", bound="<=")
     least = min(certify(problem, x)[0] for x in itertools.product([0.05, 0.5, 0.95], repeat=2))
-    found = feasible(problem, 1.05 * least, starts=6)
+    found = feasible(problem, 1.05 * least, num_starts=6)
     assert found.feasible.any()
     for i in np.flatnonzero(found.feasible):
         at = model.at(found.parameters[i])
@@ -465,14 +467,14 @@ def test_questions_that_are_none(tmp_path, changed, message):
     [
         (np.nan, {}, "threshold=nan; give a finite number"),
         (np.inf, {}, "threshold=inf"),
-        (0.2, {"starts": 0}, "starts=0; it must be at least 1"),
-        (0.2, {"starts": np.array([0.5])}, r"starts has shape \(1,\); expected \(N, 1\)"),
+        (0.2, {"num_starts": 0}, "num_starts=0; it must be at least 1"),
+        (0.2, {"guess": np.array([0.5])}, r"guess has shape \(1,\); expected \(N, 1\)"),
         (
             0.2,
-            {"starts": np.array([[0.5], [0.95]])},
-            r"start 1 has p = 0.95; its interval is \[0.1",
+            {"guess": np.array([[0.5], [0.95]])},
+            r"guess 1 has p = 0.95; its interval is \[0.1",
         ),
-        (0.2, {"starts": np.array([[np.nan]])}, "start 0 has p = nan"),
+        (0.2, {"guess": np.array([[np.nan]])}, "guess 0 has p = nan"),
         (0.2, {"hparams": Hparams(optimizer="lbfgs")}, "choose one of adabelief, .*, sign"),
         (0.2, {"hparams": Hparams(optimizer="newton")}, "optimizer='newton'; choose one of"),
     ],

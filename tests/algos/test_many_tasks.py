@@ -22,7 +22,7 @@ from jaxltl.envs.letter_world import events_seen, letter_world
 
 NAMES = ("a", "b", "c")
 EVENTS = make_events(NAMES)
-WORLD = letter_world(size=4, letters=NAMES, copies=1, horizon=30)
+WORLD = letter_world(size=4, letters=NAMES, num_copies=1, horizon=30)
 DEPTH = 3
 TASKS = ("F(a & F b)", "!a U b", "F(a & F c) & F b", "(!c U (b & F c)) & F a")
 
@@ -240,7 +240,7 @@ def test_boxes_and_finite_actions_do_the_same():
 
     told = []
     for network, discrete in ((finite, True), (boxed, False)):
-        world = flat_world(discs=scene, start=(-0.8, 0.6), discrete=discrete)
+        world = flat_world(discs=scene, initial=(-0.8, 0.6), discrete=discrete)
         plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
         task = task_environment(world, "F a & F b")
         agent = many_tasks.sequence_agent(network, plan, actions=world.actions, sampled=False)

@@ -131,7 +131,7 @@ def test_ten_million_moves_stay_in_the_region():
     safe = safe_robots(4)
     start = np.where(safe.region, safe.whole.initial, 0)
     problem = maximin_q.make_problem(
-        safe.whole, diagonal_reward(safe.whole), allowed=safe.mask, start=start / start.sum()
+        safe.whole, diagonal_reward(safe.whole), allowed=safe.mask, initial=start / start.sum()
     )
     hparams = maximin_q.Hparams(discount=0.9, num_chains=4096)
     state, metrics = train(problem, hparams, 40)
@@ -179,7 +179,7 @@ def test_the_largest_published_example_is_learned():
 def test_restarts_reach_states_without_predecessors():
     safe = safe_robots(3)
     everywhere = np.full(safe.part.num_states, 1 / safe.part.num_states)
-    problem = maximin_q.make_problem(safe.part, safe.reward, start=everywhere)
+    problem = maximin_q.make_problem(safe.part, safe.reward, initial=everywhere)
     problem = maximin_q.with_exact_value(problem, minimax_value(safe.part, safe.reward, 0.9))
     hparams = maximin_q.Hparams(discount=0.9, num_chains=256, restart=0.05)
     state, metrics = train(problem, hparams, 120)
@@ -374,7 +374,7 @@ def test_unknown_answers_may_count_or_not():
 
 def test_starts_are_drawn_as_given():
     mdp = make_mdp([[[0]], [[1]], [[2]], [[3]]], np.ones((4, 1, 1)))
-    problem = maximin_q.make_problem(mdp, np.zeros((4, 1)), start=[0.0, 0.25, 0.75, 0.0])
+    problem = maximin_q.make_problem(mdp, np.zeros((4, 1)), initial=[0.0, 0.25, 0.75, 0.0])
     state = maximin_q.init(
         jax.random.key(0), problem, maximin_q.Hparams(discount=0.9, num_chains=10_000)
     )
@@ -509,8 +509,8 @@ def only(*rows):
             {"allowed": only([1, 0], [0, 0])},
             "no action is allowed in state 1",
         ),
-        (SPLIT, np.zeros((2, 1)), {"start": [1.0, 1.0]}, "start is not a distribution"),
-        (SPLIT, np.zeros((2, 1)), {"start": [1.0]}, r"start has shape \(1,\)"),
+        (SPLIT, np.zeros((2, 1)), {"initial": [1.0, 1.0]}, "initial is not a distribution"),
+        (SPLIT, np.zeros((2, 1)), {"initial": [1.0]}, r"initial has shape \(1,\)"),
         (
             TURNS,
             np.zeros((2, 2)),

@@ -142,7 +142,7 @@ def problem_in(place, reward="linear"):
         return mlirl.make_problem(model, features, demonstrations)
     network = Network()
     start = network.init(jax.random.key(0), features)
-    return mlirl.make_problem(model, features, demonstrations, start=start, reward=network.apply)
+    return mlirl.make_problem(model, features, demonstrations, guess=start, reward=network.apply)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def problem_in(place, reward="linear"):
 def test_gradients_of_the_objective(place, reward, options):
     problem = problem_in(place, reward)
     hparams = mlirl.Hparams(discount=0.7, **options)
-    flat, unravel = ravel_pytree(problem.start)
+    flat, unravel = ravel_pytree(problem.guess)
     rng = np.random.default_rng(0)
 
     def loss(x):

@@ -50,7 +50,7 @@ def random_problem(seed, num_states=7, least=2):
         if least <= region.sum() < num_states:
             break
     reward = rng.random(game.mdp.probability.shape)
-    return rmax.make_problem(game, accepting, reward, start=region / region.sum()), rng
+    return rmax.make_problem(game, accepting, reward, initial=region / region.sum()), rng
 
 
 def gamble():
@@ -457,7 +457,7 @@ def test_a_start_outside_the_region_is_told():
     game = Game(mdp, jnp.array([False, True, True]))
     with pytest.raises(ValueError, match=r"2 of the initial states .* region: 0 .*, 2"):
         rmax.make_problem(game, "F goal", reward)
-    rmax.make_problem(mdp, "F goal", reward, start=[1, 0, 0])
+    rmax.make_problem(mdp, "F goal", reward, initial=[1, 0, 0])
 
 
 def test_rewards_out_of_bounds_are_told():
@@ -501,8 +501,8 @@ def test_mistakes_in_the_problem():
         make(found.accepting, found.reward, environment="kind")
     with pytest.raises(ValueError, match="environment: the row of state"):
         make(found.accepting, found.reward, environment=np.zeros((144, 6)))
-    with pytest.raises(ValueError, match="start is not a distribution"):
-        make(found.accepting, found.reward, start=np.ones(144))
+    with pytest.raises(ValueError, match="initial is not a distribution"):
+        make(found.accepting, found.reward, initial=np.ones(144))
     with pytest.raises(ValueError, match="needs 3 priorities"):
         rmax.make_problem(post_offices(), "G F p1 -> G F p2", np.zeros((36, 6)))
     with pytest.raises(ValueError, match=r"proposition|unknown"):
@@ -535,7 +535,7 @@ def pac_learning():
     setting = partial(rmax.Hparams, known_after=3, epsilon=0.1, reward_bound=1.0, moves_per_step=7)
     return LearnerCase(
         rmax,
-        rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
+        rmax.make_problem(game, np.arange(4) == 0, reward, initial=np.full(4, 0.25)),
         setting(discount=0.5, restart=0.1),
         setting(discount=0.6, restart=0.3),
         reward="reward",

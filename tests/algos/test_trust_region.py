@@ -137,7 +137,7 @@ ONE = Hparams(
     value_hidden=(),
     normalize=False,
     delta=0.02,
-    value_epochs=1,
+    num_value_epochs=1,
 )
 
 
@@ -164,9 +164,9 @@ SMALL = Hparams(
     num_trajectories=40,
     hidden=(4,),
     value_hidden=(4,),
-    value_epochs=2,
-    cg_steps=5,
-    value_batches=2,
+    num_value_epochs=2,
+    num_cg_steps=5,
+    num_value_batches=2,
 )
 
 
@@ -714,7 +714,7 @@ def test_values_of_what_is_cut_off_are_those_of_what_goes_on(time_limit, horizon
         num_trajectories=16,
         hidden=(),
         value_hidden=(16,),
-        value_epochs=20,
+        num_value_epochs=20,
         value_rate=0.02,
         gae_lambda=0.5,
         cost_discount=0.5,
@@ -928,8 +928,8 @@ def test_new_worlds_limits_and_settings_do_not_retrace():
     [
         ({"method": "ppo"}, r"method='ppo'; choose"),
         ({"penalty": 1.0}, "CPO finds its own multiplier"),
-        ({"cg_steps": 0}, "cg_steps=0; it must be an integer of at least 1"),
-        ({"value_batches": 1000}, "value_batches=1000 of 200 samples"),
+        ({"num_cg_steps": 0}, "num_cg_steps=0; it must be an integer of at least 1"),
+        ({"num_value_batches": 1000}, "num_value_batches=1000 of 200 samples"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(change, message):
@@ -975,9 +975,9 @@ def trust(method, **networks):
         method=method,
         num_trajectories=6,
         value_hidden=(),
-        cg_steps=3,
-        value_epochs=1,
-        value_batches=2,
+        num_cg_steps=3,
+        num_value_epochs=1,
+        num_value_batches=2,
         **networks,
     )
     world = make_environment(

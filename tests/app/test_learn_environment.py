@@ -96,7 +96,7 @@ CCE = (
 CPO = (
     CCE[0],
     '[cpo]\nlimit = 0.5\ncost = "violation"\nnum_trajectories = 32\nhidden = [4]\n'
-    "value_hidden = [4]\nvalue_batches = 2",
+    "value_hidden = [4]\nnum_value_batches = 2",
 )
 
 

@@ -115,7 +115,7 @@ def test_the_digest_covers_named_files(write):
         (("discount = 0.9", "discount = 0.9\nl2 = nan"), r"l2 = nan; it must be a finite number"),
         (("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"), r"it must be a finite number"),
         (
-            ("discount = 0.9", "discount = 0.9\nstart = [1, inf]"),
+            ("discount = 0.9", "discount = 0.9\nguess = [1, inf]"),
             r"a list of finite numbers, one per",
         ),
         (

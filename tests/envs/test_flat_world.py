@@ -64,7 +64,7 @@ def test_episodes_begin_anywhere_outside_of_the_discs():
     ):
         expected = other * 4000 / len(free)
         assert abs(one - expected) < 6 * np.sqrt(expected + 4)
-    at = flat_world(start=(0.5, 0.7), horizon=None)
+    at = flat_world(initial=(0.5, 0.7), horizon=None)
     assert at.labels(at.reset(jax.random.key(0))).tolist() == [
         False,
         False,
@@ -77,7 +77,7 @@ def test_episodes_begin_anywhere_outside_of_the_discs():
 
 
 def test_nine_directions():
-    world = flat_world(discrete=True, horizon=None, start=(0, -1.9))
+    world = flat_world(discrete=True, horizon=None, initial=(0, -1.9))
     here = world.reset(jax.random.key(0))
     after = jax.vmap(lambda a: world.step(here, a, jax.random.key(0)).world.place)(jnp.arange(9))
     moves = (np.asarray(after) - [0, -1.9]) / 0.08
@@ -90,8 +90,8 @@ def test_events_around_a_place_are_those_of_the_slow_world():
     events = np.unique(
         [colors_at(x) for x in np.random.default_rng(5).uniform(-2, 2, (5000, 2))], axis=0
     )
-    look = events_around(world, events, radii=radii, directions=6)
-    assert look == events_around(world, events, radii=radii, directions=6) and hash(look)
+    look = events_around(world, events, radii=radii, num_directions=6)
+    assert look == events_around(world, events, radii=radii, num_directions=6) and hash(look)
     places = np.random.default_rng(6).uniform(-2, 2, (40, 2)).astype(np.float32)
     found, met = np.asarray(jax.jit(jax.vmap(look))(places)), 0
     assert found.shape == (40, 13, len(events))
@@ -116,7 +116,7 @@ def test_events_around_a_place_are_those_of_the_slow_world():
         ({"discs": []}, "at least one"),
         ({"discs": [("red", 0, 0, 0)]}, "radii above zero"),
         ({"time_step": 0}, "must be positive"),
-        ({"start": (3, 0)}, "within 2.0 of the middle"),
+        ({"initial": (3, 0)}, "within 2.0 of the middle"),
         ({"discs": [("red", 0, 0, 9)]}, "hardly leave a place"),
         ({"num_starts": 0}, "num_starts=0"),
     ],
@@ -131,7 +131,7 @@ def test_what_does_not_fit_is_named(options, said):
     [
         ({"events": [[True]]}, "a column for each colour"),
         ({"radii": [0.1, -1]}, "all positive"),
-        ({"directions": 0}, "directions=0"),
+        ({"num_directions": 0}, "num_directions=0"),
     ],
 )
 def test_what_cannot_be_seen_around_is_named(options, said):

@@ -114,7 +114,7 @@ def test_a_given_map_and_where_it_is_begun():
         layout=[[0, -1, 1], [-1, -1, -1], [2, -1, 0]],
         letters=["a", "b", "c"],
         horizon=None,
-        start=3,
+        initial=3,
     )
     assert text.observations.shape == (36,) and array.observations.shape == (3, 3, 4)
     keys = jax.random.split(jax.random.key(0), 200)
@@ -129,7 +129,7 @@ def test_a_given_map_and_where_it_is_begun():
 
 
 def test_maps_without_ways_are_uniform():
-    free = letter_world(size=3, letters=2, copies=2, connected=False, horizon=None)
+    free = letter_world(size=3, letters=2, num_copies=2, connected=False, horizon=None)
     drawn = jax.vmap(free.reset)(jax.random.split(jax.random.key(0), 9000))
     assert (jnp.bincount(drawn.letter.ravel()) == 9000 * jnp.array([2, 2, 5])).all()
     share = (np.asarray(drawn.letter) == 1).mean(axis=0)
@@ -144,13 +144,13 @@ def test_maps_without_ways_are_uniform():
     [
         ({"size": 3}, "do not fit on 3 x 3 cells"),
         ({"letters": 0}, "letters=0; it must be 1 to 26"),
-        ({"size": 4, "letters": 5, "copies": 3}, "too rare"),
+        ({"size": 4, "letters": 5, "num_copies": 3}, "too rare"),
         ({"layout": "a b c"}, "1 x 3 cells; it must be square"),
         ({"layout": "a z\nb .", "letters": 3}, "'z' is none of the letters"),
         ({"layout": [[0, 9], [0, 0]], "letters": 3}, "integers .* from -1 to 2"),
         ({"layout": "a a\na a"}, "no cell is empty"),
-        ({"layout": "a a\na .", "start": 4}, "start=4; it must be at most 3"),
-        ({"start": 4}, "for a given layout"),
+        ({"layout": "a a\na .", "initial": 4}, "initial=4; it must be at most 3"),
+        ({"initial": 4}, "for a given layout"),
     ],
 )
 def test_what_does_not_fit_is_named(options, said):

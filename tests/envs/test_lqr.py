@@ -26,14 +26,14 @@ def other_world():
         control_cost=[[0.4, 0.1], [0.1, 0.3]],
         low=[-0.3, -0.1],
         high=[0.2, 0.5],
-        start=[1, -2, 0.5],
+        initial=[1, -2, 0.5],
         horizon=7,
     )
 
 
 def plainly(world, control_of):
     """J, the largest violation and the controls, by the definition."""
-    x, total, violation, controls = np.array(world.start), 0.0, 0.0, []
+    x, total, violation, controls = np.array(world.initial), 0.0, 0.0, []
     for t in range(world.horizon):
         u = np.asarray(control_of(t, x), float)
         x = world.dynamics @ x + world.control @ u
@@ -63,8 +63,8 @@ def test_runs_against_a_plain_simulation(spec):
     np.testing.assert_allclose((run.total, run.violation), (total, violation), rtol=1e-9)
     objective, cost = evaluator(world, network)(parameters, None)
     np.testing.assert_allclose((-objective * world.scale, cost), (total, violation), rtol=1e-9)
-    assert run.state.shape == (world.horizon + 1, len(world.start))
-    np.testing.assert_array_equal(run.state[0], world.start)
+    assert run.state.shape == (world.horizon + 1, len(world.initial))
+    np.testing.assert_array_equal(run.state[0], world.initial)
 
 
 def test_doing_nothing_is_the_scale():
@@ -72,7 +72,7 @@ def test_doing_nothing_is_the_scale():
         network = make_network(spec)
         objective, cost = evaluator(world, network)(jnp.zeros(network.num_parameters), None)
         np.testing.assert_allclose((objective, cost), (-1, 0), rtol=1e-12)
-    at_rest = lqr(start=[0, 0])
+    at_rest = lqr(initial=[0, 0])
     assert at_rest.scale == 1
     assert lqr(scale=3.0).scale == 3
 
@@ -99,7 +99,7 @@ def test_the_lanes_of_a_simulation():
 
 
 def test_batches_of_worlds():
-    worlds = [lqr(start=[1, -1]), lqr(start=[0.5, 0.2], high=0.1)]
+    worlds = [lqr(initial=[1, -1]), lqr(initial=[0.5, 0.2], high=0.1)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
     parameters = jnp.asarray(0.4 * RNG.normal(size=(4, 9)))
 
@@ -122,7 +122,7 @@ def test_new_worlds_and_parameters_do_not_retrace():
     jitted = jax.jit(population)
     one = jitted(evaluator(lqr(), "2-2-1"), jnp.ones((3, 9)))
     with counted_traces() as traced:
-        two = jitted(evaluator(lqr(start=[2, -1]), make_network("2-2-1")), jnp.zeros((3, 9)))
+        two = jitted(evaluator(lqr(initial=[2, -1]), make_network("2-2-1")), jnp.zeros((3, 9)))
     assert not traced
     assert (one[0] != two[0]).all()
 
@@ -175,7 +175,7 @@ def test_the_optimum_by_its_states_and_controls(world):
 
     def defect(z):
         x, u = split(z)
-        before = np.concatenate([world.start[None], x[:-1]])
+        before = np.concatenate([world.initial[None], x[:-1]])
         return (x - before @ world.dynamics.T - u @ world.control.T).ravel()
 
     zero = np.zeros(horizon * (n + m))
@@ -207,7 +207,7 @@ def test_the_optimum_meets_its_conditions_and_is_the_least():
             x = world.dynamics @ x + world.control @ u
             return x, x @ world.state_cost @ x + u @ world.control_cost @ u
 
-        return jax.lax.scan(step, jnp.asarray(world.start), controls)[1].sum()
+        return jax.lax.scan(step, jnp.asarray(world.initial), controls)[1].sum()
 
     total = jax.jit(total)
     slope = np.asarray(jax.grad(total)(jnp.asarray(best.control)))
@@ -245,7 +245,7 @@ def test_a_small_network_with_biases_comes_within_a_millionth():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"start": [1, 2, 3]}, r"start has shape \(3,\); expected \(2,\)"),
+        ({"initial": [1, 2, 3]}, r"initial has shape \(3,\); expected \(2,\)"),
         ({"state_cost": [[1.0]]}, r"state_cost has shape \(1, 1\); expected \(2, 2\)"),
         ({"state_cost": [[1, 0], [0, -1]]}, "state_cost must be symmetric and positive semi"),
         ({"state_cost": [[1, 1], [0, 1]]}, "state_cost must be symmetric"),

@@ -31,7 +31,7 @@ def crowded():
         goal=[(-1, -1), (1, 0.5)],
         obstacle=[(-2.5, 0.7), (2, 1.5)],
         bounds=[(-3, -2), (3, 2)],
-        start=[(-2, -1.5), (2, 1.8)],
+        initial=[(-2, -1.5), (2, 1.8)],
         speed=1.5,
         turn=0.9,
         time_step=0.4,
@@ -182,7 +182,7 @@ def test_runs_against_a_plain_simulation(world, absorbing):
             stayed += (states[-1] == states[-2]).all()
             turned += np.abs(np.diff(states[:, 2])).max() > math.pi
         assert (found[..., 2] >= -math.pi).all() and (found[..., 2] < math.pi).all()
-        inside = [is_in(world.start, x, y) for x, y, _ in found[:, 0]]
+        inside = [is_in(world.initial, x, y) for x, y, _ in found[:, 0]]
         assert all(inside)
     if world is not WORLD:
         assert (stayed > 0) == absorbing
@@ -190,8 +190,8 @@ def test_runs_against_a_plain_simulation(world, absorbing):
 
 
 def test_starts_are_uniform():
-    states = nav.start_states(jax.random.key(0), WORLD, (20_000,))
-    box = [*zip(*WORLD.start, strict=True), (-math.pi, math.pi)]
+    states = nav.initial_states(jax.random.key(0), WORLD, (20_000,))
+    box = [*zip(*WORLD.initial, strict=True), (-math.pi, math.pi)]
     for values, (low, high) in zip(states, box, strict=True):
         share = np.histogram(values, bins=10, range=(low, high))[0] / 20_000
         np.testing.assert_allclose(share, 0.1, atol=0.012)
@@ -226,7 +226,7 @@ def test_the_limits_are_those_of_table_4():
 
 
 def test_staying_in_the_goal_is_worth_the_horizon():
-    world = navigation(start=[(1.6, 1.1), (2.4, 1.9)])
+    world = navigation(initial=[(1.6, 1.1), (2.4, 1.9)])
     network = policy_network(world)
     parameters = random_policy(network)
     objective, cost = evaluator(world, 1, network)(parameters, jax.random.key(0))
@@ -305,7 +305,7 @@ def test_evaluations_are_differentiable_in_the_parameters():
     ("arguments", "message"),
     [
         ({"goal": [(1, 1), (0, 2)]}, "goal=.*the lower left one first"),
-        ({"start": [0, 1]}, "start=.*give the corners"),
+        ({"initial": [0, 1]}, "initial=.*give the corners"),
         ({"speed": 0.0}, "speed is 0.0; it must be positive"),
         ({"radii": ()}, "the least of radii is 0"),
         ({"radii": (1, -1)}, "the least of radii is -1"),

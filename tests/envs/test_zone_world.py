@@ -131,8 +131,8 @@ def test_zones_and_robot_are_apart():
     [
         ({"radius": 0}, "radius=0; it must be positive"),
         ({"colors": ()}, "colors=0"),
-        ({"zones": 9}, "hardly fit"),
-        ({"zones": 4}, "hardly fit"),
+        ({"num_zones": 9}, "hardly fit"),
+        ({"num_zones": 4}, "hardly fit"),
         ({"extent": 0.5}, "hardly fit"),
         ({"colors": ("red", "red")}, "'red' is not a string, or occurs twice"),
     ],

@@ -33,7 +33,7 @@ def episode(world, action, num_steps=6):
 
 
 def letters():
-    return letter_world(layout="a . b\n. . .\n. c .", letters=3, start=1, horizon=4)
+    return letter_world(layout="a . b\n. . .\n. c .", letters=3, initial=1, horizon=4)
 
 
 class Tags(HTMLParser):
@@ -83,7 +83,7 @@ def test_a_task_is_looked_through_and_what_comes_after_the_end_is_not_shown():
 
 @pytest.mark.slow
 def test_discs_and_zones_stand_upright():
-    flat = flat_world(start=(1.0, 1.5), horizon=8)
+    flat = flat_world(initial=(1.0, 1.5), horizon=8)
     scene = scene_of(flat, episode(flat, jnp.array([0.0, 1.0]), 8))
     assert len(scene.track) == 8  # it leaves the square by the seventh step
     np.testing.assert_allclose(scene.track[:2], [[3.0, 0.5], [3.0, 0.42]], atol=1e-5)

@@ -58,7 +58,7 @@ def test_a_map_shows_its_kinds_walls_layers_and_runs():
         {"0": (np.zeros(6), None), "1": (np.ones(6), None)},
         runs=[[0, 1, 4], [5]],
         marked=[(4, 1, 3)],
-        pieces=2,
+        num_pieces=2,
     )
     assert [x.text for x in parts(text, "text", "name")] == ["a", "b"]
     assert [x.get("x") for x in parts(text, "rect", "wall")] == [str(2 * CELL)]

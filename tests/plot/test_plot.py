@@ -324,7 +324,7 @@ def test_rare_moves_have_small_arrows():
     single = plot.strategies(MAP, play[0], seldom=1e-7)
     assert len(arrows(single.axes[0])[0]) == 4 and not single.legends
     # A row of maps has at most so many.
-    assert len(plot.strategies(MAP, play[[0] * 5], across=3).axes) == 6
+    assert len(plot.strategies(MAP, play[[0] * 5], num_columns=3).axes) == 6
 
 
 @pytest.mark.parametrize(
@@ -563,7 +563,7 @@ def test_paths_on_a_map():
         {"first": (place, place), "second": (place, -place), "third": (place, place)},
         {"goal": ((1, 1), (2, 2))},
         bounds=((-3, -3), (3, 3)),
-        columns=2,
+        num_columns=2,
     )
     assert len(figure.axes) == 4 and figure.axes[1].get_title(loc="left") == "second"
     drawn = figure.axes[1].get_lines()

@@ -28,11 +28,11 @@ def explicit_game(game: Model) -> Game:
     return game
 
 
-def start_distribution(game: Game, start: ArrayLike | None) -> NDArray[np.float64]:
+def initial_distribution(game: Game, initial: ArrayLike | None) -> NDArray[np.float64]:
     """The checked distribution over initial states, ``float64[S]``; default the game's."""
-    distribution = np.asarray(game.initial if start is None else start, float)
-    require_shape("start", distribution, (game.num_states,))
-    check_distributions("start", distribution[None], np.ones((1, game.num_states), bool))
+    distribution = np.asarray(game.initial if initial is None else initial, float)
+    require_shape("initial", distribution, (game.num_states,))
+    check_distributions("initial", distribution[None], np.ones((1, game.num_states), bool))
     return distribution
 
 

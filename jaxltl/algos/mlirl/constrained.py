@@ -50,28 +50,28 @@ class _BudgetSpent(Exception):
 
 def constrained_points(
     evaluate: Callable[[np.ndarray], ConstrainedPoint],
-    starts: Sequence[np.ndarray],
+    guesses: Sequence[np.ndarray],
     required: float,
     max_evaluations: int,
 ) -> list[ConstrainedPoint]:
-    """Points of SLSQP (Kraft 1988) from several starts, by at most `max_evaluations` evaluations.
+    """Points of SLSQP (Kraft 1988) from several guesses, by at most `max_evaluations` evaluations.
 
-    The last start gets the evaluations that earlier ones leave.
+    The last guess gets the evaluations that earlier ones leave.
     """
     points: list[ConstrainedPoint] = []
-    for i, start in enumerate(starts):
-        budget = max_evaluations * (i + 1) // len(starts) - len(points)
-        points += _search(evaluate, np.asarray(start, float), required, budget)
+    for i, guess in enumerate(guesses):
+        budget = max_evaluations * (i + 1) // len(guesses) - len(points)
+        points += _search(evaluate, np.asarray(guess, float), required, budget)
     return [point for point in points if point.is_finite]
 
 
 def _search(
     evaluate: Callable[[np.ndarray], ConstrainedPoint],
-    start: np.ndarray,
+    guess: np.ndarray,
     required: float,
     budget: int,
 ) -> list[ConstrainedPoint]:
-    """The points that SLSQP evaluates from one start."""
+    """The points that SLSQP evaluates from one guess."""
     known: dict[bytes, ConstrainedPoint] = {}
 
     def at(x: np.ndarray) -> ConstrainedPoint:
@@ -98,5 +98,5 @@ def _search(
     constraint = {"type": "ineq", "fun": excess, "jac": slope}
     options = {"maxiter": max(budget, 1), "ftol": _PRECISION}
     with contextlib.suppress(_BudgetSpent):
-        minimize(loss, start, jac=True, method="SLSQP", constraints=constraint, options=options)
+        minimize(loss, guess, jac=True, method="SLSQP", constraints=constraint, options=options)
     return list(known.values())

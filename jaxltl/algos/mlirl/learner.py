@@ -105,7 +105,7 @@ class Problem:
       model: the world, or its product with the task.
       features: ``float[S, A, F]`` (``[S, Q, A, F]``).
       counts: ``float[S, A]`` (``[S, Q, A]``), demonstrated state-action counts.
-      start: center of the initial parameters, any pytree; ``float[F]`` if linear.
+      guess: center of the initial parameters, any pytree; ``float[F]`` if linear.
       satisfaction_weight: ``float[S]``, weights of the states in g of (2.6).
       reward: ``(parameters, features) -> float[S, A]``; static.
     """
@@ -113,7 +113,7 @@ class Problem:
     model: MDP | DenseMDP | Product
     features: jax.Array
     counts: jax.Array
-    start: PyTree
+    guess: PyTree
     satisfaction_weight: jax.Array
     reward: Reward = struct.field(pytree_node=False, default=linear_reward)
 
@@ -127,7 +127,7 @@ class Hparams:
       mu: weight of the satisfaction term (2.6), or None (cases 1 and 2); default None.
       l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
       learning_rate: of ``adam``, ``rmsprop`` and ``sgd``; default 0.1.
-      start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
+      guess_scale: standard deviation of the noise added to ``Problem.guess``; default 1.0.
       policy: ``"boltzmann"`` (2.3) or ``"soft"`` (maximum entropy); static; default ``"boltzmann"``.
       adjoint: ``"exact"``, or ``"approximate"`` as in (2.7); static; default ``"exact"``.
       optimizer: ``"lbfgs"``, or the name of one of optax, such as ``"adamw"``; static; default
@@ -138,7 +138,7 @@ class Hparams:
     mu: Number | None = traced("mu", default=None)
     l2: Number = traced(Range(0, open_above=True), default=1e-3)
     learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
-    start_scale: Number = traced(Range(0, open_above=True), default=1.0)
+    guess_scale: Number = traced(Range(0, open_above=True), default=1.0)
     policy: str = static(("boltzmann", "soft"), default="boltzmann")
     adjoint: str = static(("exact", "approximate"), default="exact")
     optimizer: str = static(("lbfgs", *optimizers.NAMES), default="lbfgs")
@@ -149,7 +149,7 @@ class State(RunState):
     """Parameters, and the initial value of the next solve.
 
     Attributes:
-      parameters: of the reward, as ``Problem.start``; ``float[F]`` if linear.
+      parameters: of the reward, as ``Problem.guess``; ``float[F]`` if linear.
       value: ``float[S]`` (``[S, Q]``), the value at the last evaluated parameters.
       optimizer: optax's state, or that of the line search.
     """
@@ -200,7 +200,7 @@ def make_problem(
     features: jax.Array,
     demonstrations: Trajectories,
     *,
-    start: PyTree | None = None,
+    guess: PyTree | None = None,
     reward: Reward = linear_reward,
     satisfaction_over: str | jax.Array = "initial",
     allowed: jax.Array | None = None,
@@ -211,7 +211,7 @@ def make_problem(
       model: the world (case 1) or a product (cases 2 and 3).
       features: ``float[S, A, F]`` or ``float[S, Q, A, F]``.
       demonstrations: in the world; lifted here if the model is a product.
-      start: center of the initial parameters; default zero weights, one per feature.
+      guess: center of the initial parameters; default zero weights, one per feature.
       reward: any differentiable reward of parameters and features, default :func:`linear_reward`.
       satisfaction_over: the states of g in (2.6): ``"initial"`` (the dissertation's prose),
         ``"all"`` (its formula), or weights ``float[S]``.
@@ -237,48 +237,48 @@ def make_problem(
         weight = to_jax(weight.astype(model.dtype))
     weight = jnp.asarray(weight, model.dtype)
     require_shape("satisfaction_over", weight, model.state_shape)
-    start = np.zeros(features.shape[-1]) if start is None else start
-    start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
-    require_shape("the reward", jax.eval_shape(reward, start, features), actions)
+    guess = np.zeros(features.shape[-1]) if guess is None else guess
+    guess = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), guess)
+    require_shape("the reward", jax.eval_shape(reward, guess, features), actions)
     return Problem(
         model=model,
         features=features,
         counts=pair_counts(model, demonstrations, counted),
-        start=start,
+        guess=guess,
         satisfaction_weight=weight,
         reward=reward,
     )
 
 
 def solve(
-    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, guess: jax.Array | None = None
 ) -> Solution:
     """The softmax value and policy (2.3) at `parameters` of the reward of a `problem`.
 
-    By ``policy`` and ``adjoint`` of `hparams`; the Boltzmann iteration starts from `initial`,
+    By ``policy`` and ``adjoint`` of `hparams`; the Boltzmann iteration starts from `guess`,
     ``float[S]`` (``[S, Q]``). Differentiable in the parameters.
     """
-    return _solve(problem.reward(parameters, problem.features), problem, hparams, initial)
+    return _solve(problem.reward(parameters, problem.features), problem, hparams, guess)
 
 
 def _solve(
-    reward: jax.Array, problem: Problem, hparams: Hparams, initial: jax.Array | None
+    reward: jax.Array, problem: Problem, hparams: Hparams, guess: jax.Array | None
 ) -> Solution:
     if hparams.policy == "soft":
         if hparams.adjoint != "exact":
             raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
         return soft_value(problem.model, reward, hparams.discount)
     return boltzmann_value(
-        problem.model, reward, hparams.discount, initial=initial, adjoint=hparams.adjoint
+        problem.model, reward, hparams.discount, initial=guess, adjoint=hparams.adjoint
     )
 
 
 def objective(
-    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, guess: jax.Array | None = None
 ) -> tuple[jax.Array, MlirlObjective]:
     """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
 
-    The loss ``float[]`` and :class:`MlirlObjective`, for `parameters`, `problem`, `hparams` and `initial` as in
+    The loss ``float[]`` and :class:`MlirlObjective`, for `parameters`, `problem`, `hparams` and `guess` as in
     :func:`solve`. Differentiable in the parameters: exactly, or as in (2.7) with the policy held
     constant in the Bellman equation.
 
@@ -287,7 +287,7 @@ def objective(
     """
     # Evaluated once, so that the backward pass runs through it once.
     reward = problem.reward(parameters, problem.features)
-    solution = _solve(reward, problem, hparams, initial)
+    solution = _solve(reward, problem, hparams, guess)
     logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
     log_policy = jax.nn.log_softmax(logits, axis=-1)
     log_likelihood = jnp.sum(problem.counts * jnp.where(problem.counts > 0, log_policy, 0))
@@ -315,10 +315,10 @@ def objective(
 
 
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
-    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
-    flat, unravel = ravel_pytree(problem.start)
+    """Parameters at ``problem.guess`` plus noise of ``hparams.guess_scale``; the key is kept."""
+    flat, unravel = ravel_pytree(problem.guess)
     noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
-    parameters = unravel(flat + hparams.start_scale * noise)
+    parameters = unravel(flat + hparams.guess_scale * noise)
     value = jnp.zeros(problem.model.state_shape, problem.model.dtype)
     if hparams.optimizer == "lbfgs":
         # A placeholder, of which only the shapes are read.
@@ -336,10 +336,10 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
 
 @jax.jit  # traced once for all its uses
 def _evaluate(
-    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array
+    parameters: PyTree, problem: Problem, hparams: Hparams, guess: jax.Array
 ) -> optimizers.Point:
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
-        parameters, problem, hparams, initial
+        parameters, problem, hparams, guess
     )
     return optimizers.Point(parameters, loss, gradient, parts)
 
@@ -360,7 +360,7 @@ def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Me
         loss, parts, norm = before.loss, before.parts, optax.tree.norm(before.gradient)
         parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
     else:
-        loss_of = partial(objective, problem=problem, hparams=hparams, initial=state.value)
+        loss_of = partial(objective, problem=problem, hparams=hparams, guess=state.value)
         loss, parts, norm, parameters, optimizer = optimizers.descend(loss_of, state, hparams)
         value = _usable(parts)
     metrics = Metrics(

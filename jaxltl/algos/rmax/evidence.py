@@ -93,7 +93,7 @@ def evidence(
     worst_case, played = value(), value(environment=problem.environment)
     optimal = minimax_value(game, problem.reward, hparams.discount, allowed=problem.allowed)
     epsilon_optimal = partial(pac.epsilon_optimal_states, optimal, epsilon=hparams.epsilon)
-    reached = restrict(game, problem.start, allowed=problem.allowed).base_state
+    reached = restrict(game, problem.initial, allowed=problem.allowed).base_state
     data = None
     if confidence is not None:
         data = data_evidence(

@@ -77,7 +77,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
         key=key,
         step=jnp.int32(0),
         moves=jnp.int32(0),
-        position=draw(problem.start_table, word),
+        position=draw(problem.initial_table, word),
         counts=jnp.zeros(shape, jnp.int32),
         reward=jnp.full(shape, bound, game.dtype),
         known_at=jnp.full(shape[:2], -1, jnp.int32),
@@ -123,7 +123,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
         num_known=state.num_known,
         last_update=state.last_update,
         num_updates=state.num_updates,
-        value=jnp.sum(problem.start * state.value),
+        value=jnp.sum(problem.initial * state.value),
         always_almost_sure=state.always_almost_sure,
         fault=state.fault,
         residual=state.error,
@@ -248,7 +248,7 @@ def _move(rollout: _Rollout, rules: _Rules) -> _Rollout:
     count = state.moves.astype(jnp.uint32)
     words = [splitmix.words(rules.stream, 4 * count + i) for i in range(4)]
     restarts = splitmix.uniform(words[0], dtype) < jnp.asarray(rules.hparams.restart, dtype)
-    s = jnp.where(restarts, draw(problem.start_table, words[1]), state.position)
+    s = jnp.where(restarts, draw(problem.initial_table, words[1]), state.position)
     explores = splitmix.uniform(words[2], dtype) < rules.explore
     mine = jnp.where(explores, take(problem.allowed, s), take(state.best, s))
     weight = jnp.where(take(game.system, s), mine, take(problem.environment, s))

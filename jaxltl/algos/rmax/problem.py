@@ -14,7 +14,7 @@ from jaxltl.algos.common.explicit_games import (
     cumulative,
     environment_policy,
     explicit_game,
-    start_distribution,
+    initial_distribution,
     uniform_rows,
 )
 from jaxltl.algos.common.settings import COUNT, Number, RunState, static, traced
@@ -42,7 +42,7 @@ class Problem:
       region: ``bool[S]``, the almost-sure winning region.
       allowed: ``bool[S, A]``, the actions that surely stay in the region; none outside of it.
       environment: ``float[S, A]``, the policy of the environment.
-      start: ``float[S]``, initial distribution; `start_table` its cumulative weights.
+      initial: ``float[S]``, initial distribution; `initial_table` its cumulative weights.
       base_state, memory: ``int32[S]``, the state of the given game and of the task's automaton.
     """
 
@@ -52,8 +52,8 @@ class Problem:
     region: jax.Array
     allowed: jax.Array
     environment: jax.Array
-    start: jax.Array
-    start_table: jax.Array
+    initial: jax.Array
+    initial_table: jax.Array
     base_state: jax.Array
     memory: jax.Array
 
@@ -65,7 +65,7 @@ def make_problem(
     *,
     environment: ArrayLike | str = "random",
     discount: float | None = None,
-    start: ArrayLike | None = None,
+    initial: ArrayLike | None = None,
 ) -> Problem:
     """A checked :class:`Problem`: the reachable product with the task's automaton, and its winning region.
 
@@ -77,18 +77,18 @@ def make_problem(
       environment: ``"random"``; ``"adversarial"``: optimal against an optimal system, by the
         `discount`; or a policy ``int32[S]`` or ``float[S, A]`` on the given game.
       discount: of the adversarial environment only.
-      start: ``float[S]``, on the given game; default its initial distribution.
+      initial: ``float[S]``, on the given game; default its initial distribution.
 
     Raises:
-      ValueError: a wrong shape, a policy or start that is no distribution, a reward that is not
-        finite, a task that is no Buchi condition, or a start outside of the region.
+      ValueError: a wrong shape, a policy or initial distribution that is no distribution, a reward that is not
+        finite, a task that is no Buchi condition, or an initial state outside of the region.
     """
     game = explicit_game(game)
     reward = np.asarray(reward, float)
     shape = game.mdp.probability.shape
     require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
     joint, accepting, base_state, memory = _joint_game(
-        game, formula, start_distribution(game, start)
+        game, formula, initial_distribution(game, initial)
     )
     played = _merge_successors(joint)
     observed = check_reward(joint, reward[base_state])
@@ -102,8 +102,8 @@ def make_problem(
         region=region,
         allowed=_safe_actions(played, region),
         environment=jnp.zeros(()),
-        start=played.initial,
-        start_table=to_jax(cumulative(np.asarray(played.initial, float))),
+        initial=played.initial,
+        initial_table=to_jax(cumulative(np.asarray(played.initial, float))),
         base_state=to_jax(base_state.astype(np.int32)),
         memory=to_jax(memory.astype(np.int32)),
     )
@@ -112,13 +112,15 @@ def make_problem(
 
 
 def _joint_game(
-    game: Game, formula: ArrayLike | Parity | Automaton | Formula | str, start: NDArray[np.float64]
+    game: Game,
+    formula: ArrayLike | Parity | Automaton | Formula | str,
+    initial: NDArray[np.float64],
 ) -> tuple[Game, NDArray[np.bool_], NDArray[np.integer], NDArray[np.integer]]:
     """The given game, or the reachable part of its product with an automaton.
 
     With the accepting states, and the game's and the automaton's state of each state.
     """
-    game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
+    game = Game(game.mdp.replace(initial=jnp.asarray(initial, game.dtype)), game.system)
     if isinstance(formula, Automaton | Formula | str):
         joint, objective = task_game(game, formula)
         part = restrict(joint)

@@ -30,8 +30,8 @@ compiles for seconds, so only shapes are shown.)
   ...     reset, step, lambda world: world, actions=jl.environments.make_box(-jnp.inf, jnp.inf, (2,)))
   >>> problem = trust_region.make_problem(world, horizon=4, limit=6.0)
   >>> hparams = trust_region.Hparams(
-  ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
-  ...     value_epochs=1, value_batches=2)
+  ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), num_cg_steps=3,
+  ...     num_value_epochs=1, num_value_batches=2)
   >>> state = jax.eval_shape(
   ...     lambda key: trust_region.init(key, problem, hparams), jax.random.key(0))
   >>> after, metrics = jax.eval_shape(
@@ -158,8 +158,10 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     if hparams.method == "cpo" and hparams.penalty is not None:
         raise ValueError('penalty is for method="trpo": CPO finds its own multiplier.')
     samples = hparams.num_trajectories * problem.horizon
-    if hparams.value_batches > samples:
-        raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
+    if hparams.num_value_batches > samples:
+        raise ValueError(
+            f"num_value_batches={hparams.num_value_batches} of {samples} samples; use fewer."
+        )
 
 
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
@@ -324,8 +326,8 @@ def fitted(
         descend,
         (state.values, state.optimizer),
         len(weight),
-        num_epochs=hparams.value_epochs,
-        num_minibatches=hparams.value_batches,
+        num_epochs=hparams.num_value_epochs,
+        num_minibatches=hparams.num_value_batches,
     )
     return values, memory, moments
 
@@ -529,7 +531,9 @@ def direction(
     def solved(gradient: jax.Array) -> jax.Array:
         # Scaled to length 1, for tiny gradients would underflow when squared.
         length = jnp.sqrt(jnp.sum(gradient**2))
-        solution, _ = cg(damped, gradient / positive(length), tol=1e-10, maxiter=hparams.cg_steps)
+        solution, _ = cg(
+            damped, gradient / positive(length), tol=1e-10, maxiter=hparams.num_cg_steps
+        )
         return solution * length
 
     natural = jax.vmap(solved)(jax.jacrev(lambda x: surrogate_of(x)[0])(flat))
@@ -568,7 +572,7 @@ def line_search(
         return count + 1, scale, gains, kl, good
 
     def searching(carry: PyTree) -> jax.Array:
-        return (carry[0] < hparams.search_steps) & ~carry[-1]
+        return (carry[0] < hparams.max_search_steps) & ~carry[-1]
 
     zero = jnp.zeros((), flat.dtype)
     gains = jnp.zeros(1 + (hparams.method == "cpo"), flat.dtype)

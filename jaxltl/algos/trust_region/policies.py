@@ -124,11 +124,11 @@ class Hparams:
       hidden, value_hidden: widths of the tanh layers of the policy and of the value networks;
         ``()`` is linear; static; default ``(32, 32)``.
       normalize: networks read observations standardised by their moments so far; static; default True.
-      cg_steps: iterations of the conjugate gradient method; static; default 10.
-      search_steps: largest number of tries of the line search; static; default 15.
+      num_cg_steps: iterations of the conjugate gradient method; static; default 10.
+      max_search_steps: largest number of tries of the line search; static; default 15.
       fisher_stride: stride of the samples that estimate the Fisher matrix; static; default 1.
-      value_epochs: passes of the value networks over the samples; static; default 5.
-      value_batches: minibatches of each pass; static; default 8.
+      num_value_epochs: passes of the value networks over the samples; static; default 5.
+      num_value_batches: minibatches of each pass; static; default 8.
     """
 
     discount: Number = traced("closed_discount")
@@ -146,11 +146,11 @@ class Hparams:
     hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
     value_hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
     normalize: bool = static(bool, default=True)
-    cg_steps: int = static(COUNT, default=10)
-    search_steps: int = static(COUNT, default=15)
+    num_cg_steps: int = static(COUNT, default=10)
+    max_search_steps: int = static(COUNT, default=15)
     fisher_stride: int = static(COUNT, default=1)
-    value_epochs: int = static(Range(0, MAX_INT, integer=True), default=5)
-    value_batches: int = static(COUNT, default=8)
+    num_value_epochs: int = static(Range(0, MAX_INT, integer=True), default=5)
+    num_value_batches: int = static(COUNT, default=8)
 
 
 @struct.dataclass

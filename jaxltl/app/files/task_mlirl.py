@@ -141,8 +141,8 @@ class LearnerTable(OptimizerTable):
     adjoint: TomlKey[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
     optimizer: TomlKey[Optimizer, "Optimizer of the likelihood."] = "lbfgs"
     tolerance: TomlKey[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
-    start: TomlKey[Start | None, "Initial weights; default zeros."] = None
-    start_scale: TomlKey[NonNegative | None, "Standard deviation of the initial weights."] = None
+    guess: TomlKey[Start | None, "Initial weights; default zeros."] = None
+    guess_scale: TomlKey[NonNegative | None, "Standard deviation of the initial weights."] = None
     satisfaction_over: TomlKey[
         Literal["initial", "all"], "States over which mu weighs the satisfaction probability."
     ] = "initial"

@@ -113,7 +113,7 @@ class Explorer:
                 marked=self.marked,
                 actions=self.actions,
                 wall=self.wall,
-                pieces=max((len(each) for each in self.cells.values()), default=1),
+                num_pieces=max((len(each) for each in self.cells.values()), default=1),
             )
         return drawn
 

@@ -267,10 +267,10 @@ class ParametricMDP:
 
     def valid_points(self, name: str, points: ArrayLike) -> np.ndarray:
         """Validated points of the box, ``float64[N, D]``."""
-        array, names = validation.float_array(f"{name}s", points), self.parameters
+        array, names = validation.float_array(name, points), self.parameters
         if array.ndim != 2 or array.shape[1] != len(names) or not len(array):
             raise ValueError(
-                f"{name}s has shape {array.shape}; expected (N, {len(names)}), a number "
+                f"{name} has shape {array.shape}; expected (N, {len(names)}), a number "
                 f"for each of {', '.join(names)}."
             )
         out = ~((array >= self.low) & (array <= self.high))

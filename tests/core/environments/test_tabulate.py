@@ -164,7 +164,7 @@ def test_a_map_of_letters_is_a_torus_whose_program_reads_no_key():
     assert (place[model.successor] == after).all()
     assert (model.label == (cells.ravel()[place][:, None] == np.arange(2))).all()
     assert len(table.start) == 13 and table.evidence == "declared"
-    one = tabulate(letter_world(layout=cells, letters=2, start=0))
+    one = tabulate(letter_world(layout=cells, letters=2, initial=0))
     assert one.model.initial[one.start].tolist() == [1]
 
 
@@ -303,9 +303,9 @@ def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
 def test_another_layout_is_not_compiled_anew():
     cells = np.full((3, 3), -1)
     cells[0, 1] = 0
-    tabulate(letter_world(layout=cells, letters=1, start=0))
+    tabulate(letter_world(layout=cells, letters=1, initial=0))
     with jax.log_compiles(False):
-        count = compiles(lambda: tabulate(letter_world(layout=cells.T, letters=1, start=0)))
+        count = compiles(lambda: tabulate(letter_world(layout=cells.T, letters=1, initial=0)))
     assert count == 0
 
 

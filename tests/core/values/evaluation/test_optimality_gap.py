@@ -152,7 +152,7 @@ def test_what_is_cut_off_goes_on_no_more_and_what_has_ended_stays():
 
 
 def test_the_best_of_letters_is_a_shortest_way():
-    world = letter_world(size=4, letters=3, copies=2, connected=False)
+    world = letter_world(size=4, letters=3, num_copies=2, connected=False)
     drawn = jax.vmap(world.reset)(jax.random.split(jax.random.key(0), 20))
     table = tabulate(world, worlds=drawn)
     task = "F (a & F (b & F c)) & (!c U a)"
