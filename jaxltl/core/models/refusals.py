@@ -47,7 +47,7 @@ _INSTEAD = {
     "task_performance": _FORMULA,
 }
 _OTHERWISE = (
-    "minimax_value, strategy_value, mean_payoff, winning_region, or "
+    "minimax_value, strategy_value, average_reward, bounded_reachability, winning_region, or "
     "robust_reachability, robust_total_reward, robust_discounted_value and optimal_satisfaction "
     f"with a formula, {_ROWS}"
 )

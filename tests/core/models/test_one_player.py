@@ -15,7 +15,8 @@ from jaxltl.core.models import Game
 FOR_GAMES = {
     "minimax_value", "strategy_value", "mean_payoff", "average_reward", "robust_reachability",
     "robust_total_reward", "robust_discounted_value", "optimal_satisfaction", "winning_region", "permissive_strategy",
-    "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
+    "bounded_reachability", "next_probability", "cumulative_reward", "instantaneous_reward",
+    "reward_bounded_reachability", "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
 }  # fmt: skip
 # Analyses of the graph and operations on models, which are not about who chooses.
 NOT_ABOUT_CHOICE = {

@@ -118,6 +118,16 @@ def next_step(s: Subject, objective: str, nature=None, policy=None) -> np.ndarra
     return reference.steps(s.case, aims, 1, start, lambda _, ahead, __: ahead, policy)
 
 
+def afterwards(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
+    aims, start = s.aims(objective, nature), worth(s)
+    return reference.steps(s.case, aims, STEPS, start, lambda _, ahead, __: ahead, policy)
+
+
+def worth(s: Subject) -> np.ndarray:
+    """A reward of states."""
+    return 2.0 * s.case.b + s.case.a
+
+
 def affordable(s: Subject, objective: str, nature=None, policy=None) -> np.ndarray:
     aims = s.aims(objective, nature)
     return reference.within_budget(s.case, aims, s.case.b, s.case.reward + UNIT, BUDGET, policy)
@@ -144,6 +154,11 @@ for objective in ("max", "min"):
         )
         question(f"reward of {STEPS} steps {name}", partial(cumulated, **aims))(
             lambda s, m, aims=aims: jl.values.cumulative_reward(m, s.reward, STEPS, **aims)
+        )
+        question(f"reward after {STEPS} steps {name}", partial(afterwards, **aims))(
+            lambda s, m, aims=aims: jl.values.instantaneous_reward(
+                m, s.mask(worth(s)), STEPS, **aims
+            )
         )
         question(f"within a budget {name}", partial(affordable, **aims))(
             lambda s, m, aims=aims: jl.values.reward_bounded_reachability(
@@ -188,6 +203,9 @@ question("policy: next", of_policy(next_step))(
 )
 question(f"policy: reward of {STEPS} steps", of_policy(cumulated))(
     lambda s, m: jl.values.cumulative_reward(m, s.reward, STEPS, policy=s.policy)
+)
+question(f"policy: reward after {STEPS} steps", of_policy(afterwards))(
+    lambda s, m: jl.values.instantaneous_reward(m, s.mask(worth(s)), STEPS, policy=s.policy)
 )
 question("policy: within a budget", of_policy(affordable))(
     lambda s, m: jl.values.reward_bounded_reachability(
@@ -340,22 +358,26 @@ average max                       +++++++ +++++++ +++++++ +++++++
 within 3 max                      +++++++ +++++++ +++++++ +++++++
 next max                          +++++++ +++++++ +++++++ +++++++
 reward of 3 steps max             +++++++ +++++++ +++++++ +++++++
+reward after 3 steps max          +++++++ +++++++ +++++++ +++++++
 within a budget max               +++++++ +++++++ +++++++ +++++++
 average max, helped               .....++ .....++ .....++ .....++
 within 3 max, helped              .....++ .....++ .....++ .....++
 next max, helped                  .....++ .....++ .....++ .....++
 reward of 3 steps max, helped     .....++ .....++ .....++ .....++
+reward after 3 steps max, helped  .....++ .....++ .....++ .....++
 within a budget max, helped       .....++ .....++ .....++ .....++
 prepared reach min                +++++++ ....... +++++.. .......
 average min                       +++++++ +++++++ +++++++ +++++++
 within 3 min                      +++++++ +++++++ +++++++ +++++++
 next min                          +++++++ +++++++ +++++++ +++++++
 reward of 3 steps min             +++++++ +++++++ +++++++ +++++++
+reward after 3 steps min          +++++++ +++++++ +++++++ +++++++
 within a budget min               +++++++ +++++++ +++++++ +++++++
 average min, helped               .....++ .....++ .....++ .....++
 within 3 min, helped              .....++ .....++ .....++ .....++
 next min, helped                  .....++ .....++ .....++ .....++
 reward of 3 steps min, helped     .....++ .....++ .....++ .....++
+reward after 3 steps min, helped  .....++ .....++ .....++ .....++
 within a budget min, helped       .....++ .....++ .....++ .....++
 discounted                        +++++++ ....... +++++.. .......
 discounted of both players        +++++.. +++++.. +++++.. +++++..
@@ -367,6 +389,7 @@ policy: average                   +++++++ +++++++ +++++++ +++++++
 policy: within 3                  +++++++ +++++++ +++++++ +++++++
 policy: next                      +++++++ +++++++ +++++++ +++++++
 policy: reward of 3 steps         +++++++ +++++++ +++++++ +++++++
+policy: reward after 3 steps      +++++++ +++++++ +++++++ +++++++
 policy: within a budget           +++++++ +++++++ +++++++ +++++++
 policy: discounted, worst case    +++++.. +++++.. +++++.. +++++..
 F b max                           +++++++ +++++++ +++++++ .......

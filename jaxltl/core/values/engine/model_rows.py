@@ -39,6 +39,8 @@ class ModelRows:
 
     def rewards(self, reward: Reward) -> Rewards:
         """A reward of the model, on its rows."""
+        if not isinstance(reward, str | Rewards | None) and np.shape(reward) == self.shape:
+            reward = Rewards(state=np.ravel(reward))
         if self.sets is None:
             reward = row_reward(self.lazy, self.sparse, reward)
         return reward_structure(self.sparse, reward)
