@@ -532,6 +532,20 @@ _EXPERIMENTS = {
 }
 
 
+@main.command()
+@click.argument("certificate", metavar="FILE", type=_PATH)
+def verify(certificate: Path) -> None:
+    """Check a certificate by exact arithmetic, independently of all solvers.
+
+    The same as python jaxltl/checker.py FILE, which runs without the package. The exit status is 0
+    if the certificate is accepted, 1 if a condition does not hold, 2 if the file is no certificate.
+    See docs/certificates.md.
+    """
+    from jaxltl import checker
+
+    raise SystemExit(checker.main([str(certificate)]))
+
+
 @main.command(epilog="\n\n".join(f"{k}: {v}." for k, v in _EXPERIMENTS.items()))
 @click.argument("experiment", type=click.Choice(list(_EXPERIMENTS)))
 @click.option("--out", type=_PATH, help="Directory of the pictures. [default: out/reproduce]")

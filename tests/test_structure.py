@@ -25,6 +25,7 @@ MODULES = {
 }
 # The layers, lowest first: a module imports from its own folder and from those before it.
 LAYERS = (
+    "checker",
     (
         "core.array_types",
         "core.deferred",
