@@ -29,14 +29,14 @@ def unbounded_limit(
     With T a bound on the expected time until the target or a state of value zero is met, from every
     state, a run has met neither after 2 T steps with probability at most 1/2 (Markov's inequality),
     and after n steps with at most ``2 ** -floor(n / ceil(2 T))``. The bounded probability is at
-    most the unbounded one. Players who maximise may keep to their optimal choices of the unbounded
+    most the unbounded one. Maximising players may keep to their optimal choices of the unbounded
     problem. Against these the others cannot do better than avoid the target for ever from a state of
     value zero, once it is met: the value is lower than the unbounded one by at most that probability.
     """
     if game.is_mdp:
         maximize = bool(game.sole_direction)
         return _of_mdp(game.mdp, target, undecided, num_steps, Query(maximize, maximize))
-    encoded, query = game.encoded()  # whose steps are at least as many
+    encoded, query = game.encoded()  # its runs have at least as many steps
     source = encoded.source
     lower, upper = _of_sets(encoded.model, target[source], undecided[source], num_steps, query)
     return lower[: target.size], upper[: target.size]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _LEVELS = 10**7  # amounts of reward at most
 _LARGEST = 8 * 2**30  # bytes of the levels that are kept
 _UNFOLDED = 2 * 10**7  # entries of a game or an uncertain model on all levels
-_WIDTH = 1e-8  # of the bounds of such a model
+_WIDTH = 1e-11  # of the bounds of such a model
 _DENOMINATOR = 10**9  # of the fractions that rewards are taken for
 _GAIN = 1e-13  # relative gain that may be rounding
 _ROUNDS = 100

@@ -1,7 +1,7 @@
-"""Rows of a model, the players who choose among them, and nature's choice of distributions.
+"""Rows of a model, the players that own its states, and nature's choice of distributions.
 
 A Markov chain, an MDP, a game and an uncertain model are settings of one structure: each state has an
-owner, who maximises or minimises, or has a fixed distribution over its rows; each row has one
+owner that maximises or minimises, or has a fixed distribution over its rows; each row has one
 distribution, or a set of which nature picks one each time that the row is taken.
 """
 
@@ -27,7 +27,7 @@ class RowGame:
     """A model's rows, with the direction in which each state's owner and nature optimise."""
 
     mdp: HostMDP
-    maximizes: Booleans  # bool[S], the states of the player who maximises
+    maximizes: Booleans  # bool[S], the states of the maximising player
     sets: UncertainMDP | None = None  # the uncertainty sets of the rows; None where they are points
     nature_maximizes: bool = False
     weight: Floats | None = None  # float64[R], of the rows in states with a mixed policy

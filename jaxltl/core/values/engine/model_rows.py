@@ -23,14 +23,14 @@ from jaxltl.core.values.interval.robust import nature_direction, refuse_nature
 
 @dataclass(frozen=True)
 class ModelRows:
-    """Rows of a model, and who chooses; see :func:`model_rows`."""
+    """Rows of a model with the owners of its states; see :func:`model_rows`."""
 
     shape: tuple[int, ...]  # of the states
     lazy: Model  # the model without its players
     sparse: SparseMDP
     sets: UncertainMDP | None  # of models with intervals
     is_system: Booleans  # bool[S]
-    maximizes: Booleans  # bool[S], the states of the player who maximises
+    maximizes: Booleans  # bool[S], the states of the maximising player
     nature: str | None  # its direction, "max" or "min"
 
     @property
