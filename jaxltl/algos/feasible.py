@@ -299,7 +299,7 @@ class Budget:
 class BestPoint:
     """The best point so far: `parameters`, ``float[D]``, and its `value`; NaN before there is one.
 
-    >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
+    >>> BestPoint(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
     (2,)
     """
 

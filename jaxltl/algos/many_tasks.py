@@ -194,7 +194,7 @@ _FORGETS = 1 / 16  # weight of the newest value in the mean of those of a follow
 class SequenceChoice(NamedTuple):
     """The sequence that an agent follows: automaton `state`, index `sequence`, and recent `worth`.
 
-    >>> Choice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
+    >>> SequenceChoice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
     1
     """
 

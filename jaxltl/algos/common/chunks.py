@@ -3,7 +3,7 @@
 Example: a contraction to a fixed point, for two lanes.
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.core import struct
-  >>> from jaxltl.algos.common.chunks import Options, run_in_chunks
+  >>> from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
   >>> @struct.dataclass
   ... class State:
   ...     step: jax.Array
@@ -13,7 +13,7 @@ Example: a contraction to a fixed point, for two lanes.
   ...     return State(state.step + 1, guess), {"guess": guess}
   >>> start = State(jnp.zeros(2, jnp.int32), jnp.zeros(2))
   >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4,
-  ...                        options=Options(lanes=True, chunk=2))
+  ...                        options=ChunkOptions(lanes=True, chunk=2))
   >>> chunks.state.step.tolist(), chunks.step.tolist(), chunks.metrics["guess"].shape
   ([4, 4], [1, 2, 3, 4], (4, 2))
 """
@@ -60,7 +60,7 @@ class ChunkOptions:
         passes the same arguments and receives the whole result except the state, which stays where
         it is. Checkpoints of other devices, or of none, are resumed too.
 
-    >>> Options(chunk=50).max_rows
+    >>> ChunkOptions(chunk=50).max_rows
     10
     """
 

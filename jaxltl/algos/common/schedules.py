@@ -94,7 +94,7 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 class TheoremCondition(NamedTuple):
     """A condition of theorem 1: its `name`, `holds` (None if that is unknown), and the `reason`.
 
-    >>> Condition("samples grow", False, "constant").holds
+    >>> TheoremCondition("samples grow", False, "constant").holds
     False
     """
 
