@@ -367,7 +367,7 @@ class Formulas:
         return f
 
     def holds(self, f: int, letter: frozenset[str]) -> bool:
-        """Whether a formula without temporal operators holds for a set of propositions."""
+        """True if a formula without temporal operators holds for a set of propositions."""
         op, *parts = self.nodes[f]
         need(op not in ("U", "R", "X"), "a temporal operator where a set of states is expected")
         if op == "ap":
@@ -478,7 +478,7 @@ class HoaAutomaton:
         return self.edges[letter][q]
 
     def meets(self, parity: int, formulas: Formulas, f: int) -> bool:
-        """Whether some word satisfies a formula and has a run whose least priority has the parity.
+        """True if some word satisfies a formula and has a run whose least priority has the parity.
 
         Emptiness of the product with the formula's tableau, which is a generalised Buchi automaton:
         each until is not postponed infinitely often. OverflowError if the product is too large.
@@ -755,7 +755,7 @@ class ClaimChecker:
         self.rewards = rewards
 
     def is_ours(self, s: int) -> bool:
-        """Whether the player of a state is existential, and has a choice."""
+        """True if the player of a state is existential and has a choice."""
         owner = min(self.model.owner[s], 2)
         is_free = self.model.is_choice[s] and not (self.fixed and owner == 0)
         return is_free and self.file.direction[owner] == self.ours
@@ -842,7 +842,7 @@ class ClaimChecker:
         return values, low
 
     def is_inductive(self, v: int, options: list[tuple]) -> bool:
-        """Whether the bound of a node follows from the bounds of its successors."""
+        """True if the bound of a node follows from the bounds of its successors."""
         x = self.current[v]
         some = len(options) > 1 and self.is_ours(v // self.width)
         for option in options:
@@ -857,7 +857,7 @@ class ClaimChecker:
         return not some
 
     def support(self, option: tuple, free: bool) -> list[int]:
-        """Successors that an option certainly has, whatever a universal nature chooses."""
+        """Successors that an option has for every choice of a universal nature."""
         targets, low, _, high, _ = option
         if high and not free and self.file.nature == self.ours:
             # Successors with the value of the last one that is filled may share what it gets.
@@ -1042,7 +1042,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines += [f"ACCEPTED{trusted}"]
     except Refusal as why:
         status, lines = 1, [f"REFUSED: {why}"]
-    except Exception as why:  # whatever a damaged file leads to, it is not accepted
+    except Exception as why:  # no error of any kind is an acceptance
         status, lines = 2, [f"not a certificate: {type(why).__name__}: {why}"]
     gc.enable()
     for line in lines:
