@@ -547,6 +547,27 @@ def components(graph: dict[T, list[T]]) -> Iterator[list[T]]:
 # --- the question -----------------------------------------------------------------------------
 
 
+def question_text(question: dict) -> str:
+    """A question in the syntax of PRISM; what it has no syntax for follows as a comment."""
+    path, objective = field(question, "path", dict), field(question, "objective", str)
+    keys = PATHS[field(path, "kind", str)]
+    bound = f"<={field(path, 'steps', int)}" if "steps" in keys else ""
+    inner = f"C{bound}" if "reward" in keys else field(path, "formula", str, "")
+    if "target" in keys:
+        until = f"({field(path, 'stay', str)}) U" if "stay" in path else "F"
+        inner = f"{until}{bound} ({field(path, 'target', str)})"
+    head = f'R{{"{field(path, "reward", str)}"}}' if "reward" in keys else "P"
+    nature = {"adversarial": OTHER[objective], "cooperative": objective}
+    head += objective + nature.get(question.get("nature", ""), "")
+    if "environment" in question:
+        others = ",environment" if question["environment"] == "cooperative" else ""
+        head = f"<<system{others}>> {head}"
+    notes = [f"discount {field(path, 'discount', str)}"] if "discount" in keys else []
+    notes += ["policy of the certificate"] if "policy" in question else []
+    notes += ["policies see observations"] if "observations" in question else []
+    return f"{head}=? [ {inner} ]" + (f" // {', '.join(notes)}" if notes else "")
+
+
 class CertificateFile:
     """A certificate: its model, its question and its claims."""
 
@@ -574,7 +595,7 @@ class CertificateFile:
         self.nature = self._direction("nature", self.model.upper is not None)
         environment = self._direction("environment", self.model.num_players > 1)
         self.direction = [self.objective, environment, self.objective]  # of owners of states
-        text = self._text()
+        text = question_text(question)
         hold(question.get("text") == text, f"the text of the question is not {text!r}")
         self.automaton: HoaAutomaton | None = None
         self.trusted = ""
@@ -586,24 +607,6 @@ class CertificateFile:
         known = ("adversarial", "cooperative") if exists else (None,)
         need(word in known, f"{key} is {word!r:.40}, which does not fit the model")
         return OTHER[self.objective] if word == "adversarial" else self.objective
-
-    def _text(self) -> str:
-        """The question in the syntax of PRISM; what it has no syntax for follows as a comment."""
-        path, question, keys = self.path, self.question, PATHS[self.kind]
-        bound = f"<={field(path, 'steps', int)}" if "steps" in keys else ""
-        inner = f"C{bound}" if "reward" in keys else field(path, "formula", str, "")
-        if "target" in keys:
-            until = f"({field(path, 'stay', str)}) U" if "stay" in path else "F"
-            inner = f"{until}{bound} ({field(path, 'target', str)})"
-        head = f'R{{"{field(path, "reward", str)}"}}' if "reward" in keys else "P"
-        head += self.objective + (self.nature if self.model.upper is not None else "")
-        if self.model.num_players > 1:
-            others = ",environment" if question["environment"] == "cooperative" else ""
-            head = f"<<system{others}>> {head}"
-        notes = [f"discount {field(path, 'discount', str)}"] if "discount" in keys else []
-        notes += ["policy of the certificate"] if "policy" in question else []
-        notes += ["policies see observations"] if "observations" in question else []
-        return f"{head}=? [ {inner} ]" + (f" // {', '.join(notes)}" if notes else "")
 
     def letters(self, names: Iterable[str]) -> tuple[list[frozenset[str]], list[int]]:
         """The sets of propositions that hold in some state, and the number of each state's set."""

@@ -209,7 +209,7 @@ def write_umb(
             f"compression is {compression!r}; expected 'gzip', 'xz', None or 'by name'."
         )
     with errors_in(f"{str(path)!r}: "):
-        contents = _contents(model)
+        contents = umb_contents(model)
     if compression == "by name":
         compression = compression_by_name(path) or "gzip"
     if compression == "gzip":
@@ -221,7 +221,7 @@ def write_umb(
                 file.write(piece)
 
 
-def _contents(model: Model) -> Members:
+def umb_contents(model: Model) -> Members:
     """Members of the output, the index first."""
     system: NDArray[np.bool_] | None = None
     interval = None

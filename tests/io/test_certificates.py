@@ -1,0 +1,186 @@
+"""Certificates of the solvers' bounds: the checker accepts them, or they are not written."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.checker import main
+from jaxltl.core.values import robust_discounted_value
+from jaxltl.io import read_umb, write_certificate
+
+SIZE = 12
+
+
+@pytest.fixture(autouse=True)
+def in_double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+def random_model(seed, *, size=SIZE, reward=False):
+    """A sparse MDP with end components, a goal (the last state) and a trap."""
+    rng = np.random.default_rng(seed)
+    rows, entries, successor, probability = [0], [0], [], []
+    for s in range(size):
+        for _ in range(1 if s >= size - 2 else rng.integers(1, 4)):
+            width = 1 if s >= size - 2 else int(rng.integers(1, 4))
+            targets = [s] if s >= size - 2 else rng.choice(size, width, replace=False)
+            successor += sorted(int(t) for t in targets)
+            probability += list(rng.dirichlet(np.ones(width)))
+            entries.append(len(successor))
+        rows.append(len(entries) - 1)
+    rewards = (
+        {"cost": jl.models.Rewards(state=np.r_[rng.random(size - 1), 0.0])} if reward else None
+    )
+    return jl.make_sparse(
+        rows,
+        entries,
+        successor,
+        probability,
+        initial=np.eye(size)[0],
+        label={"goal": [size - 1], "safe": [*range(size - 2)]},
+        rewards=rewards,
+    )
+
+
+def verified(path, capsys):
+    status = main([str(path)])
+    assert status == 0, capsys.readouterr().out
+    return capsys.readouterr().out
+
+
+def width(text):
+    """Upper minus lower bound of the claims."""
+    bounds = [line.split(" is ")[1].split()[1] for line in text.splitlines() if "claimed" in line]
+    low, high = (float(x) if "/" not in x else eval(x) for x in bounds)
+    return high - low
+
+
+@pytest.mark.parametrize("objective", ["max", "min"])
+@pytest.mark.parametrize("seed", range(6))
+def test_probabilities(objective, seed, tmp_path, capsys):
+    model = random_model(seed)
+    goal, safe = (np.asarray(model.states_with_label(x)) for x in ("goal", "safe"))
+    for stay, formula in ((None, 'F "goal"'), (safe, '"safe" U "goal"')):
+        found = jl.reachability_probability(model, goal, stay=stay, objective=objective)
+        path = tmp_path / "file.umb"
+        write_certificate(path, model, found, f"P{objective}=? [ {formula} ]")
+        assert width(verified(path, capsys)) < 1e-5
+    assert read_umb(path).num_states == SIZE  # other tools read the model
+
+
+@pytest.mark.parametrize("objective", ["max", "min"])
+@pytest.mark.parametrize("seed", range(4))
+def test_rewards(objective, seed, tmp_path, capsys):
+    model, path = random_model(seed, reward=True), tmp_path / "file.umb"
+    goal = np.asarray(model.states_with_label("goal"))
+    found = jl.total_reward(model, "cost", goal, objective=objective)
+    write_certificate(path, model, found, f'R{{"cost"}}{objective}=? [ F "goal" ]')
+    text = verified(path, capsys)
+    assert np.isinf(found.value[0]) == ("inf" in text)
+    if objective == "max":
+        found = jl.optimal_value(model, jl.models.choice_reward(model, "cost"), 0.95)
+        write_certificate(path, model, found, 'R{"cost"}max=? [ C ]', discount=0.95)
+        assert width(verified(path, capsys)) < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("directions", ["maxmin", "maxmax", "minmax", "minmin"])
+def test_intervals(seed, directions, tmp_path, capsys):
+    model, path = random_model(seed, reward=True), tmp_path / "file.umb"
+    p = np.asarray(model.probability)
+    rough = jl.make_interval(model, 0.5 * p, np.minimum(1.5 * p, 1))
+    objective = directions[:3]
+    nature = "cooperative" if directions[3:] == objective else "adversarial"
+    goal = np.asarray(model.states_with_label("goal"))
+    found = jl.reachability_probability(rough, goal, objective=objective, nature=nature)
+    write_certificate(path, rough, found, f'P{directions}=? [ F "goal" ]')
+    assert width(verified(path, capsys)) < 1e-4
+    found = robust_discounted_value(rough, "cost", 0.9, objective=objective, nature=nature)
+    write_certificate(path, rough, found, f'R{{"cost"}}{directions}=? [ C ]', discount=0.9)
+    verified(path, capsys)
+
+
+def test_padded_models_and_chains(tmp_path, capsys):
+    path = tmp_path / "file.umb"
+    dense = jl.from_dense(
+        [[[0.5, 0.25, 0.25], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
+        label={"goal": [1]},
+        initial=[1.0, 0.0, 0.0],
+    )
+    goal = np.asarray(dense.label)[:, 0] > 0
+    for objective in ("max", "min"):
+        found = jl.reachability_probability(dense, goal, objective=objective)
+        write_certificate(path, dense, found, f'P{objective}=? [ F "goal" ]')
+        assert width(verified(path, capsys)) < 1e-6
+    cost = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 1.0]])
+    found = jl.optimal_value(dense, cost, 0.9)
+    write_certificate(path, dense, found, 'R{"cost"}max=? [ C ]', reward=cost, discount=0.9)
+    verified(path, capsys)
+    chain = jl.make_sparse(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.1, 0.9, 1, 1], label={"goal": [1]}, initial=[1, 0, 0]
+    )
+    found = jl.reachability_probability(chain, np.array([False, True, False]))
+    write_certificate(path, chain, found, 'P=? [ F "goal" ]')
+    assert width(verified(path, capsys)) < 1e-6
+
+
+def test_a_slow_random_walk(tmp_path, capsys):
+    """Ten thousand expected steps: bounds are widened by the expected number of steps."""
+    size = 100
+    successor = [0, *np.ravel([[s - 1, s + 1] for s in range(1, size - 1)]).tolist(), size - 1]
+    walk = jl.make_sparse(
+        None,
+        [0, *range(1, 2 * size - 2, 2), 2 * size - 2],
+        successor,
+        [1.0, *[0.5] * (2 * size - 4), 1.0],
+        label={"goal": [size - 1]},
+        initial=np.eye(size)[size // 2],
+    )
+    goal = np.asarray(walk.states_with_label("goal"))
+    found = jl.reachability_probability(walk, goal)
+    write_certificate(tmp_path / "walk.umb", walk, found, 'Pmax=? [ F "goal" ]')
+    assert width(verified(tmp_path / "walk.umb", capsys)) < 1e-5
+
+
+def test_games(tmp_path, capsys):
+    rng, path = np.random.default_rng(1), tmp_path / "game.umb"
+    model = random_model(3, reward=True)
+    game = jl.make_game(model, rng.random(SIZE) < 0.5)
+    reward = np.asarray(jl.models.choice_reward(model, "cost"))
+    found = jl.minimax_value(game, reward, 0.9)
+    write_certificate(path, game, found, 'R{"cost"}max=? [ C ]', reward=reward, discount=0.9)
+    assert "<<system>>" in verified(path, capsys)
+
+
+def test_false_bounds_are_not_written(tmp_path):
+    model, path = random_model(2), tmp_path / "file.umb"
+    found = jl.reachability_probability(model, np.asarray(model.states_with_label("goal")))
+    assert 0.05 < found.value[0] < 0.95
+    for side, shift in (("lower", 0.01), ("upper", -0.01)):
+        bound = np.clip(np.asarray(getattr(found, side)) + shift, 0, 1)
+        wrong = replace(found, **{side: bound, "value": np.asarray(found.value) + np.inf})
+        with pytest.raises(ValueError, match=f"no {side} bounds"):
+            write_certificate(path, model, wrong, 'Pmax=? [ F "goal" ]')
+        assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("question", "why"),
+    [
+        ('Pmax=? [ G F "goal" ]', "certificates are written for"),
+        ('Pmax=? [ F<=3 "goal" ]', "certificates are written for"),
+        ('LRAmax=? [ "goal" ]', "certificates are written for"),
+        ('P=? [ F "goal" ]', "give the objective"),
+        ('Pmax>=0.5 [ F "goal" ]', "give the objective"),
+        ('Pmax=? [ F "nothing" ]', "nothing"),
+    ],
+)
+def test_other_questions_are_refused_by_name(question, why, tmp_path):
+    model = random_model(0)
+    found = jl.reachability_probability(model, np.asarray(model.states_with_label("goal")))
+    with pytest.raises(ValueError, match=why):
+        write_certificate(tmp_path / "file.umb", model, found, question)
