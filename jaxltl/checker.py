@@ -693,6 +693,13 @@ class ClaimChecker:
             self.next_memory = file.array(field(keepers[0], "next", str), self.shape, "uint")
             need(max(self.next_memory) < self.memory, "a memory state is out of range")
         self.fixed, self.policy = (self._policy(table) for table in (question, claim))
+        # Where the player is existential and has a choice.
+        self.is_ours = [
+            has_choice
+            and not (self.fixed and not owner)
+            and file.direction[min(owner, 2)] == self.ours
+            for has_choice, owner in zip(self.model.is_choice, self.model.owner)
+        ]
         if "observations" in question and file.objective == self.ours and not self.fixed:
             self._check_observations(field(question, "observations", str))
         self._scale()
@@ -755,57 +762,49 @@ class ClaimChecker:
             self.current = [y * discount.denominator for y in x]
             self.following = [y * discount.numerator for y in x]
             rewards = [[y * discount.denominator for y in part] for part in rewards]
-        self.rewards = rewards
+        self.rewards, self.has_rewards = rewards, any(rewards)
 
-    def is_ours(self, s: int) -> bool:
-        """True if the player of a state is existential and has a choice."""
-        owner = min(self.model.owner[s], 2)
-        is_free = self.model.is_choice[s] and not (self.fixed and owner == 0)
-        return is_free and self.file.direction[owner] == self.ours
-
-    def base(self, v: int) -> int:
-        """Automaton and memory state after a node, as one number."""
+    def targets(self, r: int, v: int) -> Sequence[int]:
+        """The successors of a row in a node."""
+        states = self.model.target[self.model.branch_start[r] : self.model.branch_start[r + 1]]
+        if self.width == 1:
+            return states
         s, k = divmod(v, self.width)
         q, m = divmod(k, self.memory)
         if self.file.automaton:
             q = self.file.automaton.follow(self.file.letter_of[s], q)[0]
         m = m - 1 if self.counts else self.next_memory[v] if self.next_memory else m
-        return q * self.memory + m
+        return [t * self.width + q * self.memory + m for t in states]
 
-    def options(self, v: int, free: bool) -> Iterator[tuple]:
+    def option(self, r: int, v: int) -> tuple:
+        """The option of a row."""
+        if not self.has_rewards:
+            return (self.targets(r, v), *self.model.row(r), None)
+        (of_state, of_row, of_branch), s = self.rewards, v // self.width
+        reward = (of_state[s] if of_state else 0) + (of_row[r] if of_row else 0)
+        branches = range(self.model.branch_start[r], self.model.branch_start[r + 1])
+        rewards = (
+            [reward + of_branch[i] for i in branches] if of_branch else [reward] * len(branches)
+        )
+        return (self.targets(r, v), *self.model.row(r), rewards)
+
+    def options(self, v: int, free: bool) -> list[tuple]:
         """The options of a node that remain, or those of all policies of the question."""
         model, s = self.model, v // self.width
-        choices: Any = [[(1, r)] for r in range(model.row_start[s], model.row_start[s + 1])]
         if self.fixed and model.owner[s] == 0:
-            choices = [self.fixed(v)]
-        elif self.policy and not free and self.is_ours(s):
-            choices = [self.policy(v)]
-        base = self.base(v) if self.width > 1 else 0
-        for choice in choices:
-            options = []
-            for _, r in choice:
-                begin, end = model.branch_start[r], model.branch_start[r + 1]
-                targets: Any = model.target[begin:end]
-                if self.width > 1:
-                    targets = [t * self.width + base for t in targets]
-                low, total, high = model.row(r)
-                reward: Any = None
-                if any(self.rewards):
-                    of_state, of_row, of_branch = self.rewards
-                    fixed = (of_state[s] if of_state else 0) + (of_row[r] if of_row else 0)
-                    reward = [fixed + (of_branch[i] if of_branch else 0) for i in range(begin, end)]
-                options.append((targets, low, total, high, reward))
-            if len(choice) == 1:
-                yield options[0]
-                continue
-            hold(model.upper is None, "randomised policies of interval models are not covered")
-            targets, low, reward = [], [], []
-            for (weight, _), option in zip(choice, options):
-                targets += option[0]
-                low += [weight * Fraction(n, option[2]) for n in option[1]]
-                reward += option[4] or ()
-            (low,), _ = to_integers(low)
-            yield targets, low, sum(low), None, reward or None
+            pairs = self.fixed(v)
+        elif self.policy and self.is_ours[s] and not free:
+            pairs = self.policy(v)
+        else:
+            return [self.option(r, v) for r in range(model.row_start[s], model.row_start[s + 1])]
+        options = [self.option(r, v) for _, r in pairs]
+        if len(options) == 1:
+            return options
+        hold(model.upper is None, "randomised policies of interval models are not covered")
+        mixed = [w * Fraction(n, o[2]) for (w, _), o in zip(pairs, options) for n in o[1]]
+        (mass,), _ = to_integers(mixed)
+        rewards = [x for o in options for x in o[4] or ()]
+        return [([t for o in options for t in o[0]], mass, sum(mass), None, rewards)]
 
     def explore(self, is_final: Callable[[int], bool], free: bool = False) -> Graph:
         """The options of all nodes that are reachable from initial states; none of final nodes."""
@@ -817,7 +816,7 @@ class ClaimChecker:
         for v in pending:
             seen[v] = 1
         for v in pending:  # the list grows
-            graph[v] = [] if is_final(v) else [*self.options(v, free)]
+            graph[v] = [] if is_final(v) else self.options(v, free)
             for option in graph[v]:
                 for t in option[0]:
                     if not seen[t]:
@@ -847,7 +846,7 @@ class ClaimChecker:
     def is_inductive(self, v: int, options: list[tuple]) -> bool:
         """True if the bound of a node follows from the bounds of its successors."""
         x = self.current[v]
-        some = len(options) > 1 and self.is_ours(v // self.width)
+        some = len(options) > 1 and self.is_ours[v // self.width]
         for option in options:
             values, mass = self.distribution(option)
             if self.infinite and any(n and y >= self.infinity for n, y in zip(mass, values)):
@@ -859,7 +858,7 @@ class ClaimChecker:
                 return some
         return not some
 
-    def support(self, option: tuple, free: bool) -> list[int]:
+    def support(self, option: tuple, free: bool) -> Sequence[int]:
         """Successors that an option has for every choice of a universal nature."""
         targets, low, _, high, _ = option
         if high and not free and self.file.nature == self.ours:
@@ -868,41 +867,45 @@ class ClaimChecker:
             partly = [x for x, a, b in zip(values, low, mass) if b > a]
             last = (min if self.greatest else max)(partly, default=None)
             low = [n or b * (x == last) for x, n, b in zip(values, mass, high)]
-        return [t for t, n in zip(targets, low) if n]
+        return targets if all(low) else [t for t, n in zip(targets, low) if n]
 
     def staying(self, graph: Graph, nodes: Iterable[int], final: set[int], free: bool) -> Graph:
         """The largest set of nodes in which each has an option that stays in it or in `final`.
 
         Returns the successors under the options that stay.
         """
-        successors: Graph = {v: [] for v in nodes}
-        inside = {*successors, *final}
-        certain = {v: [self.support(x, free) for x in graph[v]] for v in successors}
         is_open = self.model.upper is not None and (free or self.file.nature != self.ours)
+        kept = {v: [(self.support(o, free), o) for o in graph[v]] for v in nodes}
+        inside = {*kept, *final}
         sources: Graph = {}
-        for v in successors:
-            for t in {t for option in graph[v] for t in option[0]}:
+        for v, options in kept.items():
+            for t in {t for certain, o in options for t in (o[0] if is_open else certain)}:
                 sources.setdefault(t, []).append(v)
 
-        def staying_options(v: int) -> Iterator[list[int]]:
-            """Possible successors of the options that stay."""
-            for (targets, _, total, high, _), sure in zip(graph[v], certain[v]):
-                if all(t in inside for t in sure):
-                    if is_open:
-                        able = [(t, n) for t, n in zip(targets, high) if n and t in inside]
-                        if sum(n for _, n in able) >= total:
-                            yield [t for t, _ in able]
-                    else:
-                        yield sure
+        def stays(certain: Sequence[int], option: tuple) -> bool:
+            if not inside.issuperset(certain):
+                return False
+            targets, _, total, high, _ = option
+            return not is_open or total <= sum(n for t, n in zip(targets, high) if t in inside)
 
-        pending = [*successors]
+        pending = [*kept]
         while pending:
             v = pending.pop()
-            if v in successors and not any(True for _ in staying_options(v)):
+            if v in kept and not any(stays(*pair) for pair in kept[v]):
                 inside.discard(v)
-                del successors[v]
+                del kept[v]
                 pending += sources.get(v, ())
-        return {v: [t for part in staying_options(v) for t in part] for v in successors}
+        successors: Graph = {}
+        for v, options in kept.items():
+            part = [(o if is_open else None, x) for x, o in options if stays(x, o)]
+            successors[v] = [
+                t
+                for o, certain in part
+                for t in (
+                    certain if o is None else [t for t, n in zip(o[0], o[3]) if n and t in inside]
+                )
+            ]
+        return successors
 
     def almost_sure(self, graph: Graph, nodes: Iterable[int], final: set[int]) -> set[int]:
         """The nodes from which universal players can reach a final one almost surely."""
@@ -963,7 +966,7 @@ class ClaimChecker:
             or (kind == "reward" and upper)
             or (kind in ("until", "total") and not upper)
         )
-        missing = [s for s in range(self.shape[0]) if self.is_ours(s)]
+        missing = [s for s, x in enumerate(self.is_ours) if x]
         hold(self.policy or not needs_policy or not missing, f"state {missing[:1]} needs a policy")
         hold(kind != "total" or not self.is_signed, "total rewards of both signs are not covered")
         graph = self.explore(is_final)
