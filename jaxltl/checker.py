@@ -869,6 +869,11 @@ class ClaimChecker:
             low = [n or b * (x == last) for x, n, b in zip(values, mass, high)]
         return targets if all(low) else [t for t, n in zip(targets, low) if n]
 
+    def earns(self, option: tuple) -> bool:
+        """True if an option has a positive reward, whatever distribution nature chooses."""
+        rewards = option[4] or (0,)
+        return any(map(mul, option[1], rewards)) or all(rewards)
+
     def staying(self, graph: Graph, nodes: Iterable[int], final: set[int], free: bool) -> Graph:
         """The largest set of nodes in which each has an option that stays in it or in `final`.
 
@@ -961,10 +966,9 @@ class ClaimChecker:
         def is_final(v: int) -> bool:
             return target[v // width] or not stay[v // width] or is_last[v % self.memory]
 
+        is_upper_reward = kind == "reward" and upper
         needs_policy = (
-            kind == "formula"
-            or (kind == "reward" and upper)
-            or (kind in ("until", "total") and not upper)
+            kind == "formula" or is_upper_reward or (kind in ("until", "total") and not upper)
         )
         missing = [s for s, x in enumerate(self.is_ours) if x]
         hold(self.policy or not needs_policy or not missing, f"state {missing[:1]} needs a policy")
@@ -997,23 +1001,19 @@ class ClaimChecker:
         infinite = self.infinite & {*nodes}
         if kind in ("until", "total", "within") and not upper:
             # Paths that stay and earn rewards for ever have an infinite total.
-            idle = {v: [o for o in graph[v] if not any(map(mul, o[1], o[4] or ()))] for v in nodes}
+            idle = {v: [o for o in graph[v] if not self.earns(o)] for v in nodes}
             positive = (v for v in nodes if x[v] > 0)
             never(idle, positive, False, "paths may stay forever where values are above 0")
         elif kind == "reward" and self.is_signed:
             graph_of_all = self.explore(is_final, free=True)
             others = (v for v in graph_of_all if not is_final(v))
-            never(
-                graph_of_all, others, True, "rewards of both signs, and paths that miss the target"
-            )
+            never(graph_of_all, others, True, "rewards of both signs, and the target may be missed")
         elif kind == "reward" and upper:
             never(graph, {*nodes} - infinite, False, "paths may miss the target forever")
         elif infinite:
             wrong = infinite & self.almost_sure(graph, nodes, final)
-            hold(
-                not wrong,
-                f"{self.place(min(wrong, default=0))}: the target is reachable, no infinity",
-            )
+            first = self.place(min(wrong, default=0))
+            hold(not wrong, f"{first}: the target can be reached almost surely, no infinity")
         return len(graph), self._bound(next(iter(graph)) % self.width)
 
     def _bound(self, start: int) -> str:

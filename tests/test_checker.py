@@ -451,6 +451,27 @@ def test_infinite_totals_are_no_lower_bounds(tmp_path, capsys):
         assert found[0] == status, found
 
 
+def test_paths_that_stay_and_earn_have_an_infinite_total(tmp_path, capsys):
+    """Nature may keep to state 0, but it earns there whatever nature does."""
+    states = [[[(0, (0.0, 1.0)), (1, (0.0, 1.0))]], [[(1, (1.0, 1.0))]]]
+    question = {
+        "text": 'R{"cost"}maxmin=? [ C ]',
+        "path": {"kind": "total", "reward": "cost"},
+        "objective": "max",
+        "nature": "adversarial",
+    }
+    claim = {"side": "lower", "bound": "1", "values": "values"}
+    arrays = {"values": ("double", [2], [1.0, 0.0])}
+    for rewards, expected in (
+        ({"states": [1.0, 0.0]}, 0),
+        ({"branches": [1.0, 1.0, 0.0]}, 0),
+        ({"branches": [0.0, 1.0, 0.0]}, 1),
+    ):
+        members = model(states, rewards={"cost": rewards})
+        found = outcome(tmp_path, capsys, certificate(members, question, [claim], arrays))
+        assert found[0] == expected, found
+
+
 def test_an_infinite_reward_is_proven_by_the_graph(tmp_path, capsys):
     """From state 0 the target, state 1, is missed with probability 1/2 (or never, in a loop)."""
     for loss, status in ((2, 0), (0, 1)):
