@@ -293,8 +293,20 @@ class UmbModel:
 class Formulas:
     """Formulas of linear temporal logic in negation normal form, each stored once by a number."""
 
-    _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|<->|->|[A-Za-z0-9_][\w.]*|\S')
-    _LEVEL: ClassVar = {"->": 1, "<->": 1, "|": 2, "xor": 3, "&": 4, "U": 5, "R": 5, "W": 5, "M": 5}
+    _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|<=>|=>|<->|->|[A-Za-z0-9_][\w.]*|\S')
+    _LEVEL: ClassVar = {
+        "->": 1,
+        "<->": 1,
+        "=>": 1,
+        "<=>": 1,
+        "|": 2,
+        "xor": 3,
+        "&": 4,
+        "U": 5,
+        "R": 5,
+        "W": 5,
+        "M": 5,
+    }
 
     def __init__(self) -> None:
         self.nodes: list[tuple] = []
@@ -308,23 +320,35 @@ class Formulas:
         return self.number[node]
 
     def parse(self, text: str, columns: Sequence[str] | None = None) -> tuple[int, int]:
-        """The numbers of a formula and of its negation; `columns` names numbers in HOA labels."""
+        """The numbers of a formula and of its negation; `columns` names numbers in HOA labels.
+
+        Tools differ in the precedence of operators. Where it matters, parentheses are required.
+        """
         tokens = [*self._TOKEN.findall(text), ""][::-1]
         need(len(tokens) < 2000, "a formula has 2000 tokens")
         self.names = set()
+        levels: list[list[str]] = [[]]  # operators at each depth of parentheses
         true = self.make("true"), self.make("false")
 
         def both(op: str, f: tuple, g: tuple) -> tuple[int, int]:
             dual = {"and": "or", "or": "and", "U": "R", "R": "U"}[op]
             return self.make(op, f[0], g[0]), self.make(dual, f[1], g[1])
 
+        def is_clear(operators: list[str]) -> bool:
+            binaries = [x for x in operators if x not in "XFG"]
+            is_alone = not binaries or len(operators) == 1
+            return is_alone or {*operators} <= {"&", "|"}
+
         def unary() -> tuple[int, int]:
             token = tokens.pop()
             if token == "(":
+                levels.append([])
                 f = binary(1)
                 need(tokens.pop() == ")", f"{text!r:.80}: expected )")
+                need(is_clear(levels.pop()), f"{text!r:.80}: add parentheses")
                 return f
             if token in ("!", "X", "F", "G"):
+                levels[-1] += [token] * (token != "!")
                 f = unary()
                 if token == "X":
                     return self.make("X", f[0]), self.make("X", f[1])
@@ -348,7 +372,8 @@ class Formulas:
         def binary(level: int) -> tuple[int, int]:
             f = unary()
             while (own := self._LEVEL.get(tokens[-1], 0)) >= level:
-                op = tokens.pop()
+                op = tokens.pop().replace("=", "-")
+                levels[-1].append(op)
                 g = binary(own + (own not in (1, 5)))
                 if op in ("xor", "<->"):
                     f = both("or", both("and", f, g), both("and", f[::-1], g[::-1]))
@@ -363,7 +388,8 @@ class Formulas:
             return f
 
         f = binary(1)
-        need(tokens == [""], f"{text!r:.80}: {tokens[-1]!r:.20} is out of place")
+        is_whole = tokens == [""] and is_clear(levels[0])
+        need(is_whole, f"{text!r:.80}: {tokens[-1]!r:.20} is out of place, or add parentheses")
         return f
 
     def holds(self, f: int, letter: frozenset[str]) -> bool:
@@ -680,6 +706,8 @@ class ClaimChecker:
         # The memory is of the policy of the claim or of the question, or counts the steps left.
         keepers = [x for x in (claim, question, path) if x.keys() & {"memory", "steps"}]
         hold(len(keepers) < 2, "two memories (or one and bounded steps) are not covered")
+        is_twofold = "policy" in question and ("memory" in claim or "observations" in question)
+        hold(not is_twofold, "a policy in the question, and memory or observations of another one")
         self.counts = "steps" in path
         self.memory = (
             path["steps"] + 1 if self.counts else field((*keepers, {})[0], "memory", int, 1)

@@ -584,7 +584,7 @@ AUTOMATA = {
         "1 Inf(0)",
         "State: 0\n[0] 1\n[!0&!1] 0\n[!0&1] 2\nState: 1 {0}\n[t] 1\nState: 2\n[t] 2",
     ),
-    "G F a & F G !b": (
+    "(G F a) & (F G !b)": (
         "1",
         '2 "a" "b"',
         "2 Fin(0) & Inf(1)",
@@ -595,7 +595,7 @@ DELTA = {  # successor and priority (least, even accepts) of a state for a lette
     "G F a": lambda q, a, b: (0, 0 if a else 1),
     "F G a": lambda q, a, b: (0, 2 if a else 1),
     "!b U a": lambda q, a, b: (1 if a else 2 if b else 0, 1) if q == 0 else (q, 0 if q == 1 else 1),
-    "G F a & F G !b": lambda q, a, b: (0, 1 if b else 2 if a else 3),
+    "(G F a) & (F G !b)": lambda q, a, b: (0, 1 if b else 2 if a else 3),
 }
 
 
@@ -678,11 +678,19 @@ def formula_file(formula, text, letters=((0, 0), (1, 0), (0, 1), (1, 1)), bound=
 
 
 @pytest.mark.parametrize("other", AUTOMATA)
-@pytest.mark.parametrize("formula", [*AUTOMATA, "b R (a | b)", "F (a & X b)", "G (a -> F b)"])
+@pytest.mark.parametrize("formula", [*AUTOMATA, "b R (a | b)", "F (a & (X b))", "G (a -> (F b))"])
 def test_an_automaton_of_another_formula_is_refused(formula, other, tmp_path, capsys):
     status, text = outcome(tmp_path, capsys, formula_file(formula, hoa(other)))
     assert status == (formula != other), text
     assert formula == other or "a word that" in text
+
+
+@pytest.mark.parametrize(
+    "formula", ["G F a & b", "a & b U a", "a -> b -> a", "F a U b", "G (a -> F b)", "(a | X b)"]
+)
+def test_formulas_that_tools_read_differently_need_parentheses(formula, tmp_path, capsys):
+    status, text = outcome(tmp_path, capsys, formula_file(formula, hoa("!b U a")))
+    assert status == 2 and "add parentheses" in text
 
 
 def test_automata_of_the_library_are_right_for_their_formulas(tmp_path, capsys):
@@ -690,8 +698,21 @@ def test_automata_of_the_library_are_right_for_their_formulas(tmp_path, capsys):
     from jaxltl.core.automata import is_equivalent
     from jaxltl.io import write_hoa
 
-    formulas = ["a W b", "a M b", "X (a xor b)", "F a <-> G b", "(a U b) U a", "G F a -> G F b"]
-    formulas += ["F G (a | X b)", "!(a R X !b)", "G (a -> X (b U a))", "true", "F (a & X F b)"]
+    formulas = [
+        "a W b",
+        "a M b",
+        "X (a xor b)",
+        "(F a) <-> (G b)",
+        "(a U b) U a",
+        "(G F a) => (G F b)",
+    ]
+    formulas += [
+        "F G (a | (X b))",
+        "!(a R (X !b))",
+        "G (a -> (X (b U a)))",
+        "true",
+        "F (a & (X F b))",
+    ]
     texts = {f: write_hoa(to_automaton(f)) for f in formulas}
     for formula, other in itertools.product(formulas, formulas):
         if other == formula or len(formula) + len(other) < 18:
@@ -729,8 +750,8 @@ State: 1
 def memory_file(policy, successors, **more):
     """A controller of two memory states, and a claim of probability 1."""
     question = {
-        "text": "Pmax=? [ G F one & G F two ]" + more.get("tail", ""),
-        "path": {"kind": "formula", "formula": "G F one & G F two", "automaton": "both"},
+        "text": "Pmax=? [ (G F one) & (G F two) ]" + more.get("tail", ""),
+        "path": {"kind": "formula", "formula": "(G F one) & (G F two)", "automaton": "both"},
         "objective": "max",
         **more.get("question", {}),
     }
