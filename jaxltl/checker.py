@@ -25,7 +25,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from operator import le, mul
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 Ways = list  # pairs: formulas for the next step, and bits of postponed untils
@@ -69,8 +69,13 @@ def read_archive(path: str, limit: int) -> dict[str, bytes]:
     with open(path, "rb") as plain:
         is_gzip = plain.read(2) == b"\x1f\x8b"
         plain.seek(0)
-        data = (gzip.GzipFile(fileobj=plain) if is_gzip else plain).read(limit + 1)
-    need(len(data) <= limit, f"the archive has more than {limit} bytes; see --limit")
+        file: Any = gzip.GzipFile(fileobj=plain) if is_gzip else plain
+        pieces, size = [], 0
+        while piece := file.read(2**20):
+            pieces.append(piece)
+            size += len(piece)
+            need(size <= limit, f"the archive has more than {limit} bytes; see --limit")
+    data = b"".join(pieces)
     with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
         for info in archive:
             if not info.isdir():
@@ -294,19 +299,7 @@ class Formulas:
     """Formulas of linear temporal logic in negation normal form, each stored once by a number."""
 
     _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|<=>|=>|<->|->|[A-Za-z0-9_][\w.]*|\S')
-    _LEVEL: ClassVar = {
-        "->": 1,
-        "<->": 1,
-        "=>": 1,
-        "<=>": 1,
-        "|": 2,
-        "xor": 3,
-        "&": 4,
-        "U": 5,
-        "R": 5,
-        "W": 5,
-        "M": 5,
-    }
+    _BINARY = frozenset(["&", "|", "->", "=>", "<->", "<=>", "xor", "U", "R", "W", "M"])
 
     def __init__(self) -> None:
         self.nodes: list[tuple] = []
@@ -327,69 +320,70 @@ class Formulas:
         tokens = [*self._TOKEN.findall(text), ""][::-1]
         need(len(tokens) < 2000, "a formula has 2000 tokens")
         self.names = set()
-        levels: list[list[str]] = [[]]  # operators at each depth of parentheses
         true = self.make("true"), self.make("false")
 
         def both(op: str, f: tuple, g: tuple) -> tuple[int, int]:
             dual = {"and": "or", "or": "and", "U": "R", "R": "U"}[op]
             return self.make(op, f[0], g[0]), self.make(dual, f[1], g[1])
 
-        def is_clear(operators: list[str]) -> bool:
-            binaries = [x for x in operators if x not in "XFG"]
-            is_alone = not binaries or len(operators) == 1
-            return is_alone or {*operators} <= {"&", "|"}
-
-        def unary() -> tuple[int, int]:
+        def unary() -> tuple[tuple[int, int], bool]:
+            """A formula, and if it begins with a temporal operator."""
             token = tokens.pop()
             if token == "(":
-                levels.append([])
-                f = binary(1)
+                f = group()
                 need(tokens.pop() == ")", f"{text!r:.80}: expected )")
-                need(is_clear(levels.pop()), f"{text!r:.80}: add parentheses")
-                return f
+                return f, False
             if token in ("!", "X", "F", "G"):
-                levels[-1] += [token] * (token != "!")
-                f = unary()
+                f, is_temporal = unary()
+                if token == "!":
+                    return (f[1], f[0]), is_temporal
                 if token == "X":
-                    return self.make("X", f[0]), self.make("X", f[1])
-                if token == "F":
-                    return both("U", true, f)
-                return (f[1], f[0]) if token == "!" else both("R", true[::-1], f)
+                    return (self.make("X", f[0]), self.make("X", f[1])), True
+                return both("U", true, f) if token == "F" else both("R", true[::-1], f), True
             if token in ("true", "false") or (columns is not None and token in ("t", "f")):
-                return true if token[0] == "t" else (true[1], true[0])
+                return true if token[0] == "t" else (true[1], true[0]), False
             is_number = columns is not None and re.fullmatch(r"\d{1,6}", token)
             if is_number and int(token) < len(columns or ()):
                 name = (columns or ())[int(token)]
             else:
                 bare = re.fullmatch(r"(?![FGX](?!\d))[A-Za-z_][\w.]*", token)
                 is_name = token[:1] == '"' or (bare and columns is None)
-                reserved = token in self._LEVEL or token.lower() in ("true", "false", "xor")
+                reserved = token in self._BINARY or token.lower() in ("true", "false", "xor")
                 need(is_name and not reserved, f"{text!r:.80}: {token!r:.20} is no name")
                 name = re.sub(r"\\(.)", r"\1", token[1:-1]) if token[0] == '"' else token
             self.names.add(name)
-            return self.make("ap", name, True), self.make("ap", name, False)
+            return (self.make("ap", name, True), self.make("ap", name, False)), False
 
-        def binary(level: int) -> tuple[int, int]:
-            f = unary()
-            while (own := self._LEVEL.get(tokens[-1], 0)) >= level:
+        def group() -> tuple[int, int]:
+            f, is_temporal = unary()
+            terms: list[tuple[int, int]] = [f]  # of a disjunction
+            operators: set[str] = set()
+            while tokens[-1] in self._BINARY:
                 op = tokens.pop().replace("=", "-")
-                levels[-1].append(op)
-                g = binary(own + (own not in (1, 5)))
-                if op in ("xor", "<->"):
-                    f = both("or", both("and", f, g), both("and", f[::-1], g[::-1]))
-                    f = (f[1], f[0]) if op == "xor" else f
-                elif op == "W":
-                    f = both("R", g, both("or", f, g))
-                elif op == "M":
-                    f = both("U", g, both("and", f, g))
+                g, is_also = unary()
+                is_temporal |= is_also
+                is_clear = not is_temporal and (not operators or {op, *operators} <= {"&", "|"})
+                need(is_clear, f"{text!r:.80}: add parentheses at {op!r}")
+                operators.add(op)
+                if op == "|":
+                    terms.append(g)
+                elif op == "->":
+                    terms = [both("or", f[::-1], g)]
+                elif op in ("xor", "<->"):
+                    same = both("or", both("and", f, g), both("and", f[::-1], g[::-1]))
+                    terms = [(same[1], same[0]) if op == "xor" else same]
+                elif op in ("W", "M"):
+                    terms = [
+                        both("R", g, both("or", f, g))
+                        if op == "W"
+                        else both("U", g, both("and", f, g))
+                    ]
                 else:
-                    name = {"&": "and", "|": "or", "->": "or"}.get(op, op)
-                    f = both(name, f[::-1] if op == "->" else f, g)
-            return f
+                    terms[-1] = both("and" if op == "&" else op, terms[-1], g)
+            return functools.reduce(functools.partial(both, "or"), terms)
 
-        f = binary(1)
-        is_whole = tokens == [""] and is_clear(levels[0])
-        need(is_whole, f"{text!r:.80}: {tokens[-1]!r:.20} is out of place, or add parentheses")
+        f = group()
+        need(tokens == [""], f"{text!r:.80}: {tokens[-1]!r:.20} is out of place")
         return f
 
     def holds(self, f: int, letter: frozenset[str]) -> bool:
