@@ -820,3 +820,17 @@ def test_given_randomised_policies(weights, status, tmp_path, capsys):
     members = model(states, labels={"goal": [1]})
     found = outcome(tmp_path, capsys, certificate(members, question, claims, arrays))
     assert found[0] == status, found
+
+
+def test_the_command_verify_is_the_checker(tmp_path):
+    from click.testing import CliRunner
+
+    from jaxltl.cli import main as command
+
+    for bounds, status, last in (
+        (("0.589", "0.611"), 0, "ACCEPTED"),
+        (("0.6", "0.611"), 1, "beyond 0.6"),
+    ):
+        path = write(tmp_path / "file.umb", five(bounds=bounds))
+        result = CliRunner().invoke(command, ["verify", str(path)])
+        assert result.exit_code == status and result.output.strip().endswith(last)
