@@ -79,38 +79,18 @@ class Subject:
 
     @property
     def reward(self) -> np.ndarray:
+        """Of actions, ``[S, A]`` or ``[S, Q, A]``."""
         return self.of_actions(self.case.reward)
 
     def of_actions(self, table: np.ndarray) -> np.ndarray:
         """A quantity of the actions of the world, ``[S, A]``."""
         table = np.repeat(table[:, None], self.memory, 1)  # [S, Q, A]
-        if self.by_rows:
-            return table[np.repeat(self.case.available[:, None], self.memory, 1)]
         return table if self.is_product else table[:, 0]
 
     @property
-    def world_policy(self) -> np.ndarray:
-        """Actions, or rows of the world, in the states of the model."""
-        policy = self.case.policy
-        if self.by_rows:
-            before = self.case.available & (
-                np.arange(self.case.available.shape[1]) < policy[:, None]
-            )
-            policy = self.row_start + before.sum(1)
-        return self.mask(policy.astype(np.int32))
-
-    @property
-    def row_start(self) -> np.ndarray:
-        return np.append(0, self.case.available.sum(1).cumsum())[:-1]
-
-    @property
     def policy(self) -> np.ndarray:
-        """Actions, or rows of the model: of a product, of the product."""
-        if not (self.by_rows and self.is_product):
-            return self.world_policy
-        count, rank = self.case.available.sum(1), self.world_policy[:, 0] - self.row_start
-        first = np.cumsum(np.repeat(count, self.memory)) - np.repeat(count, self.memory)
-        return (first.reshape(-1, self.memory) + rank[:, None]).astype(np.int32)
+        """Actions in the states of the model."""
+        return self.mask(self.case.policy.astype(np.int32))
 
     def aims(self, objective: str, nature: str | None = None) -> Aims:
         system = 1 if objective == "max" else -1

@@ -29,9 +29,10 @@ from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.core.statistics.binomial import bounded_mean
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.values.evaluation.evaluation import frequency_estimate
-from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.multi_objective.multi_objective import multi_objective
 from jaxltl.core.values.multi_objective.objectives import Objective
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.total_reward import total_reward
 from jaxltl.envs import navigation
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world
@@ -92,7 +93,7 @@ def things(folder):
     box = read.over(0.1, 0.9)
     problem = feasible.make_problem(box, "goal", bound=">=")
     asked = {"model": model, "target": "a", "objective": "max", "nature": "adversarial"}
-    solved = robust_reachability(model, "a", nature="adversarial")
+    solved = reachability_probability(model, "a", nature="adversarial")
     ends = {"lower": [0.4, 0.3, 1, 1], "upper": [0.7, 0.6, 1, 1]}
     ball = {"center": [0.5, 0.5, 1, 1], "radius": [0.1, 0, 0]}
     told = {
@@ -120,11 +121,11 @@ def things(folder):
                 "valuation": {},
             },
         ),
-        (robust_reachability, {**asked, "policy": None, "stay": None, "tolerance": 1e-6}),
-        (robust_total_reward, {**asked, "reward": "r", "policy": None, "tolerance": 1e-6}),
+        (reachability_probability, {**asked, "policy": None, "stay": None, "tolerance": 1e-6}),
+        (total_reward, {**asked, "reward": "r", "policy": None, "tolerance": 1e-6}),
         (
-            jl.values.robust_discounted_value,
-            {"model": model, "reward": "r", "discount": 0.9, "policy": None, "tolerance": 1e-6},
+            jl.optimal_value,
+            {"model": model, "reward": "r", "discount": 0.9, "nature": None, "tolerance": 1e-6},
         ),
         (
             jl.values.robust_expectation,
@@ -759,7 +760,7 @@ def test_good_input_is_taken(tmp_path):
             lambda m: jl.values.bounded_reachability(m, "a", None),
             "num_steps=None; it must be an integer",
         ),
-        (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),
+        (lambda m: reachability_probability(m, "a", policy="x"), "policy is 'x'; give the number"),
         (
             lambda m: multi_objective(m, [Objective(target="a"), Objective(target="a")]),
             "ask for one at a time",

@@ -62,7 +62,7 @@ from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status, require_states
 from jaxltl.core.validation import Range
 from jaxltl.core.values.engine.state_quantities import safe_ends
-from jaxltl.core.values.interval.robust import requested_width
+from jaxltl.core.values.interval.sides import requested_width
 from jaxltl.core.values.prepared.prepared import (
     Prepared,
     evaluate_prepared,

@@ -25,7 +25,7 @@ from jaxltl.core.values.undiscounted.mixture import (
     require_attainable,
 )
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions, OptimalActions
-from jaxltl.core.values.undiscounted.reachability import rows_of_model
+from jaxltl.core.values.engine.row_form import rows_of
 from jaxltl.core.values.undiscounted.satisfaction_steps import (
     constrained_policy,
     Quickest,
@@ -153,7 +153,7 @@ def _losing(
     first = tuple(np.argwhere(lost)[0])
     s, q, a = state[first], memory[first], action[first]
     value = np.asarray(best.value, float)
-    sparse = rows_of_model(model)
+    sparse = rows_of(model)
     chosen = (sparse.host.state == s * model.num_memory + q) & (np.asarray(sparse.action) == a)
     after = sparse.host.expectation(value.ravel())[chosen]
     return lost, (float(value[s, q]), float(after.sum()))

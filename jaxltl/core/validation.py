@@ -252,7 +252,7 @@ def unsupported_model(model: object) -> str:
         return (
             f"{name} has intervals for its probabilities, which are not supported here; use a "
             "solver that supports them (reachability_probability, total_reward, "
-            "robust_discounted_value, optimal_satisfaction, bounded_reachability), or give "
+            "optimal_value, optimal_satisfaction, bounded_reachability), or give "
             "its nominal model, model.nominal, whose probabilities are one choice of nature."
         )
     if hasattr(model, "num_exchanged"):

@@ -29,8 +29,8 @@ from jaxltl.core.models.protocols import ActionModel, Array
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.shortest_path import expected_steps
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.reachability import on_actions, row_of_action, rows_of_model
-from jaxltl.core.values.undiscounted.satisfaction import as_reachability, until_visit
+from jaxltl.core.values.engine.row_form import on_actions, row_of_action, rows_of
+from jaxltl.core.values.undiscounted.acceptance import as_reachability, until_visit
 
 
 def pair_counts(
@@ -135,7 +135,7 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     """Decrease ``float[S, Q, A]`` of the expected steps to the goal; None if these are too many."""
     problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
     reached = np.asarray(problem.target).ravel()
-    sparse = rows_of_model(model)
+    sparse = rows_of(model)
     mdp, row = sparse.host, row_of_action(sparse, best.policy)
     ahead = expected_steps(mdp, row, reached | lost)
     visit_steps: np.ndarray | None = np.zeros(reached.size)

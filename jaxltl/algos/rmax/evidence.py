@@ -19,7 +19,7 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.types import Solution
-from jaxltl.core.values import minimax_value, robust_discounted_value, strategy_value
+from jaxltl.core.values import minimax_value, optimal_value, policy_value, strategy_value
 from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
 
@@ -174,10 +174,8 @@ def data_evidence(
     system: Array = np.asarray(problem.game.system)[state]
     within = Game(model, system)
     weight = np.asarray(strategy, np.float64)[s, a]
-    secured = robust_discounted_value(
-        within, "reward", discount, policy=weight, nature="adversarial"
-    )
-    optimal = robust_discounted_value(within, "reward", discount, nature="cooperative")
+    secured = policy_value(within, weight, "reward", discount, nature="adversarial")
+    optimal = optimal_value(within, "reward", discount, nature="cooperative")
     bounds = np.full((2, region.size), np.nan)
     bounds[0, state], bounds[1, state] = secured.lower, optimal.upper
     return DataEvidence(bounds[0], bounds[1], float(confidence), int(count.sum()))

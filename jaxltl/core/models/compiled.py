@@ -12,11 +12,13 @@ from jaxltl.core import validation
 from jaxltl.core.models.construct.convert import product_rows, to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.action_numbers import row_actions, rows_of_policy, weights_of_policy
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace
+from jaxltl.core.models.ops.kernels import segment_ids
+from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
-from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
 
@@ -35,6 +37,7 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
         return (model if form is model.mdp else Game(form, system)), reward
     if is_sharded(model):
         return _named_reward(model, reward)
+    lazy = model
     if isinstance(model, Product) and isinstance(model.mdp, SparseMDP):
         model = product_rows(model.mdp, model) if is_traced(model) else to_sparse(model)
     if hasattr(base_model(model), "nominal"):
@@ -42,11 +45,24 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
     if not isinstance(model, SparseMDP):
         return model, reward
     if reward is not None:
-        reward = reward_structure(model, reward)
+        reward = reward_structure(model, _on_form(lazy, reward))
     none = np.zeros((model.num_states, 0), bool)
     return replace(
         model, label=none, propositions=(), rewards={}, valuation={}, action=None, action_names=()
     ), reward
+
+
+def _on_form(lazy: Model, reward: Reward) -> Reward:
+    """A reward ``[S, A]`` of a sparse model, or ``[S, Q]`` or ``[S, Q, A]`` of a product, on its rows."""
+    if isinstance(reward, str | Rewards) or np.ndim(reward) < 2:
+        return reward
+    shape = lazy.state_shape
+    if np.shape(reward) == shape:
+        return Rewards(state=reward.reshape(-1))
+    if np.shape(reward)[:-1] != shape:
+        return reward
+    _, number, state, table = namespace(*_row_numbers(lazy), reward)
+    return Rewards(choice=table.reshape(lazy.num_states, -1)[state, number])
 
 
 def _named_reward(model: Model, reward: Reward) -> tuple[Model, Array]:
@@ -62,9 +78,9 @@ def _named_reward(model: Model, reward: Reward) -> tuple[Model, Array]:
 
 
 def reshape_solution(model: Model, solution: Solution) -> Solution:
-    """A solution of a model's compiled form, with the model's shape of states."""
+    """A solution of a model's compiled form in the model's shape of states, with action numbers."""
     lazy = model.mdp if isinstance(model, Game) else model
-    if not (is_sparse(lazy) and isinstance(lazy, Product)):
+    if not is_sparse(lazy):
         return solution
     shape, policy = model.state_shape, solution.policy
 
@@ -76,12 +92,50 @@ def reshape_solution(model: Model, solution: Solution) -> Solution:
         value=one(solution.value),
         lower=one(solution.lower),
         upper=one(solution.upper),
-        policy=one(policy) if is_deterministic(policy) else policy,
+        policy=one(jnp.asarray(_row_numbers(lazy)[0])[policy])
+        if is_deterministic(policy)
+        else policy,
     )
 
 
-def flatten_policy(model: Model, policy: Array) -> Array:
-    """A policy for the compiled form: of a product of a sparse model rows ``int32[S * Q]``."""
-    if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
-        return policy.reshape(-1)
-    return policy
+def compiled_policy(model: Model, policy: Array, where: Array = True) -> Array:
+    """A policy for the compiled form: of sparse models rows ``int32[S * Q]`` or weights ``float[R]``.
+
+    The given one has actions ``int32[S]``, weights of actions ``float[S, A]``, or weights of rows. A
+    concrete one is checked in the states `where`; of a traced one, an action that a state does not
+    have becomes a row that no state has.
+    """
+    lazy = model.mdp if isinstance(model, Game) else model
+    if policy is None or not is_sparse(lazy):
+        return policy
+    shape, count = lazy.state_shape, lazy.num_states
+    is_action, flat = is_deterministic(policy), policy
+    if (jnp.shape(policy) if is_action else jnp.shape(policy)[:-1]) == shape:
+        flat = policy.reshape(count) if is_action else policy.reshape(count, -1)
+    if not is_traced((lazy, policy, where)):
+        sparse, where = to_sparse(lazy), np.broadcast_to(where, shape).ravel()
+        row_weights(sparse, flat, where, shape)  # checks it
+        if is_action:
+            return jnp.asarray(rows_of_policy(sparse, flat, where), jnp.int32)
+        return jnp.asarray(weights_of_policy(sparse, flat))
+    flat, number, state = (jnp.asarray(x) for x in (flat, *_row_numbers(lazy)))
+    if is_action and flat.shape == (count,):
+        place = jnp.where(number == flat[state], jnp.arange(state.size), state.size)
+        rows = jax.ops.segment_min(place, state, num_segments=count, indices_are_sorted=True)
+        return rows.astype(jnp.int32)
+    if flat.ndim == 2 and flat.shape[0] == count:
+        known = number < flat.shape[1]
+        return jnp.where(known, flat[state, jnp.where(known, number, 0)], 0)
+    return flat
+
+
+def _row_numbers(lazy: Model) -> tuple[Array, Array]:
+    """The action number of each row of a sparse model or its product, and the state of each row."""
+    if not is_traced(lazy):
+        sparse = to_sparse(lazy)
+        return row_actions(sparse), sparse.host.state
+    form = product_rows(lazy.mdp, lazy) if isinstance(lazy, Product) else lazy
+    state = segment_ids(form.row_start, form.num_rows)
+    if form.action is None or base_model(lazy).action_names:
+        return jnp.arange(state.size) - jnp.asarray(form.row_start)[state], state
+    return jnp.asarray(form.action), state

@@ -134,7 +134,7 @@ def refuse_ball(model: IntervalMDP, why: str) -> None:
         raise ValueError(
             f"the model has a radius, and {why}; give its smallest intervals, "
             "model.box, or ask the solvers that take a radius "
-            "(reachability_probability, total_reward, robust_discounted_value, "
+            "(reachability_probability, total_reward, optimal_value, "
             "optimal_satisfaction)."
         )
 

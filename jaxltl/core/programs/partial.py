@@ -27,7 +27,7 @@ from jaxltl.core.programs.local_choices import Numbers
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.engine.host_solution import complement_event
-from jaxltl.core.values.interval.robust import requested_width
+from jaxltl.core.values.interval.sides import requested_width
 from jaxltl.core.values.properties.answers import Answer
 from jaxltl.core.values.properties.solve_property import TOLERANCE, as_answer, solve_property
 

@@ -28,12 +28,7 @@ from .evaluation.optimality_gap import (
     optimality_gap as optimality_gap,
     tabulate_policy as tabulate_policy,
 )
-from .interval.robust import (
-    robust_discounted_value as robust_discounted_value,
-    robust_expectation as robust_expectation,
-    robust_reachability as robust_reachability,
-    robust_total_reward as robust_total_reward,
-)
+from .interval.robust import robust_expectation as robust_expectation
 from .interval.sensitivity import (
     Sensitivity as Sensitivity,
     robust_sensitivity as robust_sensitivity,

@@ -12,14 +12,12 @@ from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.statistics.confidence_sets import intervals_from_counts
+from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
-from jaxltl.core.values.interval.robust import (
-    robust_discounted_value,
-    robust_expectation,
-    robust_reachability,
-)
+from jaxltl.core.values.interval.robust import robust_expectation
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.preparation import prepare
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
@@ -62,7 +60,7 @@ def test_half_of_the_radius_moves():
     for radius, least, most in ((0.0, 0.5, 0.5), (0.2, 0.4, 0.6), (1.2, 0.0, 1.0), (2.0, 0, 1)):
         model = around(three(), radius)
         for nature, value in (("min", least), ("max", most)):
-            found = robust_reachability(model, "a", nature=nature_word("max", nature))
+            found = reachability_probability(model, "a", nature=nature_word("max", nature))
             assert found.value[0] == pytest.approx(value, abs=1e-15)
             assert found.lower[0] <= value <= found.upper[0]
             within_ball(model.host, found.nature)
@@ -100,7 +98,7 @@ def test_what_a_radius_removes():
     """An end may go only if the ball reaches so far."""
     for radius, zero in ((0.19, False), (0.2, True), (0.21, True)):
         model = around(three(), radius)
-        found = robust_reachability(model, "b", nature="adversarial")
+        found = reachability_probability(model, "b", nature="adversarial")
         assert (found.upper[0] == 0) == zero
         # Who is not known to be left out is entered sooner or later.
         again = interval_rows(
@@ -112,7 +110,7 @@ def test_what_a_radius_removes():
             center=[0.5, 0.4, 0.1, 1, 1],
             radius=[radius + 0.8, 0, 0],
         )
-        least = robust_reachability(again, [False, True, True], nature="adversarial")
+        least = reachability_probability(again, [False, True, True], nature="adversarial")
         assert least.lower[0] == (0 if zero else 1)
     never = around(three().replace(probability=np.array([0.5, 0.5, 0, 1, 1, 1])), 0.0)
     assert never.num_transitions == 5  # what can get nothing is left out
@@ -161,8 +159,8 @@ def test_products_policies_and_games():
             mixed = satisfaction_probability(both, share, nature=nature_word("max", nature))
             assert (mixed.lower <= whole.upper).all()
         system = rng.random(world.num_states) < 0.5
-        game = robust_reachability(make_game(world, system), "a")
-        free = robust_reachability(world, "a", nature="adversarial")
+        game = reachability_probability(make_game(world, system), "a")
+        free = reachability_probability(world, "a", nature="adversarial")
         assert (game.lower <= free.upper).all()
         within_ball(world.host, game.nature)
 
@@ -184,13 +182,13 @@ def test_restricted_and_written(tmp_path):
     first = np.isin(np.arange(world.num_rows), np.asarray(world.nominal.row_start)[:-1])
     few = with_allowed(world, first)
     np.testing.assert_array_equal(few.radius, world.radius[first])
-    policy = np.flatnonzero(first).astype(np.int32)
-    alone = robust_reachability(world, "a", policy=policy, nature="adversarial")
-    kept = robust_reachability(few, "a", nature="adversarial")
+    policy = np.zeros(world.num_states, np.int32)
+    alone = reachability_probability(world, "a", policy=policy, nature="adversarial")
+    kept = reachability_probability(few, "a", nature="adversarial")
     np.testing.assert_allclose(kept.value, alone.value, atol=1e-9)
     part = restrict(world)
-    near = robust_reachability(part.model, "a", nature="adversarial").value
-    far = robust_reachability(world, "a", nature="adversarial").value
+    near = reachability_probability(part.model, "a", nature="adversarial").value
+    far = reachability_probability(world, "a", nature="adversarial").value
     np.testing.assert_allclose(near, far[np.asarray(part.base_state)], atol=1e-9)
     for solve in (
         lambda: prepare(world, "a"),
@@ -211,7 +209,9 @@ def test_padded_models_and_successors_that_repeat():
         radius=[[0.2], [0], [0]],
     )
     goal = [False, True, False]
-    assert robust_reachability(model, goal, nature="adversarial").value[0] == pytest.approx(0.5)
+    assert reachability_probability(model, goal, nature="adversarial").value[0] == pytest.approx(
+        0.5
+    )
     twice = interval_rows(
         None,
         [0, 3, 4, 5],
@@ -222,8 +222,10 @@ def test_padded_models_and_successors_that_repeat():
         radius=[0.2, 0, 0],
     )
     assert twice.num_transitions == 4
-    assert robust_reachability(twice, goal, nature="adversarial").value[0] == pytest.approx(0.5)
-    gain = robust_discounted_value(twice, [0.0, 1.0, 0.0], 0.5)
+    assert reachability_probability(twice, goal, nature="adversarial").value[0] == pytest.approx(
+        0.5
+    )
+    gain = optimal_value(twice, [0.0, 1.0, 0.0], 0.5)
     assert gain.value[0] == pytest.approx(0.5 * 0.5 * 2)
 
 

@@ -13,10 +13,11 @@ from jaxltl.core.models import Game
 
 # Those that know who moves; the cells of tests/core/values/test_matrix.py test their answers.
 FOR_GAMES = {
-    "minimax_value", "strategy_value", "mean_payoff", "average_reward", "robust_reachability",
-    "robust_total_reward", "robust_discounted_value", "optimal_satisfaction", "winning_region", "permissive_strategy",
+    "minimax_value", "strategy_value", "mean_payoff", "average_reward", "reachability_probability",
+    "total_reward", "optimal_value", "policy_value", "satisfaction_probability", "optimal_satisfaction",
     "bounded_reachability", "next_probability", "cumulative_reward", "instantaneous_reward",
-    "reward_bounded_reachability", "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
+    "reward_bounded_reachability", "solve_property", "winning_region", "permissive_strategy",
+    "verify", "almost_sure_buchi", "almost_surely_reaching", "avoidable",
 }  # fmt: skip
 # Analyses of the graph and operations on models, which are not about who chooses.
 NOT_ABOUT_CHOICE = {

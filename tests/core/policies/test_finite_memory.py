@@ -126,10 +126,9 @@ def test_policies_of_all_containers_are_the_same():
     found = {"dense": jl.project_policy(dense, jl.optimal_satisfaction(dense).policy)}
     sparse = jl.to_sparse(WORLD)
     lazy = jl.product(sparse, TASK)
-    rows = jl.optimal_satisfaction(lazy).policy
-    found["sparse"] = jl.project_policy(lazy, rows)
-    weight = np.zeros((sparse.num_rows, lazy.num_memory))
-    weight[np.asarray(rows), np.arange(lazy.num_memory)] = 1
+    actions = np.asarray(jl.optimal_satisfaction(lazy).policy)
+    found["sparse"] = jl.project_policy(lazy, actions)
+    weight = (actions[sparse.host.state] == np.asarray(sparse.action)[:, None]).astype(float)
     mixed = jl.project_policy(lazy, weight)
     assert mixed.action.shape == (3, lazy.num_memory, 2)
     found["weights"] = mixed.replace(action=np.asarray(mixed.action).argmax(-1))
@@ -152,10 +151,10 @@ def test_action_numbers_of_sparse_rows_are_those_of_the_model():
     sparse = jl.make_sparse(
         [0, 1, 3], [0, 1, 2, 3], [1, 0, 1], [1.0, 1.0, 1.0], action=[2, 0, 3], label={"a": [1]}
     )
-    policy = jl.project_policy(sparse, np.array([0, 2]))
+    policy = jl.project_policy(sparse, np.array([2, 3]))
     assert np.asarray(policy.action).tolist() == [[2], [3]]
-    with pytest.raises(ValueError, match="is not a row of its state"):
-        jl.project_policy(sparse, np.array([1, 2]))
+    with pytest.raises(ValueError, match=r"policy\[1\] = 2 is no action of its state; .*\[0, 3\]"):
+        jl.project_policy(sparse, np.array([2, 2]))
 
 
 def test_policies_with_a_horizon_follow_time():

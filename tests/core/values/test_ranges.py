@@ -131,4 +131,4 @@ def test_rewards_of_both_signs_stay_in_their_range(seed):
                 span = span if sign > 0 else (-span[1], -span[0])
                 require_range(solve(sign * reward, direction), span, (solve, sign, direction))
         span = ends[0] if sign > 0 else (-ends[0][1], -ends[0][0])
-        require_range(values.robust_discounted_value(intervals, sign * reward, 0.5), span, sign)
+        require_range(values.optimal_value(intervals, sign * reward, 0.5), span, sign)

@@ -15,6 +15,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree, base_model
 from jaxltl.core.models.sparse import SparseMDP
@@ -178,7 +179,7 @@ def project_policy(
       model: a product, a model without memory, or a game on one of these; or the model of a
         ``Satisfaction``.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``, or with an axis of T steps in front; for a sparse
-        world ``float[R, Q]`` or rows ``int32[S, Q]``; or the ``Satisfaction``.
+        world also weights ``float[R, Q]`` of rows; or the ``Satisfaction``.
       actions, states: names of the actions and of the base model's states.
 
     Returns:
@@ -202,14 +203,15 @@ def project_policy(
     if isinstance(policy, MemoryRows) and rows is not None:
         memory = Product(rows, policy.automaton, policy.letter, policy.label_on)
         count = len(policy.automaton.delta)
-        table = np.repeat(np.asarray(rows.row_start)[:-1, None], count, axis=1)
-        table[policy.product.base_state, policy.product.memory] = policy.row
+        number = row_actions(rows)
+        table = np.repeat(number[np.asarray(rows.row_start)[:-1], None], count, axis=1)
+        table[policy.product.base_state, policy.product.memory] = number[policy.row]
     elif isinstance(model, Product):
         memory = model
     else:
         memory, zeros = None, np.zeros((model.num_states, 1), np.int32)
     if rows is not None:
-        table = _actions_of_rows(rows, table)
+        table = _named_actions(rows, table)
     elif memory is None:
         operators.policy_distribution(model, table)
     else:
@@ -229,22 +231,29 @@ def project_policy(
     )
 
 
-def _actions_of_rows(world: SparseMDP, policy: PyTree) -> jax.Array:
-    """Actions ``[S, Q]`` or their weights ``[S, Q, A]`` from rows of a sparse world."""
-    start, own = np.asarray(world.row_start), np.asarray(policy)
-    state = np.repeat(np.arange(world.num_states), np.diff(start))
-    number = np.arange(len(state)) - start[state] if world.action is None else world.action
-    number = np.asarray(number)
+def _named_actions(world: SparseMDP, policy: PyTree) -> jax.Array:
+    """Actions ``[S, Q]`` or weights ``[S, Q, A]`` by the names' numbers, from a policy of a sparse world."""
+    own, state, number = np.asarray(policy), world.host.state, row_actions(world)
+    named = world.rank if world.action is None else np.asarray(world.action)
     if own.dtype.kind in "iu":
-        places = np.arange(world.num_states).reshape(-1, *[1] * (own.ndim - 1))
-        wrong = np.argwhere((own < start[places]) | (own >= start[places + 1]))
-        if own.shape[0] != world.num_states or wrong.size:
-            where = (
-                f"policy{wrong[0].tolist()} = {own[tuple(wrong[0])]}" if wrong.size else "policy"
+        if own.shape[:1] != (world.num_states,):
+            raise ValueError(
+                f"policy has shape {own.shape}; give actions int32[{world.num_states}, Q]."
             )
-            raise ValueError(f"{where} is not a row of its state; give rows int32[S, Q].")
-        return jnp.asarray(number[own].astype(np.int32))
-    width = max(int(number.max(initial=0)) + 1, len(world.action_names))
+        row = np.full((world.num_states, int(number.max()) + 1), -1)
+        row[state, number] = np.arange(number.size)
+        place = np.arange(world.num_states).reshape(-1, *[1] * (own.ndim - 1))
+        known = (own >= 0) & (own < row.shape[1])
+        taken = np.where(known, row[place, np.where(known, own, 0)], -1)
+        for at in map(tuple, np.argwhere(taken < 0)[:1].tolist()):
+            raise ValueError(
+                f"policy{list(at)} = {own[at]} is no action of its state; choose one of "
+                f"{number[state == at[0]].tolist()}."
+            )
+        return jnp.asarray(named[taken].astype(np.int32))
+    if own.shape[0] == world.num_states and own.ndim > 1 and own.shape[-1] > number.max():
+        own = np.moveaxis(own, -1, 1)[state, number]
+    width = max(int(named.max(initial=0)) + 1, len(world.action_names))
     weight = np.zeros((world.num_states, width, *own.shape[1:]), own.dtype)
-    np.add.at(weight, (state, number), own)
+    np.add.at(weight, (state, named), own)
     return jnp.asarray(np.moveaxis(weight, 1, -1))

@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxltl.core import validation
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.sparse import SparseMDP
 
 _LARGEST = 8 * 2**30  # bytes of the largest model that is padded
-
-
-def row_actions(model: SparseMDP) -> np.ndarray:
-    """The action of each row in the padded model, ``int[R]``."""
-    if not isinstance(model, SparseMDP):
-        raise ValueError(validation.unsupported_model(model))
-    if model.action is not None and not model.action_names:
-        return np.asarray(model.action)
-    return model.rank
 
 
 def to_padded(model: SparseMDP) -> MDP:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.padded import row_actions
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedRowTable, ShardedMDP, StateLayout, state_layout

@@ -34,6 +34,7 @@ from jaxltl.core.models.ops.choices import (
 )
 from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
+from jaxltl.core.models.action_numbers import row_actions, rows_of_policy, weights_of_policy
 from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
@@ -455,43 +456,37 @@ def require_policy(model: Model, policy: Array, where: Array = True) -> None:
         )
 
 
-def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndarray:
-    """A concrete policy of a sparse model as checked row weights ``float64[R]``; `where` as in :func:`valid_policy`."""
+def row_weights(
+    model: SparseMDP, policy: Array, where: Array = True, shape: tuple[int, ...] | None = None
+) -> np.ndarray:
+    """A concrete policy of a sparse model as checked row weights ``float64[R]``; `where` as in :func:`valid_policy`.
+
+    Errors name states in `shape`. A policy gives actions ``int[S]``, or weights of actions
+    ``float[S, A]`` or of rows ``float[R]``.
+    """
     host, policy = model.host, np.asarray(policy)
     if is_deterministic(policy):
-        if policy.shape != (host.num_states,):
-            raise ValueError(
-                f"policy has shape {policy.shape}; expected ({host.num_states},), a "
-                f"row for each state, or ({host.num_rows},) weights of rows."
-            )
-        wrong = ((policy < host.row_start[:-1]) | (policy >= host.row_start[1:])) & where
-        for s in first_true(wrong):
-            first, count = int(host.row_start[s]), int(host.row_start[s + 1] - host.row_start[s])
-            ranks = 0 <= policy[s] < count
-            hint = "; for choice k of a state give row_start[s] + k" if ranks else ""
-            raise ValueError(
-                f"policy[{s}]={policy[s]} is not a choice of state {s}: a policy of a sparse model "
-                f"gives rows, and those of the state are {first} to {first + count - 1}{hint}."
-            )
+        row = rows_of_policy(model, policy, where, shape)
         weight = np.zeros(host.num_rows)
-        weight[policy[np.broadcast_to(where, policy.shape)]] = 1
+        weight[row[np.broadcast_to(where, row.shape)]] = 1
         return weight
-    if policy.shape != (host.num_rows,):
-        raise ValueError(
-            f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
-            "for each choice."
-        )
-    weight = policy.astype(np.float64)
-    require_weights(host, weight, row_tolerance(policy.dtype), where)
-    if (small := underflows(policy, policy.dtype)) is not None:
+    given = weights_of_policy(model, policy, shape)
+    weight = given.astype(np.float64)
+    require_weights(host, weight, row_tolerance(policy.dtype), where, shape)
+    if (small := underflows(given, policy.dtype)) is not None:
         row = int(np.argmax(small))
-        text = underflow_text(policy[row], policy.dtype)
-        raise ValueError(f"the policy's weight of choice {row} {text}.")
+        text = underflow_text(given[row], policy.dtype)
+        place = row_actions(model)[row], host.state[row]
+        raise ValueError(f"the policy's weight of action {place[0]} in state {place[1]} {text}.")
     return cast(np.ndarray, weight)
 
 
 def require_weights(
-    host: HostMDP, weight: np.ndarray, tolerance: float, where: Array = True
+    host: HostMDP,
+    weight: np.ndarray,
+    tolerance: float,
+    where: Array = True,
+    shape: tuple[int, ...] | None = None,
 ) -> None:
     """Raises ValueError unless row weights are a distribution in each state."""
     total = host.over_choices(np.add, weight)
@@ -499,4 +494,5 @@ def require_weights(
     off &= where
     for s in first_true(off):
         row = weight[host.row_start[s] : host.row_start[s + 1]]
-        raise ValueError(f"{describe_row(row, (s,))}.")
+        place = (s,) if shape is None else np.unravel_index(s, shape)
+        raise ValueError(f"{describe_row(row, place)}.")

@@ -57,7 +57,7 @@ _KILLED = 1e-6  # probability that a step is the last one, for policies that lea
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class PathAccuracy:
     """Requested width of an enclosure, absolute or relative to the value."""
 
     tolerance: float
@@ -119,7 +119,7 @@ class PathBounds:
     probability: Floats  # float64[T], nature's distributions
     rounds: int  # systems solved
 
-    def enclosed(self, problem: PathProblem, accuracy: Accuracy) -> Enclosure | None:
+    def enclosed(self, problem: PathProblem, accuracy: PathAccuracy) -> Enclosure | None:
         """The optimum, if it is enclosed as narrowly as requested."""
         if self.attained is None:
             return None
@@ -130,7 +130,7 @@ class PathBounds:
         return Enclosure(np.clip(self.value, low, high), low, high, self.row, 0, 0.0, "")
 
 
-def enclose_paths(problem: PathProblem, accuracy: Accuracy) -> PathBounds:
+def enclose_paths(problem: PathProblem, accuracy: PathAccuracy) -> PathBounds:
     """Bounds of a :class:`PathProblem` from both sides."""
     search = _PolicySearch(problem.operator(), accuracy, problem.may_stay)
     operator = search.operator
@@ -185,7 +185,7 @@ class _PolicySearch:
     """State of a policy iteration."""
 
     operator: RowOperator
-    accuracy: Accuracy
+    accuracy: PathAccuracy
     may_stay: bool
     # reward or cost of each step. It never grows for long: a pair that lingers for it would come
     # and go with it

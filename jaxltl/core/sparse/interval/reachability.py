@@ -14,7 +14,7 @@ import numpy as np
 from jaxltl.core.sparse.rows import mask_of
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import SparseEndComponents, shortest_path_rows
-from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
+from jaxltl.core.sparse.interval.policy_iteration import PathAccuracy, PathProblem, enclose_paths
 from jaxltl.core.sparse.interval.qualitative import (
     attracting_rows,
     certain_choices,
@@ -88,7 +88,7 @@ def _reachability(
         both = replace(query, maximize=maximize, nature_maximizes=maximize)
         return _joint(part, target, both, fixed_nature)
 
-    cost, accuracy = np.zeros(absorbing.mdp.num_rows), Accuracy(query.tolerance)
+    cost, accuracy = np.zeros(absorbing.mdp.num_rows), PathAccuracy(query.tolerance)
     solve = Subproblems(fixed_nature, joint, cost, accuracy)
     if query.cooperative:
         values = joint(absorbing, cost, query.maximize)
@@ -128,12 +128,12 @@ def _joint(
         depth=query.depth,
     )
     pair = np.where(keep, row, mdp.row_start[:-1]).astype(np.int64), chance
-    return joint_optimum(problem, Accuracy(query.tolerance), components, pair, fixed_nature)
+    return joint_optimum(problem, PathAccuracy(query.tolerance), components, pair, fixed_nature)
 
 
 def joint_optimum(
     problem: PathProblem,
-    accuracy: Accuracy,
+    accuracy: PathAccuracy,
     components: tuple[SparseEndComponents, Booleans] | None,
     pair: tuple[Integers, Floats],
     fixed_nature: MDPSolver,
@@ -185,7 +185,7 @@ def _opposed(model: UncertainMDP, target: Booleans, query: Query) -> RobustValue
             first=attracting_rows(model, known.one) if up else row,
             depth=query.depth,
         )
-        bounds = enclose_paths(problem, Accuracy(query.tolerance))
+        bounds = enclose_paths(problem, PathAccuracy(query.tolerance))
         if bounds.attained is None:
             return None
         low, high = (bounds.attained, bounds.beyond) if up else (bounds.beyond, bounds.attained)

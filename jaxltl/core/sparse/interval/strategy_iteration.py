@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.interval.policy_iteration import Accuracy
+from jaxltl.core.sparse.interval.policy_iteration import PathAccuracy
 from jaxltl.core.sparse.interval.robust_values import (
     RobustValues,
     differences,
@@ -37,7 +37,7 @@ class Subproblems:
     fixed_nature: MDPSolver  # the optimum of an MDP, from rewards of rows and whether it is maximal
     joint: JointSolver  # the joint optimum of an uncertain MDP
     cost: Floats  # float64[R], rewards of the rows
-    accuracy: Accuracy  # requested width
+    accuracy: PathAccuracy  # requested width
 
 
 def under_nature(

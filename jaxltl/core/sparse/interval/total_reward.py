@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
-from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem
+from jaxltl.core.sparse.interval.policy_iteration import PathAccuracy, PathProblem
 from jaxltl.core.sparse.interval.qualitative import (
     almost_sure_states,
     attracting_rows,
@@ -76,7 +76,7 @@ def _total_reward(
         both = replace(query, maximize=maximize, nature_maximizes=maximize)
         return _joint(some, earned, ends, both, fixed_nature)
 
-    solve = Subproblems(fixed_nature, joint, cost, Accuracy(query.tolerance, relative=True))
+    solve = Subproblems(fixed_nature, joint, cost, PathAccuracy(query.tolerance, relative=True))
     if query.cooperative:
         values = joint(part, cost, query.maximize)
     else:
@@ -118,7 +118,7 @@ def _joint(
         may_stay=not up,
     )
     pair = mdp.row_start[:-1].astype(np.int64), mdp.probability
-    accuracy = Accuracy(query.tolerance, relative=True)
+    accuracy = PathAccuracy(query.tolerance, relative=True)
     return joint_optimum(problem, accuracy, components, pair, fixed_nature)
 
 

@@ -21,7 +21,7 @@ from jaxltl.core.models.ops.operators import induced_chain
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.discounted.discounted import expected_reward
+from jaxltl.core.values.discounted.compiled import expected_reward
 from jaxltl.core.values.engine.validated import validated
 
 

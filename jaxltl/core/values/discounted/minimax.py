@@ -20,7 +20,7 @@ from jaxltl.core import validation
 from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.compiled import compiled_form, flatten_policy, reshape_solution
+from jaxltl.core.models.compiled import compiled_form, compiled_policy, reshape_solution
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import jit, namespace, to_jax
 from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices
@@ -35,7 +35,8 @@ from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, require_shape, status_code
-from jaxltl.core.values.discounted.discounted import best_action, expected_reward
+from jaxltl.core.values.discounted.compiled import best_action, expected_reward
+from jaxltl.core.values.door.question import Accuracy, DiscountedReward, Question
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import (
     RelativeEnclosure,
@@ -44,6 +45,7 @@ from jaxltl.core.values.engine.certificates import (
     refuse,
     rounding_unit,
 )
+from jaxltl.core.values.engine.host_solution import negated
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System
@@ -127,6 +129,27 @@ def minimax_value(
     )
 
 
+def discounted_game(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Discounted rewards of traced games; a minimum is that of the negated reward."""
+    path, game = question.path, as_game(model)
+    assert isinstance(path, DiscountedReward)
+    if question.environment == "cooperative":
+        if question.policy is not None:
+            raise ValueError(
+                "environment='cooperative' with a policy is answered for concrete games; call it outside jit."
+            )
+        game = replace(game, system=jnp.ones_like(game.system))
+    sign = 1 if question.objective == "max" or question.policy is not None else -1
+    reward = path.reward if sign > 0 else jax.tree.map(jnp.negative, path.reward)
+    given = game, reward, path.discount
+    if question.policy is None:
+        found = minimax_value(*given, tolerance=accuracy.tolerance)
+    else:
+        game, *rest = given
+        found = strategy_value(game, question.policy, *rest, tolerance=accuracy.tolerance)
+    return found if sign > 0 else negated(found)
+
+
 @validated(games=True, per=_PER, method=_METHODS)
 def strategy_value(
     game: Model,
@@ -177,16 +200,19 @@ def strategy_value(
     if isinstance(environment, str):
         validation.choice("environment", environment, ("adversarial",))
         environment = None
-    strategy, environment = (flatten_policy(game_model.mdp, x) for x in (strategy, environment))
+    own = game_model.system
+    strategy = compiled_policy(game_model, strategy, own)
     policies = [("strategy", strategy, form.system)]
     if environment is not None:
+        environment = compiled_policy(game_model, environment, ~own)
         policies.append(("environment", environment, ~form.system))
     for name, policy, states in policies:
         kind, shape = "stochastic", choice_shape(form)
         if is_deterministic(policy):
             kind, shape = "of integers", form.state_shape
         require_shape(f"{name} ({kind})", policy, shape)
-        require_policy(form, policy, _read(form, states))
+        if not isinstance(form.mdp, SparseMDP):  # those of sparse models are checked above
+            require_policy(form, policy, _read(form, states))
     checked = _joint(form, strategy, environment)
     graph = graph_of(form, checked)
     system, used = take(graph, (form.system, checked.used))

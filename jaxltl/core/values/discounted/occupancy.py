@@ -9,7 +9,7 @@ from jax import lax
 
 from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled import compiled_form, flatten_policy
+from jaxltl.core.models.compiled import compiled_form, compiled_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
@@ -57,8 +57,9 @@ def occupancy_measure(
       >>> [round(v, 4) for v in x[:, 0].tolist()]
       [1.0, 1.0]
     """
-    (form, _), policy = compiled_form(model), flatten_policy(model, policy)
-    require_policy(form, policy)
+    (form, _), policy = compiled_form(model), compiled_policy(model, policy)
+    if not isinstance(form, SparseMDP):  # its policy is checked above
+        require_policy(form, policy)
     if initial is not None:
         require_shape("initial", initial, model.state_shape)
     start = model.initial if initial is None else initial

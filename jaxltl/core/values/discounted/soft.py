@@ -21,7 +21,7 @@ from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
 from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.types import Solution, require_shape, status_code
-from jaxltl.core.values.discounted.discounted import (
+from jaxltl.core.values.discounted.compiled import (
     action_value,
     expected_reward,
     gains,

@@ -1,26 +1,23 @@
-"""Solutions of the sparse engine: enclosures as `Solution`, induced chains, discounted values."""
+"""Solutions of the engine on rows, complements of events, and chains of policies."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax import lax
 
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.compiled import is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
-from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
-from jaxltl.core.models.protocols import ActionModel, Array, Model
-from jaxltl.core.models.sparse import SparseMDP, reward_structure
+from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers.discounted import discounted_value
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
-from jaxltl.core.types import Solution, Status, row_tolerance
-from jaxltl.core.values.engine.state_quantities import clipped, discounted_span, finite_reward
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.engine.row_form import RowForm, row_form
 
 
 def status_between(
@@ -38,44 +35,78 @@ def status_between(
 
 
 def solution_from_enclosure(
-    model: Model,
-    sparse: SparseMDP | None,
-    enclosure: Enclosure,
-    tolerance: float,
-    *,
-    relative: bool,
+    form: RowForm, enclosure: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
     """A solution in the shapes and precision of a model, with bounds rounded outwards."""
-    value, low, high, policy = enclosure.value, enclosure.lower, enclosure.upper, enclosure.row
-    status = status_between(low, high, tolerance, relative=relative)
-    dtype = np.dtype(np.float64)
-    if not is_sparse(model):
-        policy = policy if sparse is None else np.asarray(sparse.action)[policy]
-        dtype, exact = np.dtype(model.dtype), low == high
-        low, high = (
-            np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
-            for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf)))
+    policy = form.actions(enclosure.row)
+    if form.is_padded:
+        highest = math.inf if relative else 1.0
+        return padded_solution(form.lazy, enclosure, policy, tolerance, highest, relative=relative)
+    value, low, high = (
+        x.reshape(form.shape) for x in (enclosure.value, enclosure.lower, enclosure.upper)
+    )
+    return _solution(enclosure, (value, low, high), policy, tolerance, relative)
+
+
+def padded_solution(
+    model: Model,
+    enclosure: Enclosure,
+    policy: np.ndarray,
+    tolerance: float,
+    highest: float = 1.0,
+    *,
+    relative: bool = False,
+) -> Solution:
+    """A solution of at least 0 in the precision of a padded model, as JAX arrays."""
+    dtype, exact = np.dtype(model.dtype), enclosure.lower == enclosure.upper
+    low, high = (
+        np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
+        for x, end in (
+            (enclosure.lower, dtype.type(-np.inf)),
+            (enclosure.upper, dtype.type(np.inf)),
         )
-        # XLA flushes subnormal numbers to zero.
-        tiny = np.finfo(dtype).tiny
-        low = np.where(low < tiny, 0, low).astype(dtype)
-        high = np.where(high > 0, np.maximum(high, tiny), high).astype(dtype)
-        high = high if relative else np.minimum(high, 1)
-        value = np.clip(value.astype(dtype), low, high)
-    parts: list[Array] = [
-        *(x.reshape(model.state_shape) for x in (value, policy.astype(np.int32), low, high)),
-        np.asarray(enclosure.residual, dtype)[()],
-        np.int32(enclosure.rounds),
-        np.int32(status),
-    ]
-    solution = Solution(*(parts if is_sparse(model) else to_jax(parts)))
-    return replace(solution, method=enclosure.method)
+    )
+    # XLA flushes subnormal numbers to zero.
+    tiny = np.finfo(dtype).tiny
+    low = np.where(low < tiny, 0, low).astype(dtype)
+    high = np.where(high > 0, np.maximum(high, tiny), high).astype(dtype)
+    high = np.minimum(high, dtype.type(highest))
+    value = np.clip(enclosure.value.astype(dtype), low, high)
+    ends = tuple(x.reshape(model.state_shape) for x in (value, low, high))
+    policy = policy.reshape(model.state_shape)
+    return to_jax(_solution(enclosure, ends, policy, tolerance, relative))
+
+
+def _solution(
+    enclosure: Enclosure,
+    ends: tuple[np.ndarray, ...],
+    policy: np.ndarray,
+    tolerance: float,
+    relative: bool,
+) -> Solution:
+    value, low, high = ends
+    status = status_between(enclosure.lower, enclosure.upper, float(tolerance), relative=relative)
+    parts: dict[str, Array] = {
+        "value": value,
+        "policy": policy.astype(np.int32),
+        "lower": low,
+        "upper": high,
+        "residual": np.asarray(enclosure.residual, value.dtype)[()],
+        "num_steps": np.int32(enclosure.rounds),
+        "status": np.int32(status),
+    }
+    return Solution(**parts, method=enclosure.method)
 
 
 def complement_event(solution: Solution) -> Solution:
     """The solution of the complementary event, with bounds rounded outwards."""
     value, lower, upper = complement(solution.value, solution.lower, solution.upper)
     return replace(solution, value=value, lower=lower, upper=upper)
+
+
+def negated(solution: Solution) -> Solution:
+    """The solution of the negated quantity."""
+    return replace(solution, value=-solution.value, lower=-solution.upper, upper=-solution.lower)
 
 
 def complement(
@@ -118,10 +149,14 @@ class PolicyChain(NamedTuple):
         return np.add.reduceat(taken, row_start[:-1])
 
 
-def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> PolicyChain:
-    """Markov chain induced by a policy."""
-    host = sparse.host
-    weight = policy_weights(model, sparse, policy, by_rows=is_sparse(model))
+def induced_chain(model: Model, policy: Array) -> PolicyChain:
+    """Markov chain induced by a policy in a concrete model, over flat states."""
+    form = row_form(model)
+    return policy_chain(form.host, form.weights(policy))
+
+
+def policy_chain(host: HostMDP, weight: np.ndarray) -> PolicyChain:
+    """Markov chain of checked weights of rows ``float64[R]``."""
     total = host.over_choices(np.add, weight)
     from scipy.sparse import csr_array
 
@@ -140,29 +175,6 @@ def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> PolicyChain
     return PolicyChain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
 
-def policy_weights(
-    model: Model, sparse: SparseMDP, policy: Array, *, by_rows: bool, where: Array = True
-) -> np.ndarray:
-    """A policy of some states as checked weights of rows, ``float64[R]``."""
-    policy = np.asarray(policy)
-    if by_rows:
-        flat = policy.ravel() if policy.shape == model.state_shape else policy
-        return row_weights(sparse, flat, where)
-    num_actions = cast(ActionModel, model).num_actions
-    actions = (*model.state_shape, num_actions)
-    if is_deterministic(policy) and policy.shape == actions[:-1]:
-        policy = np.eye(num_actions)[policy]
-    if policy.shape != actions:
-        raise ValueError(
-            f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
-            f"or {actions} of their probabilities."
-        )
-    flat = policy.reshape(sparse.num_states, -1).astype(np.float64)
-    weight: np.ndarray = flat[sparse.host.state, np.asarray(sparse.action)]
-    require_weights(sparse.host, weight, row_tolerance(np.float64), where)
-    return weight
-
-
 def with_given_policy(solution: Solution, policy: Array) -> Solution:
     """A solution with the policy that was evaluated, if one was given."""
     if policy is None:
@@ -170,33 +182,6 @@ def with_given_policy(solution: Solution, policy: Array) -> Solution:
     table = np.asarray(policy)
     weight: Array = table.astype(np.int32) if is_deterministic(table) else table.copy()
     return replace(solution, policy=weight)
-
-
-def discounted(
-    model: Model,
-    reward: Array | str,
-    discount: Array,
-    *,
-    policy: Array | None = None,
-    tolerance: Array | None = None,
-) -> Solution:
-    """Discounted values of a sparse model; arguments as of the functions for padded ones."""
-    sparse = to_sparse(model)
-    earned, magnitude = finite_reward(sparse, reward)
-    host, depth = sparse.host, 0
-    largest = float(np.abs(earned).max()) / (1 - float(discount))
-    requested = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
-    if policy is not None:
-        chain = induced_chain(model, sparse, policy)
-        earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
-        host, depth = chain.mdp, chain.depth
-    enclosure = discounted_value(
-        host, earned, magnitude, float(discount), tolerance=requested, depth=depth
-    )
-    solution = solution_from_enclosure(model, sparse, enclosure, requested, relative=False)
-    span = discounted_span(reward_structure(sparse, reward), float(discount))
-    solution = clipped(solution, span) if is_sparse(model) else solution
-    return with_given_policy(solution, policy)
 
 
 def default_tolerance(model: Model | jax.Array) -> float:

@@ -12,7 +12,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.models.protocols import Array, Model, SuccessorModel, base_model
+from jaxltl.core.models.action_numbers import row_actions
+from jaxltl.core.models.protocols import ActionModel, Array, Model, SuccessorModel, base_model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
@@ -44,22 +45,39 @@ def state_mask(model: SparseMDP, states: Array | str, name: str) -> np.ndarray:
 
 
 def row_reward(model: Model, sparse: SparseMDP, reward: Reward) -> Reward:
-    """A reward ``[S]``, ``[S, A]`` or ``[S, A, K]`` of a padded model, expected on rows of its sparse form."""
-    if isinstance(base_model(model), SparseMDP) or isinstance(reward, str | Rewards | None):
+    """A reward of states, actions ``[S, A]`` or padded transitions ``[S, A, K]``, on the model's rows.
+
+    Names and structures, and arrays in the order of the rows, are returned as they are.
+    """
+    if isinstance(reward, str | Rewards | None):
         return reward
-    earned = validation.float_array("reward", reward)
-    if earned.shape == model.state_shape:
+    earned, shape = validation.float_array("reward", reward), model.state_shape
+    if earned.shape == shape:
         return Rewards(state=earned.ravel())
-    padded = cast(SuccessorModel, model)
-    actions = (*model.state_shape, padded.num_actions)
-    if earned.shape == (*actions, padded.num_successors):
-        weight = np.asarray(padded.successor_probability, np.float64)
-        earned = (weight * np.where(weight > 0, earned, 0)).sum(-1)
-    if earned.shape in ((sparse.num_rows,), (sparse.num_transitions,)):
-        return earned
-    require_shape("reward", earned, actions)
-    pairs = earned.reshape(sparse.num_states, -1)
-    return Rewards(choice=pairs[sparse.host.state, np.asarray(sparse.action)])
+    by_rows = hasattr(base_model(model), "rewards")
+    if earned.shape[:-1] == shape and earned.shape not in ((sparse.num_rows,),):
+        number = row_actions(sparse)
+        if by_rows and earned.shape[-1] <= number.max():
+            raise ValueError(
+                f"reward has shape {earned.shape}, and actions are 0 to {number.max()}; give one number "
+                "for each of them."
+            )
+        if not by_rows:
+            require_shape("reward", earned, (*shape, cast(ActionModel, model).num_actions))
+        pairs = earned.reshape(sparse.num_states, -1)
+        return Rewards(choice=pairs[sparse.host.state, number])
+    if not by_rows:
+        padded = cast(SuccessorModel, model)
+        actions = (*shape, padded.num_actions)
+        if earned.shape == (*actions, padded.num_successors):
+            weight = np.asarray(padded.successor_probability, np.float64)
+            pairs = (
+                (weight * np.where(weight > 0, earned, 0)).sum(-1).reshape(sparse.num_states, -1)
+            )
+            return Rewards(choice=pairs[sparse.host.state, row_actions(sparse)])
+        if earned.shape not in ((sparse.num_rows,), (sparse.num_transitions,)):
+            require_shape("reward", earned, actions)
+    return earned
 
 
 def state_reward(model: SparseMDP, reward: Reward) -> np.ndarray:

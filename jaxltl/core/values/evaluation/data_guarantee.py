@@ -25,7 +25,7 @@ from jaxltl.core.types import require_shape
 from jaxltl.core import validation
 from jaxltl.core.validation import first_true
 from jaxltl.core.models.protocols import RowModel
-from jaxltl.core.values.interval.robust import require_objective
+from jaxltl.core.values.interval.sides import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction

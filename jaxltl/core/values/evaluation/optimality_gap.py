@@ -30,9 +30,12 @@ from jaxltl.core.sparse.bounded.step_bounded import until
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.types import Solution
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     at_states,
-    product_satisfaction,
 )
 from jaxltl.core.values.engine.state_quantities import PROBABILITY, safe_mean, solution_from_error
 
@@ -332,8 +335,8 @@ def _unbounded(
         np.minimum.reduceat(mass, base.host.row_start[:-1], axis=0),
         lambda at: (int(at[0]), int(at[1])),
     )
-    own = product_satisfaction(model, policy=mass / total[base.host.state])
-    best = product_satisfaction(model)
+    own = satisfaction_probability(model, mass / total[base.host.state])
+    best = optimal_satisfaction(model)
     at: Array = start, np.asarray(model.initial_memory)[start]
     return at_states(own, at), at_states(best, at)
 

@@ -9,16 +9,14 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import FormulaLike
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.sparse.interval.game_encoding import choices_as_nature
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.parity import parity_against_nature
 from jaxltl.core.sparse.interval.qualitative import joint_accepting_region
@@ -27,13 +25,16 @@ from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
-from jaxltl.core.types import Solution, require_shape, row_tolerance
-from jaxltl.core.values.interval.robust import (
+from jaxltl.core.types import Solution
+from jaxltl.core.values.door.question import Accuracy, Question
+from jaxltl.core.values.engine.host_solution import status_between, with_given_policy
+from jaxltl.core.values.engine.row_form import row_form
+from jaxltl.core.values.interval.sides import (
+    TOLERANCE,
     Sides,
-    host_sides,
-    solution_at,
+    directions,
     requested_width,
-    world_of,
+    sides_of,
 )
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
@@ -65,63 +66,59 @@ def robust_satisfaction(
     tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
     """Robust satisfaction probability of a formula in an interval MDP; labels are read on exit."""
-    world, system = world_of(model)
-    requested = requested_width(tolerance)
+    form, aims = row_form(model), directions(objective, nature)
+    world, requested = form.uncertain, requested_width(tolerance)
     automaton, letter = automaton_and_letters(world.nominal, formula)
     states = starting_states(world, states)
     start = states, np.broadcast_to(automaton.initial, states.shape)
     product, host, verdicts = _product(
         world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
-    moves = None if system is None else system[product.base_state]
-    values = _solved(host_sides(host, moves, objective, nature), host, verdicts, requested)
+    system = None if form.system is None else form.system[product.base_state]
+    values = _solved(sides_of(host, system, aims), host, verdicts, requested)
     row = product.base_row[values.row].astype(np.int32)
-    solution = solution_at(values, product.start, product.start.shape, row, requested)
+    solution = _solution_at(values, product.start, product.start.shape, requested)
+    solution = replace(solution, policy=row)
     return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")
 
 
-@validated(host=True)
-def robust_product_satisfaction(
-    model: Product,
-    *,
-    policy: Array | None = None,
-    objective: str = "max",
-    nature: str | None = None,
-    tolerance: jax.Array | float | None = None,
-) -> Solution:
-    """Robust satisfaction probability from all states of a product of an interval MDP."""
-    if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
+def accept_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Probability of acceptance from all states of a product of an interval model, or of a game."""
+    form, policy = row_form(model), question.policy
+    lazy = form.lazy
+    assert isinstance(lazy, Product)
+    if lazy.allowed is not None:
         raise ValueError(
-            f"{type(model).__name__} is no product of an interval model; give "
-            "product(model, formula)."
-        )
-    if model.allowed is not None:
-        raise ValueError(
-            "a product of an interval model takes no mask of actions; restrict the "
+            "a product of a game or an interval model takes no mask of actions; restrict the "
             "world by with_allowed(world, rows)."
         )
-    requested = requested_width(tolerance)
-    shape = model.state_shape
+    requested, shape = accuracy.width(TOLERANCE), form.shape
+    world = row_form(form.world).uncertain
     state, memory = (x.ravel() for x in np.indices(shape))
     product, host, verdicts = _product(
-        model.mdp,
-        model.automaton,
-        np.asarray(model.letter),
+        world,
+        lazy.automaton,
+        np.asarray(lazy.letter),
         (state, memory),
-        on_entry=model.label_on == "entry",
+        on_entry=lazy.label_on == "entry",
         is_absorbing=False,
     )
-    sides = host_sides(host, None, objective, nature)
-    if policy is not None:
-        sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
-    values = _solved(sides, host, verdicts, requested)
-    if policy is not None:
-        solution = solution_at(values, product.start, shape, np.asarray(policy), requested)
-        result: Solution = solution.replace(nature=None)  # type: ignore[attr-defined]
-        return result
-    policy = product.base_row[values.row[product.start]].astype(np.int32).reshape(shape)
-    values = replace(values, probability=values.probability[: product.host.num_transitions])
-    return solution_at(values, product.start, shape, policy, requested)
+    aims = directions(question.objective, question.nature, question.environment)
+    weights, system = None if policy is None else form.weights(policy), form.system
+    # The states that read priorities on entry have one choice.
+    if system is not None:
+        system = np.append(system, np.ones(host.mdp.num_states - system.size, bool))
+    if weights is not None:
+        weights = np.append(weights, np.ones(host.mdp.num_rows - weights.size))
+    values = _solved(sides_of(host, system, aims, weights), host, verdicts, requested)
+    solution = _solution_at(values, product.start, shape, requested)
+    parts: dict[str, Array] = {"nature": None}
+    if policy is None:
+        row = product.base_row[values.row[product.start]]
+        parts["policy"] = row_actions(world.nominal)[row].astype(np.int32).reshape(shape)
+        if form.interval is not None:
+            parts["nature"] = values.probability[: product.host.num_transitions]
+    return with_given_policy(replace(solution, **parts), policy)
 
 
 def _product(
@@ -203,26 +200,25 @@ def _uncertain(model: IntervalMDP, product: SparseProduct) -> tuple[SparseProduc
     return product._replace(host=host), UncertainMDP(host, lower, upper, ball)
 
 
-def _fixed(
-    model: Product, product: SparseProduct, host: UncertainMDP, policy: np.ndarray, helpful: bool
-) -> Sides:
-    """The product under a finite-memory policy."""
-    world: IntervalMDP = model.mdp
-    mine = product.host.state
-    memory = product.memory[mine]
-    if is_deterministic(policy):
-        require_shape("policy", policy, model.state_shape)
-        taken = policy[product.base_state[mine], memory] == product.base_row
-        weight = taken.astype(np.float64)
-    else:
-        require_shape("policy", policy, (world.num_rows, model.num_memory))
-        weight = policy[product.base_row, memory].astype(np.float64)
-    weight = np.append(weight, np.ones(host.mdp.num_rows - weight.size))  # where nobody chooses
-    dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
-    require_weights(host.mdp, weight, row_tolerance(dtype))
-    weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
-    encoded = choices_as_nature(host, np.ones(host.mdp.num_states, bool), weight, weight)
-    return Sides(helpful, helpful, encoded, policy)
+def _solution_at(
+    values: RobustValues, states: Integers, shape: tuple[int, ...], tolerance: float
+) -> Solution:
+    """The :class:`Solution` at some states, in a shape, without a policy."""
+    value, low, high = (
+        x[states].reshape(shape) for x in (values.value, values.lower, values.upper)
+    )
+    status = status_between(low, high, float(tolerance), relative=False)
+    parts: dict[str, Array] = {
+        "value": value,
+        "policy": np.zeros(shape, np.int32),
+        "nature": values.probability,
+        "lower": low,
+        "upper": high,
+        "residual": np.float64(values.residual),
+        "num_steps": np.int32(values.rounds),
+        "status": np.int32(status),
+    }
+    return Solution(**parts, method=values.method)
 
 
 def _solved(

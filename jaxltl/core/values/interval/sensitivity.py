@@ -18,8 +18,9 @@ from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.values.interval.robust import nature_direction
-from jaxltl.core.values.engine.state_quantities import state_mask
+from jaxltl.core.values.interval.sides import nature_direction
+from jaxltl.core.models.action_numbers import rows_of_policy
+from jaxltl.core.values.engine.row_form import row_form
 
 
 @brief
@@ -59,7 +60,7 @@ def robust_sensitivity(
 
     Args:
       model: the model.
-      solution: of :func:`robust_reachability` or :func:`robust_total_reward`.
+      solution: of :func:`reachability_probability` or :func:`total_reward`.
       target, objective, nature, stay: the arguments of that solution.
       initial: ``float[S]``, weights of the states; default the initial distribution.
 
@@ -73,11 +74,11 @@ def robust_sensitivity(
 
     Example:
       >>> from jaxltl import make_interval, make_sparse
-      >>> from jaxltl.core.values import robust_reachability
+      >>> from jaxltl import reachability_probability
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> goal = [False, True, False]
-      >>> found = robust_reachability(model, goal, nature="adversarial")
+      >>> found = reachability_probability(model, goal, nature="adversarial")
       >>> change = robust_sensitivity(model, found, goal, nature="adversarial", initial=[1, 0, 0])
       >>> change.lower.tolist(), change.upper.tolist()
       ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
@@ -89,8 +90,9 @@ def robust_sensitivity(
             f"solution is {validation.shorten(solution)}; give what a solver of interval models "
             "returned, reachability_probability, say."
         )
-    goal = state_mask(model.nominal, target, "target")
-    passed = np.ones(goal.size, bool) if stay is None else state_mask(model.nominal, stay, "stay")
+    form = row_form(model)
+    goal = form.states("target", target)
+    passed = np.ones(goal.size, bool) if stay is None else form.states("stay", stay)
     weight = validation.float_array("initial", model.initial if initial is None else initial)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:
@@ -100,9 +102,10 @@ def robust_sensitivity(
         )
     if policy.shape != goal.shape or not is_deterministic(policy):
         raise ValueError(
-            "the solution's policy is no row for each state; weights have no single "
+            "the solution's policy is no action for each state; weights have no single "
             "order of successors."
         )
+    policy = rows_of_policy(model.nominal, policy)
     if not np.isfinite(value[weight > 0]).all():
         raise ValueError(
             "the value from an initial state is infinite, which no end changes a little."

@@ -109,7 +109,7 @@ class FrontSearch:
     def _evaluate(self, weight: np.ndarray, home: np.ndarray) -> np.ndarray:
         """Values of a policy and their bounds, all maximised: ``float64[3, n]``."""
         problem, sparse = self.problem, sparse_mdp_of_product(self.product)
-        chain = induced_chain(sparse, sparse, weight)
+        chain = induced_chain(sparse, weight)
         inside = (weight > 0) & home[problem.mdp.state]
         component = end_components(problem.mdp, rows=inside).component
         leader = component[problem.mdp.state[inside]]

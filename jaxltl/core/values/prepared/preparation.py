@@ -11,20 +11,20 @@ from jaxltl.core import validation
 from jaxltl.core import struct
 
 from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.refusals import of_one_player
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model, PyTree
-from jaxltl.core.models.sparse import Rewards, refuse_underflow
+from jaxltl.core.models.sparse import Rewards, SparseMDP, refuse_underflow
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
 from jaxltl.core.types import require_states
 from jaxltl.core.values.prepared.block_iteration import Blocks
 from jaxltl.core.values.engine.state_quantities import nonnegative_reward
-from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.interval.sides import refuse_nature
 from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval
 
 
@@ -43,6 +43,7 @@ class Prepared:
       own: ``int32[S]``, the place from which a state takes its row, or -1.
       row: ``int32[S]``, the row that it takes else.
       entry_row, row_state: ``int32[T]`` and ``int32[R]``, row of a transition, state of a row.
+      action: ``int32[R]``, the action number of a row.
       probability, reward: ``float[T]`` and ``float[R]``, as they were.
       loops: self-loops: entries, groups, rows, groups of these; or None.
       cycles: end components that are one node, or None.
@@ -66,6 +67,7 @@ class Prepared:
     row: jax.Array
     entry_row: jax.Array
     row_state: jax.Array
+    action: jax.Array
     probability: jax.Array
     reward: jax.Array | None
     loops: tuple[jax.Array, ...] | None
@@ -116,7 +118,7 @@ def prepare(
       stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of
         reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
-      policy: of an IntervalMDP, rows ``int32[S]`` to be evaluated; default: optimise.
+      policy: of an IntervalMDP, actions ``int32[S]`` to be evaluated; default: optimise.
       objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
       nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
 
@@ -180,11 +182,12 @@ def prepare(
         plan = plan_optimum(
             reduce_total_reward(host, cost, target, maximize=objective == "max", kept=earning), cost
         )
-    return _prepared(host, plan, cost, objective)
+    return _prepared(sparse, plan, cost, objective)
 
 
-def _prepared(host: HostMDP, plan: Plan, cost: np.ndarray | None, objective: str) -> Prepared:
+def _prepared(sparse: SparseMDP, plan: Plan, cost: np.ndarray | None, objective: str) -> Prepared:
     """The arrays of a plan; solves fill in the weights of its blocks."""
+    host = sparse.host
     dtype = jnp.zeros(()).dtype
     refuse_underflow(host.row_start, host.entry_start, host.probability, dtype)
     nothing = host.num_transitions + host.num_rows + 1
@@ -204,6 +207,7 @@ def _prepared(host: HostMDP, plan: Plan, cost: np.ndarray | None, objective: str
         "row": plan.row,
         "entry_row": host.row.astype(np.int32),
         "row_state": host.state.astype(np.int32),
+        "action": row_actions(sparse).astype(np.int32),
         "probability": host.probability.astype(dtype),
         "reward": None if cost is None else cost.astype(dtype),
         "loops": loops,

@@ -69,7 +69,7 @@ def solve_prepared(
       lower, upper: ``float[T]``, of a prepared IntervalMDP in place of probabilities.
       reward: ``float[R]``, finite, at least 0, and 0 where it was; for a minimum also positive where
         it was. Only if a reward was prepared.
-      policy: rows ``int32[S]`` or weights ``float[R]``, if it was prepared for policies; a chain
+      policy: actions ``int32[S]`` or weights of rows ``float[R]``, if it was prepared for policies; a chain
         needs none.
       tolerance: width of the enclosure, for rewards relative to the value; default 1e-6 in double
         precision, 1e-3 in single.
@@ -77,7 +77,7 @@ def solve_prepared(
 
     Returns:
       :class:`Solution`; `value` ``float[S]``, exact where the graph decides, `policy` ``int32[S]``,
-      rows that attain the bound on the safe side, or the given policy. The status is ``INVALID``
+      actions that attain the bound on the safe side, or the given policy. The status is ``INVALID``
       for invalid numbers and ``NONFINITE`` for NaN or infinite ones. Differentiable, forward and
       reverse, in the probabilities, the rewards and the weights of a policy, along distributions;
       of an optimum with its policy held fixed.
@@ -178,7 +178,7 @@ def _policy_rows(prepared: Prepared, policy: _Maybe) -> _PolicyRows:
     policy = jnp.ones(prepared.num_rows, dtype) if policy is None else policy
     weight = policy
     if is_deterministic(policy):
-        weight = policy[state] == jnp.arange(prepared.num_rows, dtype=jnp.int32)
+        weight = policy[state] == prepared.action
     weight = weight.astype(dtype)
     total = jax.ops.segment_sum(weight, state, prepared.num_states, indices_are_sorted=True)
     valid = jnp.all(jnp.abs(total - 1) <= row_tolerance(dtype)) & jnp.all(weight >= 0)
@@ -509,11 +509,13 @@ def _policy(prepared: Prepared, enclosure: _Enclosed) -> jax.Array:
     """An optimal policy, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
     if enclosure.rank is None or not names.shape[0]:
-        return prepared.row
+        return prepared.action[prepared.row]
     chosen = chosen_names(names, enclosure.rank, prepared.choices)
     own = prepared.own
     rows = jnp.where(own >= 0, chosen[jnp.maximum(own, 0)], prepared.row)
-    return rows if prepared.cycles is None else _towards_exits(prepared, prepared.cycles, rows)
+    if prepared.cycles is not None:
+        rows = _towards_exits(prepared, prepared.cycles, rows)
+    return prepared.action[rows]
 
 
 def _towards_exits(prepared: Prepared, cycles: tuple[jax.Array, ...], rows: jax.Array) -> jax.Array:

@@ -15,7 +15,8 @@ from jax import lax
 
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.ops.array_namespace import jit, is_traced, to_jax
-from jaxltl.core.models.ops.operators import is_deterministic, row_weights
+from jaxltl.core.models.action_numbers import row_actions, rows_of_policy
+from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
@@ -40,7 +41,9 @@ from jaxltl.core.values.interval.robust_policy_iteration import (
     leaving,
     rounding,
 )
-from jaxltl.core.values.interval.robust import interval_reward, nature_direction
+from jaxltl.core.values.door.row_engines import certain_reward
+from jaxltl.core.values.engine.row_form import row_form
+from jaxltl.core.values.interval.sides import nature_direction
 from jaxltl.core.values.engine.state_quantities import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
@@ -61,7 +64,7 @@ class PreparedInterval:
       first: ``int32[N]``, a row that leaves the node.
       node: ``int32[S]``, of each state.
       policy: ``int32[S]``, rows of states that are no nodes, or of all if a policy was given.
-      entry_row: ``int32[T]``, the row of each entry.
+      entry_row, action: ``int32[T]`` and ``int32[R]``, the row of each entry, the action of each row.
       within: ``bool[T]``, entries to which nature keeps where values are known.
       answers: invariants of the preprocessing: entries, questions, their rows, answers.
       lower, upper, reward: ``float[T]``, ``float[T]``, ``float[R]``, as they were.
@@ -87,6 +90,7 @@ class PreparedInterval:
     node: Array
     policy: Array
     entry_row: Array
+    action: Array
     within: Array
     answers: Array
     lower: Array
@@ -131,18 +135,17 @@ def prepare_interval(
     host: UncertainMDP = model.host
     entry: Array = np.arange(model.num_transitions)
     if policy is not None:
-        policy = np.asarray(policy)
         if not is_deterministic(policy):
             raise ValueError(
-                "prepare_interval takes a policy of rows, int[S]; weights are for "
+                "prepare takes a policy of actions, int[S], of an interval model; weights are for "
                 "the host's solvers."
             )
-        row_weights(model.nominal, policy)  # checks it
+        policy = rows_of_policy(model.nominal, policy)
         host, entry = host.under_policy(policy)
     up, large = objective == "max", direction == "max"
     if policy is not None:
         up = large  # without choices, the policy has the objective of nature
-    cost = None if reward is None else interval_reward(model, reward)
+    cost = None if reward is None else certain_reward(row_form(model), reward)
     if cost is None:
         plan = plan_reachability(host, target, stay, Query(up, large))
     else:
@@ -198,6 +201,7 @@ def _prepared(
         node=node.astype(np.int32),
         policy=origin[plan.row].astype(np.int32),
         entry_row=whole.row.astype(np.int32),
+        action=row_actions(model.nominal).astype(np.int32),
         within=inside,
         answers=(
             entry[answers.entry].astype(np.int32),
@@ -391,7 +395,7 @@ def _answer(
     chance = chance.at[prepared.table].set(bounds.probability, mode="drop")
     return Solution(
         value=everywhere(value, jnp.nan),
-        policy=row,
+        policy=prepared.action[row],
         nature=lax.stop_gradient(chance),
         lower=everywhere(low, -jnp.inf),
         upper=everywhere(high, jnp.inf),

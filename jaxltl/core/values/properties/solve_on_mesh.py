@@ -35,7 +35,7 @@ Bounds = tuple[jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
-class Question:
+class MeshProperty:
     """A property of a sharded model, with its solver."""
 
     prop: Property
@@ -74,7 +74,7 @@ class Question:
         )
 
 
-def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
+def question_on_mesh(model: ShardedMDP, prop: Property) -> MeshProperty:
     """Solver of a property of a model on a mesh of devices."""
     path = _path(prop)
     if prop.definitions or prop.aggregate is not None:
@@ -111,7 +111,7 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     def taken(quantity: jax.Array) -> np.ndarray:
         return np.asarray(on_host(_pick(model, quantity, *index)), np.float64)
 
-    return Question(prop, states, shape, advance, taken)
+    return MeshProperty(prop, states, shape, advance, taken)
 
 
 def _path(prop: Property) -> Formula:
@@ -143,7 +143,7 @@ def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
     return model.rewards[name]
 
 
-def first_bounds(model: ShardedMDP, question: Question) -> Bounds:
+def first_bounds(model: ShardedMDP, question: MeshProperty) -> Bounds:
     """Those that any probability has, where the model's values are."""
 
     def full(number: jax.Array) -> jax.Array:

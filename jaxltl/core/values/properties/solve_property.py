@@ -17,6 +17,7 @@ from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula, TRUE
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
+from jaxltl.core.models.action_numbers import rows_of_policy
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Array
@@ -27,7 +28,7 @@ from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.values.interval.robust import requested_width
+from jaxltl.core.values.interval.sides import requested_width
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
@@ -43,10 +44,8 @@ from jaxltl.core.values.properties.several_objectives import solve_multi_objecti
 from jaxltl.core.values.properties.exact_thresholds import exact_values, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
-from jaxltl.core.values.undiscounted.reachability import (
-    avoidance_probability,
-    reachability_probability,
-)
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.reaching import avoidance_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import at_states, starting_states
 from jaxltl.core.values.undiscounted.total_reward import total_reward
@@ -439,7 +438,8 @@ class _ModelQuery(NamedTuple):
     def result(self, solution: Solution, by: str = "") -> _Result:
         """A solution at all states, at those that are asked for."""
         nature = None if solution.nature is None else np.asarray(solution.nature)
-        strategy = PropertyStrategy(np.asarray(solution.policy), by, nature=nature)
+        rows = rows_of_policy(_graph(self.model), solution.policy)
+        strategy = PropertyStrategy(rows, by, nature=nature)
         return _Result(at_states(solution, self.states), strategy)
 
     def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
@@ -457,7 +457,7 @@ class _ModelQuery(NamedTuple):
             case "X":
                 target = self.where(right)
                 solution = bounded.next_probability(self.model, target, **aim.directions)
-                return self.result(solution)
+                return self.result(solution, by="one step")
             case "F":
                 return self.until(TRUE, right, aim, tolerance)
             case "U":
@@ -529,7 +529,7 @@ class _ModelQuery(NamedTuple):
             return result
         if self.model.num_states > QUICK_LIMIT:
             return result
-        host, chosen = self.model.host, np.asarray(solution.policy)
+        host, chosen = self.model.host, rows_of_policy(self.model, solution.policy)
         row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
         return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 

@@ -30,15 +30,10 @@ from jaxltl.core.values.undiscounted.fastest import (
     attained_by_ties,
     conserving_rows,
 )
-from jaxltl.core.values.undiscounted.reachability import (
-    enclose,
-    on_actions,
-    rows_of_model,
-)
+from jaxltl.core.values.engine.row_form import on_actions, row_form, rows_of
+from jaxltl.core.values.undiscounted.acceptance import Reaching, as_product, as_reachability
+from jaxltl.core.values.undiscounted.reaching import enclose
 from jaxltl.core.values.undiscounted.satisfaction import (
-    Reaching,
-    as_product,
-    as_reachability,
     optimal_satisfaction,
     satisfaction_probability,
 )
@@ -175,7 +170,7 @@ def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
     sign = 1
     if objective == "min":
         pessimistic, optimistic, sign = optimistic, pessimistic, -1
-    sparse = rows_of_model(model)
+    sparse = rows_of(model)
     ahead = on_actions(sparse, sparse.host.expectation(optimistic.ravel()), model)
     # The model's probabilities may be rounded ones.
     slack = rounding_unit(model) * np.maximum(ahead, pessimistic[..., None])
@@ -188,7 +183,7 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
     # None if such a policy may stay undecided for ever.
     if problem.model.num_states > QUICK_LIMIT:
         return None
-    sparse = rows_of_model(problem.model)
+    sparse = rows_of(problem.model)
     host = sparse.host
     enclosure = enclose(host, problem.target, problem.objective, 1e-12)
     keeps = conserving_rows(host, problem.objective, enclosure)
@@ -200,7 +195,7 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
             keeps, enclosure = more, slower
     if not backward_reachable(host, decided, keeps).all():
         return None
-    bounds = solution_from_enclosure(problem.model, sparse, enclosure, np.inf, relative=False)
+    bounds = solution_from_enclosure(row_form(problem.model), enclosure, np.inf, relative=False)
     return on_actions(sparse, keeps, problem.model), bounds
 
 

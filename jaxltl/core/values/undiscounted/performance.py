@@ -40,11 +40,8 @@ from jaxltl.core.values.engine.certificates import m_matrix_error
 from jaxltl.core.values.engine.host_solution import complement
 from jaxltl.core.values.engine.implicit_diff import ChainSystem, with_derivative
 from jaxltl.core.values.engine.linear import inverse
-from jaxltl.core.values.undiscounted.satisfaction import (
-    as_product,
-    as_reachability,
-    satisfaction_probability,
-)
+from jaxltl.core.values.undiscounted.acceptance import as_product, as_reachability
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q

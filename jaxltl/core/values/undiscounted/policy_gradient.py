@@ -22,7 +22,7 @@ from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.values.engine.host_solution import induced_chain
-from jaxltl.core.values.undiscounted.reachability import on_actions, rows_of_model
+from jaxltl.core.values.engine.row_form import on_actions, rows_of
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU
@@ -61,11 +61,11 @@ class FullSupport:
 
     def probability(self, policy: np.ndarray) -> tuple[float, Floats]:
         """The probability and its derivative ``float[S, Q, A]``; NaN if they are not solved."""
-        model, sparse = self.model, rows_of_model(self.model)
+        model, sparse = self.model, rows_of(self.model)
         (value, undecided), start = self.sets, np.asarray(model.initial, float).ravel()
         visits, failed = np.zeros(value.size), (np.nan, np.full(policy.shape, np.nan))
         if undecided.any():
-            chain = induced_chain(model, sparse, policy).mdp
+            chain = induced_chain(model, policy).mdp
             try:
                 factors = transient_factors(chain, undecided)
             except RuntimeError:  # singular: rounding makes it impossible to leave

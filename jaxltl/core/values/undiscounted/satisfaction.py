@@ -2,69 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple, Unpack, overload
+from typing import overload
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from numpy.typing import ArrayLike
-from jax import lax
 
-from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core import validation
-from jaxltl.core.values.engine.validated import SolverOptions, validated
-from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.graphs.end_components import (
-    Accepting,
-    accepting_bottom_components,
-    accepting_end_components,
-)
 from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.refusals import refuse_game, refuse_traced
-from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
-from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers.shortest_path import fastest_rows, with_exits
-from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.host_solution import complement_event, is_sparse
-from jaxltl.core.values.interval.robust import refuse_nature
-from jaxltl.core.values.interval.satisfaction import (
-    robust_product_satisfaction,
-    robust_satisfaction,
-)
-from jaxltl.core.values.undiscounted.reachability import (
-    QUICK_LIMIT,
-    on_rows,
-    reachability_probability,
-    refuse_iteration,
-    relative_width,
-    row_of_action,
-    rows_of_model,
-)
-from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    Satisfaction,
-    product_satisfaction,
-    sparse_satisfaction,
-)
+from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.refusals import refuse_traced
+from jaxltl.core.types import Solution, check
+from jaxltl.core.values.door.kinds import kind_of
+from jaxltl.core.values.door.question import Acceptance, Accuracy, Question
+from jaxltl.core.values.door.table import solve
+from jaxltl.core.values.engine.host_solution import default_tolerance
+from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.interval.satisfaction import robust_satisfaction
+from jaxltl.core.values.interval.sides import refuse_nature
+from jaxltl.core.values.undiscounted.acceptance import require_product
+from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction, sparse_satisfaction
 
 
-@validated(method=("auto", "direct", "iterative"))
+@validated(games=True, method=("auto", "direct", "iterative"))
 def satisfaction_probability(
-    model: Product,
+    model: Product | Game,
     policy: jax.Array,
     *,
     nature: str | None = None,
+    environment: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
+    throw: bool = False,
 ) -> Solution:
     """Satisfaction probability of a policy, from every product state.
 
@@ -73,12 +45,13 @@ def satisfaction_probability(
     component with an even least priority.
 
     Args:
-      model: the product.
-      policy: ``float[S, Q, A]`` or ``int32[S, Q]``; for a sparse world ``float[R, Q]``, or its rows
-        ``int32[S, Q]``.
+      model: a product of any model, or a game on one.
+      policy: actions ``int32[S, Q]`` or their weights ``float[S, Q, A]``, of a game the system's;
+        for a sparse world also weights ``float[R, Q]`` of its rows.
       nature: for products of interval models only, ``"adversarial"`` (default), against the policy,
         or ``"cooperative"``.
-      method, tolerance: as in :func:`reachability_probability`.
+      environment: of games, in the same words.
+      method, tolerance, throw: as in :func:`reachability_probability`.
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the initial distribution
@@ -100,38 +73,24 @@ def satisfaction_probability(
       >>> round(float(np.sum(model.initial * found.value)), 6)
       0.75
     """
-    model = as_product(model)
-    if isinstance(model.mdp, IntervalMDP):
-        return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
-    refuse_nature(nature)
-    if is_sparse(model):
-        arguments = [("model", model), ("policy", policy), ("tolerance", tolerance)]
-        refuse_traced("satisfaction_probability", arguments)
-        return product_satisfaction(model, policy=policy, tolerance=tolerance)
-    task = model.automaton
-    if task.has_final_states:
-        target = model.final if task.is_cosafe else _not_final(model)
-    else:
-        require_policy(model, policy)
-        support = policy
-        if is_deterministic(policy):
-            support = _one_hot(policy, model.num_actions)
-        target = accepting_bottom_components(model, lax.stop_gradient(support))
-    reach = reachability_probability(
-        model, target, policy=policy, method=method, tolerance=tolerance
-    )
-    return complement_event(reach) if task.is_safety else reach
+    question = Question(Acceptance(), "max", nature, environment, policy)
+    given = None if method == "auto" else method
+    return solve(require_product(model), question, Accuracy(tolerance), throw=throw, method=given)
 
 
 @overload
 def optimal_satisfaction(
-    model: Product,
+    model: Product | Game,
     formula: None = None,
     *,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     tolerance: jax.Array | float | None = None,
-    **options: Unpack[SolverOptions],
+    relative: bool = False,
+    max_steps: jax.Array | int | None = None,
+    start: tuple[jax.Array, jax.Array] | None = None,
+    throw: bool = False,
 ) -> Solution: ...
 
 
@@ -146,6 +105,7 @@ def optimal_satisfaction(
     label_on: str | None = None,
     tolerance: float | None = None,
     relative: bool = False,
+    throw: bool = False,
 ) -> Satisfaction: ...
 
 
@@ -158,8 +118,12 @@ def optimal_satisfaction(
     nature: str | None = None,
     states: ArrayLike | None = None,
     label_on: str | None = None,
+    environment: str | None = None,
     tolerance: jax.Array | float | None = None,
-    **options: Unpack[SolverOptions],
+    relative: bool = False,
+    max_steps: jax.Array | int | None = None,
+    start: tuple[jax.Array, jax.Array] | None = None,
+    throw: bool = False,
 ) -> Solution | Satisfaction:
     """Maximal or minimal satisfaction probability of a product, or of a model and a formula.
 
@@ -184,12 +148,13 @@ def optimal_satisfaction(
       states: with `formula`, ``int[I]``, the requested states; default the initial ones.
       label_on: with `formula`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
         state's label; the probability is the same. Interval models read on exit.
-      tolerance: as for :func:`reachability_probability`.
-      max_steps, start, relative: as for :func:`reachability_probability`; the first two of a product.
+      environment: for games with a product, ``"adversarial"`` (default) or ``"cooperative"``.
+      tolerance, relative, throw: as for :func:`reachability_probability`.
+      max_steps, start: as there; of a product.
 
     Returns:
-      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, rows
-      for a sparse world. With a formula, a :class:`Satisfaction`, a finite-memory policy of rows.
+      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` actions ``int32[S, Q]``.
+      With a formula, a :class:`Satisfaction`, a finite-memory policy of rows.
       Differentiable in a product's transition probabilities, with the optimal
       policy held fixed; not for sparse and interval models, which are solved on the host.
 
@@ -205,29 +170,40 @@ def optimal_satisfaction(
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
     """
-    max_steps, start, relative = validation.options(
-        "optimal_satisfaction", options, max_steps=None, start=None, relative=False
-    )
-    if relative:
-        tolerance = relative_width(model, tolerance)
-    if formula is not None:
-        refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
-        refuse_iteration(max_steps, start)
-        if isinstance(model, Game) and isinstance(model.mdp, MDP | DenseMDP):
-            model = replace(model, mdp=to_sparse(model.mdp))
-        if isinstance(model, IntervalMDP | Game):
-            if label_on is not None:  # interval models read labels on exit
-                validation.choice("label_on", label_on, ("exit",))
-            return robust_satisfaction(
-                model,
-                formula,
-                objective=objective,
-                nature=nature,
-                states=states,
-                tolerance=tolerance,
+    if formula is None:
+        if states is not None or label_on is not None:
+            raise ValueError(
+                "states and label_on are for a model and a formula, not for a product."
             )
+        return solve(
+            require_product(model),
+            Question(Acceptance(), objective, nature, environment),
+            Accuracy(tolerance, relative),
+            throw=throw,
+            max_steps=max_steps,
+            start=start,
+        )
+    refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
+    if max_steps is not None or start is not None or environment is not None:
+        raise ValueError(
+            "max_steps, start and environment are options for a product; a model with a formula is "
+            "solved without them. Leave them out, or give product(model, formula)."
+        )
+    kind = kind_of(model)
+    if kind.container != "intervals":
         refuse_nature(nature)
-        return sparse_satisfaction(
+    if relative:
+        if kind.column != "rows":
+            raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
+        tolerance = Accuracy(tolerance, True).width(default_tolerance(model))
+    if kind.is_game or kind.container == "intervals":
+        if label_on is not None:  # interval models read labels on exit
+            validation.choice("label_on", label_on, ("exit",))
+        found = robust_satisfaction(
+            model, formula, objective=objective, nature=nature, states=states, tolerance=tolerance
+        )
+    else:
+        found = sparse_satisfaction(
             to_sparse(model),
             formula,
             objective=objective,
@@ -235,153 +211,6 @@ def optimal_satisfaction(
             label_on="entry" if label_on is None else label_on,
             tolerance=tolerance,
         )
-    refuse_game("optimal_satisfaction", [("model", model)])
-    if states is not None or label_on is not None:
-        raise ValueError("states and label_on are for a model and a formula, not for a product.")
-    model = as_product(model)
-    by_rows = objective in ("max", "min") and is_sparse(model)
-    if by_rows or isinstance(model.mdp, IntervalMDP):
-        refuse_iteration(max_steps, start)
-    if isinstance(model.mdp, IntervalMDP):
-        return robust_product_satisfaction(
-            model, objective=objective, nature=nature, tolerance=tolerance
-        )
-    refuse_nature(nature)
-    if by_rows:
-        refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
-        return product_satisfaction(model, objective=objective, tolerance=tolerance)
-    run = _over_mesh if is_sharded(model) else _optimal
-    return run(model, tolerance, max_steps, start, objective=objective)
-
-
-def _optimal(
-    model: Product,
-    tolerance: jax.Array | float | None,
-    max_steps: jax.Array | int | None,
-    start: tuple[jax.Array, jax.Array] | None,
-    *,
-    objective: str,
-) -> Solution:
-    problem, bounds = as_reachability(model, objective), start
-    if start is not None and problem.opposite:  # rounded outwards
-        eps = np.finfo(model.dtype).eps
-        start = 1 - start[1] - eps, 1 - start[0] + eps
-    solution = reachability_probability(
-        problem.model,
-        problem.target,
-        objective=problem.objective,
-        tolerance=tolerance,
-        max_steps=max_steps,
-        start=start,
-    )
-    if problem.accepting is not None:
-        xp, region, action, chosen = namespace(
-            problem.accepting.region, _visiting(problem, solution), solution.policy
-        )
-        solution = replace(
-            solution, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32))
-        )
-    if not problem.opposite:
-        return solution
-    solution = complement_event(solution)
-    return solution if bounds is None else _within(solution, bounds)
-
-
-def _within(solution: Solution, bounds: tuple[jax.Array, jax.Array]) -> Solution:
-    """A solution with bounds no wider than given ones, despite rounding outwards."""
-    lower = jnp.maximum(solution.lower, bounds[0])
-    upper = jnp.minimum(solution.upper, bounds[1])
-    inside = jnp.clip(solution.value, lower, upper)
-    # The value with its derivative, which clipping halves at a bound.
-    value = solution.value + lax.stop_gradient(inside - solution.value)
-    return replace(solution, value=value, lower=lower, upper=upper)
-
-
-# One program for a model over a mesh, instead of one for each operation.
-_over_mesh = jax.jit(_optimal, static_argnames=("objective",))
-
-
-@brief
-class Reaching(NamedTuple):
-    """An optimal satisfaction problem as an optimal reachability problem."""
-
-    model: Product  # the product, or that of the task's negation
-    target: Array  # ``bool[S, Q]``
-    objective: str  # ``"max"`` or ``"min"``
-    opposite: bool  # whether the satisfaction probability is one minus that of the target
-    # for Buchi and parity, the accepting end components of the target
-    accepting: Accepting | None = None
-
-
-def as_reachability(model: Product, objective: str) -> Reaching:
-    """Reachability problem with the optimal satisfaction probability as its optimum."""
-    reduction_for(objective)
-    task = model.automaton
-    if task.is_cosafe:
-        return Reaching(model, model.final, objective, False)
-    if task.is_safety:
-        return Reaching(model, _not_final(model), "min" if objective == "max" else "max", True)
-    if objective == "min":
-        model = replace(model, automaton=_shifted(model.automaton))
-    accepting = accepting_end_components(model)
-    return Reaching(model, accepting.region, "max", objective == "min", accepting)
-
-
-def _visiting(problem: Reaching, solution: Solution) -> Array:
-    """A policy that reads the least priority of accepting end components infinitely often."""
-    model, accepting = problem.model, problem.accepting
-    assert accepting is not None
-    if is_traced((model, solution)) or model.num_states > QUICK_LIMIT:
-        return accepting.action
-    sparse = rows_of_model(model)
-    visits = until_visit(problem, sparse.host)
-    inside = on_rows(sparse, accepting.inside)
-    outer = ~np.asarray(accepting.region).ravel()
-    row = row_of_action(sparse, accepting.action)
-    rows = fastest_rows(
-        visits, np.append(inside, True), np.append(outer, True), np.append(row, sparse.num_rows)
-    )
-    return np.asarray(sparse.action)[rows[:-1]].reshape(model.state_shape)
-
-
-def until_visit(problem: Reaching, mdp: HostMDP) -> HostMDP:
-    """The product's rows, in which accepting visits lead to a further, absorbing state."""
-    # An accepting visit reads the least priority of the accepting end component.
-    model, accepting = problem.model, problem.accepting
-    assert accepting is not None
-    automaton, letter = jax.tree.map(np.asarray, (model.automaton, model.letter))
-    least = np.asarray(accepting.least)
-    if model.label_on == "entry":
-        marked = automaton.priority == least[..., None]  # [S, Q, L]
-        read = np.repeat(letter, model.num_memory)
-    else:
-        marked = least == automaton.priority[:, letter].T
-        read = np.zeros(model.num_states, np.int32)
-    marked = marked.reshape(model.num_states, -1)
-    return with_exits(mdp, marked[mdp.state[mdp.row], read[mdp.successor]])
-
-
-def _shifted(automaton: Automaton) -> Automaton:
-    """The automaton of the negation; unlike `complement`, for traced tables too."""
-    xp, priority = namespace(automaton.priority)
-    priority = to_jax((priority + 1).astype(xp.int32))
-    return replace(automaton, priority=priority, acceptance="parity", state_names=())
-
-
-def _not_final(model: Product) -> jax.Array:
-    _, final = namespace(model.final)
-    return jax_array(~final)
-
-
-def _one_hot(policy: Array, num_actions: int) -> Array:
-    xp, table = namespace(policy)
-    return table[..., None] == xp.arange(num_actions)
-
-
-def as_product(model: object) -> Product:
-    if not isinstance(model, Product):
-        raise ValueError(
-            f"{type(model).__name__} is no product of a world and a task; give "
-            "product(world, formula), or the task to optimal_satisfaction."
-        )
-    return model
+    if throw:
+        check(found.solution)
+    return found

@@ -34,13 +34,9 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.undiscounted.fastest import possibly_optimal_rows, tied_rows
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.policy_gradient import transient_factors
-from jaxltl.core.values.undiscounted.reachability import on_actions, on_rows, rows_of_model
-from jaxltl.core.values.undiscounted.satisfaction import (
-    Reaching,
-    as_product,
-    as_reachability,
-    satisfaction_probability,
-)
+from jaxltl.core.values.engine.row_form import on_actions, on_rows, rows_of
+from jaxltl.core.values.undiscounted.acceptance import Reaching, as_product, as_reachability
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -176,7 +172,7 @@ class StepAnalysis:
 
     @cached_property
     def sparse(self) -> SparseMDP:
-        return rows_of_model(self.model)
+        return rows_of(self.model)
 
     @cached_property
     def lost(self) -> Booleans:
@@ -194,7 +190,7 @@ class StepAnalysis:
         """:func:`satisfaction_steps` of a policy."""
         if self.problem.opposite:
             return Steps(0.0, 0.0, 0.0, Status.CONVERGED)
-        chain = induced_chain(self.model, self.sparse, policy)
+        chain = induced_chain(self.model, policy)
         total = optimal.reward_forever(
             chain.mdp,
             self.undecided.astype(float),
@@ -256,7 +252,7 @@ class StepAnalysis:
 
     def _share_reached(self, policy: Array) -> float:
         """Lower bound of the probability of the target, to a width relative to it."""
-        chain = induced_chain(self.model, self.sparse, policy)
+        chain = induced_chain(self.model, policy)
         own = optimal.reachability(
             chain.mdp,
             np.asarray(self.problem.target).ravel(),
@@ -540,7 +536,7 @@ class _StepsFrontSearch:
         """Expected visits of undecided states with each action, ``float[S, Q, A]``."""
         clock = self.clock
         inner, visits = clock.undecided, np.zeros(clock.undecided.size)
-        chain = induced_chain(clock.model, clock.sparse, policy)
+        chain = induced_chain(clock.model, policy)
         start = np.asarray(clock.model.initial, float).ravel()[inner]
         visits[inner] = transient_factors(chain.mdp, inner).solve(start, "T")
         rows = np.maximum(visits, 0)[clock.sparse.host.state] * chain.weight

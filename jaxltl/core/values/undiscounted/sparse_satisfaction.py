@@ -15,7 +15,7 @@ from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.deferred import Deferred, deferred_field
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
-from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -24,16 +24,18 @@ from jaxltl.core.sparse.graph.accepting import AcceptingRegion, accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
-from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.types import Solution
+from jaxltl.core.values.door.question import Accuracy, Question
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.engine.host_solution import (
-    PolicyChain,
     complement_event,
     default_tolerance,
-    induced_chain,
+    policy_chain,
     solution_from_enclosure,
+    with_given_policy,
 )
+from jaxltl.core.values.engine.row_form import row_form
 
 
 @brief
@@ -157,14 +159,11 @@ def _best(
     solve, maximize = (
         (avoidance, not problem.maximize) if avoids else (reachability, problem.maximize)
     )
-    solution = solution_from_enclosure(
-        whole,
-        whole,
-        solve(product.host, problem.goal, maximize=maximize, tolerance=requested, depth=depth),
-        float(requested),
-        relative=relative,
+    enclosure = solve(
+        product.host, problem.goal, maximize=maximize, tolerance=requested, depth=depth
     )
-    row = np.asarray(solution.policy)
+    solution = solution_from_enclosure(row_form(whole), enclosure, requested, relative=relative)
+    row = enclosure.row
     if problem.visiting is not None:
         row = np.where(problem.visiting.region, problem.visiting.row, row)
     return (complement_event(solution) if problem.complement and not relative else solution), row
@@ -207,21 +206,16 @@ def _problem(product: SparseProduct, reader: _LetterReader, objective: str) -> R
     return ReachabilityProblem(goal | visiting.region, True, opposite, visiting)
 
 
-def product_satisfaction(
-    model: Product,
-    *,
-    policy: Array | None = None,
-    objective: str = "max",
-    tolerance: Array | None = None,
-) -> Solution:
+def accept_rows(model: Model, question: Question, accuracy: Accuracy) -> Solution:
     """Optimal probability of acceptance on every state of a lazy product of a sparse model."""
+    assert isinstance(model, Product)
     if model.allowed is not None:
         raise ValueError(
             "a product of a sparse model takes no mask of actions; restrict the world "
             "by with_allowed(world, rows), or write the product out by to_sparse."
         )
     world: SparseMDP = model.mdp
-    task = model.automaton
+    task, policy, objective = model.automaton, question.policy, question.objective
     automaton = replace(task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
     letter, shape = np.asarray(model.letter), model.state_shape
     on_entry = model.label_on == "entry"
@@ -231,36 +225,18 @@ def product_satisfaction(
     )
     depth = 0
     if policy is not None:
-        chain = _chain(product, model, policy)
+        chain = policy_chain(product.host, row_form(model).weights(policy))
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
     reader = _LetterReader(automaton, letter, on_entry)
-    solution, row = _best(product, reader, objective, tolerance, depth)
+    width = accuracy.width(default_tolerance(model))
+    solution, row = _best(product, reader, objective, width, depth)
     parts: dict[str, Array] = {
         name: np.asarray(getattr(solution, name)).reshape(shape)
         for name in ("value", "lower", "upper")
     }
-    parts["policy"] = (
-        np.asarray(policy)
-        if policy is not None
-        else product.base_row[row].astype(np.int32).reshape(shape)
-    )
-    return replace(solution, **parts)
-
-
-def _chain(product: SparseProduct, model: Product, policy: Array) -> PolicyChain:
-    """The chain of a policy of the model's rows."""
-    policy = np.asarray(policy)
-    written = sparse_mdp_of_product(product)
-    memory = product.memory[product.host.state]
-    if is_deterministic(policy):
-        require_shape("policy", policy, model.state_shape)
-        taken = policy.ravel()[product.host.state] == product.base_row
-        weight = taken.astype(np.float64)
-    else:
-        world: SparseMDP = model.mdp
-        require_shape("policy", policy, (world.num_rows, model.num_memory))
-        weight = policy[product.base_row, memory]
-    return induced_chain(written, written, weight)
+    if policy is None:
+        parts["policy"] = row_actions(world)[product.base_row[row]].astype(np.int32).reshape(shape)
+    return with_given_policy(replace(solution, **parts), policy)
 
 
 def _product(model: SparseMDP, reader: _LetterReader, states: np.ndarray) -> SparseProduct:

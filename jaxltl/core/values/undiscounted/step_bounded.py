@@ -26,18 +26,19 @@ from jaxltl.core.sparse.bounded.step_bounded import (
     until,
 )
 from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.model_rows import ModelRows, model_rows
+from jaxltl.core.values.engine.host_solution import with_given_policy
+from jaxltl.core.values.engine.row_form import RowForm, row_form
 from jaxltl.core.values.engine.state_quantities import (
     PROBABILITY,
     Span,
     finite_reward,
     reward_span,
     solution_from_error,
-    state_mask,
     state_reward,
     transition_reward,
 )
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.interval.sides import directions, refuse_environment, refuse_nature
 
 
 @validated(games=True, host=True)
@@ -47,12 +48,13 @@ def next_probability(
     *,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     policy: Array | None = None,
 ) -> Solution:
     """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
     Args:
-      model, target, objective, nature, policy: as for :func:`bounded_reachability`.
+      model, target, objective, nature, environment, policy: as for :func:`bounded_reachability`.
 
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
@@ -67,10 +69,10 @@ def next_probability(
       >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 0, 1], [0.75, 0.25, 1, 1])
       >>> found = next_probability(model, [False, True])
       >>> found.value.tolist(), found.policy.tolist()
-      ([0.25, 1.0], [0, 2])
+      ([0.25, 1.0], [0, 0])
     """
-    problem = _problem(model, objective, nature, policy)
-    values = next_step(problem.game, problem.states(target, "target"))
+    problem = _problem(model, objective, nature, environment, policy)
+    values = next_step(problem.game, problem.form.states("target", target))
     return problem.solution(values, PROBABILITY)
 
 
@@ -83,6 +85,7 @@ def bounded_reachability(
     stay: Array | str | None = None,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
@@ -95,19 +98,20 @@ def bounded_reachability(
 
     Args:
       model: any concrete model. In a game the environment has the opposite objective.
-      target: ``bool[S]``, or the name of a label.
+      target: ``bool[S]``, a label's name, or a Boolean formula of labels.
       num_steps: n.
-      stay: ``bool[S]`` or a label that must hold before the target is reached; default everywhere.
+      stay: in the same forms, what must hold before the target is reached; default everywhere.
       objective: ``"max"`` or ``"min"``, of the system; irrelevant for chains.
       nature: of models with intervals: ``"adversarial"`` (default), against the objective, or
         ``"cooperative"``.
-      policy: evaluate this policy, of a game the system's: actions ``int32[S]`` or ``float[S, A]``;
-        rows or ``float[R]`` for sparse rows. Default: optimise.
+      environment: of games, in the same words.
+      policy: evaluate this policy, of a game the system's: actions ``int32[S]`` or ``float[S, A]``, of
+        sparse models also weights of rows ``float[R]``. Default: optimise.
       by_step: return the choices of all steps.
 
     Returns:
       :class:`Solution`; `value` is ``float64`` in the shape of the states, exactly 0 or 1 where the
-      graph decides. `policy` is the first choice of each state, an action, or a row for sparse rows;
+      graph decides. `policy` is the first action of each state;
       with `by_step` the choices of all steps in order, with an axis ``[n]`` in front. `num_steps` is
       the number of computed steps, `nature` has the distributions of the first step. Concrete arrays
       only; not differentiable.
@@ -123,8 +127,8 @@ def bounded_reachability(
       [0.875, 1.0]
     """
     steps = validation.integer("num_steps", num_steps)
-    problem = _problem(model, objective, nature, policy)
-    goal, free = problem.states(target, "target"), problem.passable(stay)
+    problem = _problem(model, objective, nature, environment, policy)
+    goal, free = problem.form.states("target", target), problem.passable(stay)
     return problem.solution(until(problem.game, goal, free, steps, by_step), PROBABILITY)
 
 
@@ -138,7 +142,7 @@ def bounded_avoidance(
     nature: str | None = None,
 ) -> Solution | None:
     """Complement of :func:`bounded_reachability`, relatively exact; None for many steps."""
-    problem = _problem(model, objective, nature, None)
+    problem = _problem(model, objective, nature, None, None)
     values = avoidance(problem.game, target, stay, num_steps)
     return None if values is None else problem.solution(values, PROBABILITY)
 
@@ -151,6 +155,7 @@ def cumulative_reward(
     *,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
@@ -159,7 +164,7 @@ def cumulative_reward(
     ``x_{k+1}(s) = opt_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
 
     Args:
-      model, num_steps, objective, nature, policy, by_step: as for :func:`bounded_reachability`.
+      model, num_steps, objective, nature, environment, policy, by_step: as for :func:`bounded_reachability`.
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite, of any sign.
 
     Returns:
@@ -176,13 +181,13 @@ def cumulative_reward(
       [1.75, 0.0]
     """
     steps = validation.integer("num_steps", num_steps)
-    problem = _problem(model, objective, nature, policy)
-    rewards = problem.world.rewards(reward)
-    earned, magnitude = finite_reward(problem.world.sparse, rewards)
+    problem = _problem(model, objective, nature, environment, policy)
+    rewards = problem.form.reward(reward)
+    earned, magnitude = finite_reward(problem.form.sparse, rewards)
     entry = None
     if problem.game.sets is not None:
-        entry = transition_reward(problem.world.sparse, rewards)
-        magnitude = np.maximum.reduceat(np.abs(entry), problem.world.sparse.host.entry_start[:-1])
+        entry = transition_reward(problem.form.sparse, rewards)
+        magnitude = np.maximum.reduceat(np.abs(entry), problem.form.sparse.host.entry_start[:-1])
         entry = entry[problem.entry]
     paid = StepReward(earned[problem.row], magnitude[problem.row], entry)
     start = np.zeros(problem.game.mdp.num_states)
@@ -198,6 +203,7 @@ def instantaneous_reward(
     *,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     policy: Array | None = None,
     by_step: bool = False,
 ) -> Solution:
@@ -206,7 +212,7 @@ def instantaneous_reward(
     ``x_{k+1}(s) = opt_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
 
     Args:
-      model, objective, nature, policy, by_step: as for :func:`bounded_reachability`.
+      model, objective, nature, environment, policy, by_step: as for :func:`bounded_reachability`.
       reward: the name of a reward, a structure, of which only the rewards of states count, or an
         array ``[S]``. None is the only reward of the model.
       num_step: n.
@@ -225,8 +231,8 @@ def instantaneous_reward(
       [0.125, 0.0]
     """
     steps = validation.integer("num_steps", num_step)
-    problem = _problem(model, objective, nature, policy)
-    final = state_reward(problem.world.sparse, problem.world.rewards(reward))
+    problem = _problem(model, objective, nature, environment, policy)
+    final = state_reward(problem.form.sparse, problem.form.reward(reward))
     zero = np.zeros(problem.game.mdp.num_rows)
     values = total(problem.game, StepReward(zero, zero), final, steps, by_step)
     return problem.solution(values, (float(final.min()), float(final.max())))
@@ -242,6 +248,7 @@ def reward_bounded_reachability(
     stay: Array | str | None = None,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     policy: Array | None = None,
     by_level: bool = False,
 ) -> Solution:
@@ -252,7 +259,7 @@ def reward_bounded_reachability(
     (Andova, Hermanns and Katoen 2003). Rewards in the target do not count.
 
     Args:
-      model, target, stay, objective, nature, policy: as for :func:`bounded_reachability`.
+      model, target, stay, objective, nature, environment, policy: as for :func:`bounded_reachability`.
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative, multiples of one
         unit; numbers are read as the simplest fractions that round to them.
       bound: the largest reward.
@@ -275,13 +282,13 @@ def reward_bounded_reachability(
       >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
       [0.875, 1.0]
     """
-    problem = _problem(model, objective, nature, policy)
-    goal, free = problem.states(target, "target"), problem.passable(stay)
+    problem = _problem(model, objective, nature, environment, policy)
+    goal, free = problem.form.states("target", target), problem.passable(stay)
     validation.require_in_range("bound", bound, validation.Range(0, math.inf, open_above=True))
-    sparse, host = problem.world.sparse, problem.world.sparse.host
+    sparse, host = problem.form.sparse, problem.form.sparse.host
     # Rewards of transitions are not their expectation here.
-    if np.ndim(cast(Array, reward)) < len(problem.world.shape) + 2:
-        reward = problem.world.rewards(reward)
+    if np.ndim(cast(Array, reward)) < len(problem.form.shape) + 2:
+        reward = problem.form.reward(reward)
     cost = transition_reward(sparse, reward_structure(sparse, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
@@ -301,39 +308,46 @@ def reward_bounded_reachability(
 class _Problem(NamedTuple):
     """A model as a game on rows, under the given policy."""
 
-    world: ModelRows
+    form: RowForm
     game: RowGame
     row: Integers  # int[R'], int[T'], the model's rows and entries
     entry: Integers
     policy: Array | None
 
-    def states(self, states: Array | str, name: str) -> Booleans:
-        return state_mask(self.world.sparse, states, name)
-
     def passable(self, stay: Array | str | None) -> Booleans:
-        everywhere = np.ones(self.world.sparse.num_states, bool)
-        return everywhere if stay is None else self.states(stay, "stay")
+        everywhere = np.ones(self.form.sparse.num_states, bool)
+        return everywhere if stay is None else self.form.states("stay", stay)
 
     def solution(
         self, values: StepBoundedValues | BudgetLevel, span: Span, num_levels: int | None = None
     ) -> Solution:
         """The :class:`Solution` of values of the rows."""
         steps = values.num_steps if isinstance(values, StepBoundedValues) else num_levels
-        solution = solution_from_error(
-            values.value, values.error, self.row[values.row], steps or 0, span=span
-        )
-        solution = self.world.shaped(solution, self.policy)
-        nature: Array | None = None if self.policy is not None else values.probability
+        row = self.row[values.row]
+        solution = solution_from_error(values.value, values.error, row, steps or 0, span=span)
+        shape, form = self.form.shape, self.form
+        parts: dict[str, Array] = {
+            name: getattr(solution, name).reshape(shape) for name in ("value", "lower", "upper")
+        }
+        parts["policy"] = form.number[row].astype(np.int32).reshape(*row.shape[:-1], *shape)
+        parts["nature"] = None if self.policy is not None else values.probability
         method = "step by step" if num_levels is None else "level by level of the reward"
-        return replace(solution, nature=nature, method=method)
+        return with_given_policy(replace(solution, **parts, method=method), self.policy)
 
 
-def _problem(model: Model, objective: str, nature: str | None, policy: Array | None) -> _Problem:
-    world = model_rows(model, objective, nature)
-    host = world.sparse.host
-    game = RowGame(host, world.maximizes, world.sets, world.nature == "max")
+def _problem(
+    model: Model, objective: str, nature: str | None, environment: str | None, policy: Array | None
+) -> _Problem:
+    form = row_form(model)
+    aims = directions(objective, nature, environment)
+    if form.interval is None:
+        refuse_nature(nature)
+    if form.system is None:
+        refuse_environment(environment)
+    host, sets = form.host, None if form.interval is None else form.interval.host
+    own = np.ones(host.num_states, bool) if form.system is None else form.system
+    maximizes = np.where(own, aims.system, aims.environment)
+    game = RowGame(host, maximizes, sets, aims.nature)
     if policy is None:
-        return _Problem(
-            world, game, np.arange(host.num_rows), np.arange(host.num_transitions), None
-        )
-    return _Problem(world, *game.under(world.weights(policy), world.is_system), policy)
+        return _Problem(form, game, np.arange(host.num_rows), np.arange(host.num_transitions), None)
+    return _Problem(form, *game.under(form.weights(policy), own), policy)

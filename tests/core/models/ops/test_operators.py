@@ -301,13 +301,14 @@ def test_policies_of_rows():
         (np.where(weight > 0, np.nan, 0), False),
     ):
         assert bool(valid(policy, everywhere)) == good
-        if good:
-            operators.require_policy(model, policy)
-        else:
-            with pytest.raises(ValueError, match="state 0"):
-                operators.require_policy(model, policy)
     assert valid(wrong, everywhere[:4] & (np.arange(4) > 0))
-    operators.require_policy(model, wrong, np.arange(4) > 0)
+    last = np.diff(model.row_start) - 1
+    operators.require_policy(model, last)
+    operators.require_policy(model, weight)
+    for policy in (last + 1, 2 * weight, weight - 1, np.where(weight > 0, np.nan, 0)):
+        with pytest.raises(ValueError, match="state 0"):
+            operators.require_policy(model, policy)
+    operators.require_policy(model, last + (np.arange(4) == 0), np.arange(4) > 0)
     for shape in (model.num_rows + 1, 3):
         with pytest.raises(ValueError, match="policy has shape"):
             operators.policy_distribution(model, np.zeros(shape))

@@ -9,7 +9,7 @@ from scipy import sparse
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.sparse.interval import policy_iteration as interval_optimum
 from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem
+from jaxltl.core.sparse.interval.policy_iteration import PathAccuracy, PathProblem
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.row_operator import PolicyPair
 from jaxltl.core.sparse.linear import elimination
@@ -181,7 +181,7 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
         maximize=True,
     )
     nodes = problem.operator()
-    search = interval_optimum._PolicySearch(nodes, Accuracy(1e-6), False)
+    search = interval_optimum._PolicySearch(nodes, PathAccuracy(1e-6), False)
     chosen, p = nodes.exit_rows(positive=True), nodes.interior()
     begin = PolicyPair(chosen, p, np.zeros(nodes.size), np.ones(nodes.size))
     far = search.upper_bound(search.approximate(begin) or begin)
@@ -191,11 +191,11 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
     chain = nodes.system(near)
     value = np.linalg.solve(np.eye(nodes.size) - chain.matrix.toarray(), chain.earned)
     assert (near.bound <= value + 1e-12).all() and (value - near.bound).max() < 1e-9
-    found = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
+    found = interval_optimum.enclose_paths(problem, PathAccuracy(1e-6))
     open_ = problem.interior
     assert (found.beyond - found.attained)[open_].max() < 6e-7
     monkeypatch.setattr(interval_optimum._PolicySearch, "proportional_bound", lambda *_: None)
-    other = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
+    other = interval_optimum.enclose_paths(problem, PathAccuracy(1e-6))
     assert (found.attained <= other.beyond + 1e-12)[open_].all()
     assert (other.attained <= found.beyond + 1e-12)[open_].all()
 
@@ -217,8 +217,8 @@ def test_refined_bounds_are_narrower_and_agree(maximize, adversarial):
             maximize=maximize,
             adversarial=adversarial,
         )
-        found = interval_optimum.enclose_paths(problem, Accuracy(1e-6))
-        search = interval_optimum._PolicySearch(problem.operator(), Accuracy(1e-6), False)
+        found = interval_optimum.enclose_paths(problem, PathAccuracy(1e-6))
+        search = interval_optimum._PolicySearch(problem.operator(), PathAccuracy(1e-6), False)
         operator = search.operator
         begin = PolicyPair(
             operator.exit_rows(positive=maximize),

@@ -11,15 +11,10 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interva
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
-from jaxltl.core.values.interval.robust import (
-    host_sides,
-    robust_discounted_value,
-    robust_expectation,
-    robust_reachability,
-    robust_total_reward,
-)
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.interval.robust import robust_expectation
 from jaxltl.core.values.interval.satisfaction import _solved, _Verdicts
+from jaxltl.core.values.interval.sides import directions, sides_of
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
@@ -181,10 +176,10 @@ def test_parts_of_interval_models():
     part = restrict(model, np.eye(6)[0], allowed=first)
     target = model.states_with_label("a")
     for nature in ("min", "max"):
-        whole = robust_reachability(
-            model, target, policy=host.row_start[:-1], nature=nature_word("max", nature)
+        whole = reachability_probability(
+            model, target, policy=np.zeros(6, int), nature=nature_word("max", nature)
         )
-        found = robust_reachability(
+        found = reachability_probability(
             part.model, target[np.asarray(part.base_state)], nature=nature_word("max", nature)
         )
         np.testing.assert_allclose(found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
@@ -196,49 +191,24 @@ def test_policies_are_evaluated():
         model = labelled(rng)
         target = model.states_with_label("a")
         for nature in ("min", "max"):
-            best = robust_reachability(model, target, nature=nature_word("max", nature))
-            own = robust_reachability(
+            best = reachability_probability(model, target, nature=nature_word("max", nature))
+            own = reachability_probability(
                 model, target, policy=best.policy, nature=nature_word("max", nature)
             )
             np.testing.assert_allclose(own.value, best.value, atol=1e-6)
             np.testing.assert_array_equal(own.policy, best.policy)
-            other = robust_reachability(
+            other = reachability_probability(
                 model,
                 target,
-                policy=model.nominal.host.row_start[:-1],
+                policy=np.zeros(4, int),
                 nature=nature_word("max", nature),
             )
             assert (other.lower <= best.upper + 1e-12).all()
 
 
-def test_one_function_takes_both_kinds():
+def test_nature_is_of_intervals():
     model = labelled(np.random.default_rng(3))
     target = model.states_with_label("a")
-    for objective, nature in DIRECTIONS:
-        np.testing.assert_array_equal(
-            reachability_probability(
-                model, target, objective=objective, nature=nature_word(objective, nature)
-            ).value,
-            robust_reachability(
-                model, target, objective=objective, nature=nature_word(objective, nature)
-            ).value,
-        )
-        np.testing.assert_array_equal(
-            total_reward(
-                model,
-                np.ones(4),
-                target,
-                objective=objective,
-                nature=nature_word(objective, nature),
-            ).value,
-            robust_total_reward(
-                model,
-                np.ones(4),
-                target,
-                objective=objective,
-                nature=nature_word(objective, nature),
-            ).value,
-        )
     with pytest.raises(ValueError, match=r"nature='cooperative'.*intervals"):
         reachability_probability(model.nominal, target, nature="cooperative")
 
@@ -255,10 +225,12 @@ def test_mixed_policies():
         points = make_interval(model.nominal, *[model.nominal.probability] * 2)
         alone = reachability_probability(model.nominal, target, policy=weight)
         np.testing.assert_allclose(
-            robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6
+            reachability_probability(points, target, policy=weight).value, alone.value, atol=1e-6
         )
         low, high = (
-            robust_reachability(model, target, policy=weight, nature=nature_word("max", nature))
+            reachability_probability(
+                model, target, policy=weight, nature=nature_word("max", nature)
+            )
             for nature in ("min", "max")
         )
         assert (low.lower <= alone.upper).all()
@@ -289,15 +261,15 @@ def test_games(count):
                 of = {"objective": objective, "nature": nature}
                 ask = {"objective": objective, "nature": nature_word(objective, nature)}
                 held(
-                    robust_reachability(game, goal, **ask),
+                    reachability_probability(game, goal, **ask),
                     played(host, goal, system, worth[0], **of),
                 )
                 held(
-                    robust_total_reward(game, cost, goal, **ask),
+                    total_reward(game, cost, goal, **ask),
                     played(host, goal, system, worth[1], **of),
                 )
             yes = np.zeros(4, bool)
-            sides = host_sides(host, system, "max", nature_word("max", nature))
+            sides = sides_of(host, system, directions("max", nature_word("max", nature)))
             found = _solved(sides, host, _Verdicts(yes, yes, priority), 1e-6)
             held(
                 found,
@@ -350,7 +322,7 @@ def test_exact_games_have_values():
     )
     for system, best in ((True, 0.5), (False, 0.25)):
         game = Game(coins, np.array([system] * 3))
-        assert robust_reachability(game, "a").value[0] == pytest.approx(best)
+        assert reachability_probability(game, "a").value[0] == pytest.approx(best)
         found = optimal_satisfaction(game, "F G a", states=[0]).solution
         assert found.value[0] == pytest.approx(best)
 
@@ -371,7 +343,7 @@ def test_discounted_values():
                 p = model.host.extreme_distributions(ahead, maximize=nature == "max")
                 image = model.host.sum_rows(p * ahead)
                 value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
-            found = robust_discounted_value(
+            found = optimal_value(
                 model, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
             )
             assert int(found.status) == Status.CONVERGED
@@ -380,7 +352,7 @@ def test_discounted_values():
             assert (value <= found.upper + 1e-12).all()
             game = Game(model, np.ones(4, bool))
             np.testing.assert_allclose(
-                robust_discounted_value(
+                optimal_value(
                     game, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
                 ).value,
                 value,
@@ -432,29 +404,29 @@ def test_bad_questions():
         make_interval(model, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
     target = [False, True, False]
     with pytest.raises(ValueError, match="nature='adverse'; choose one of adversarial"):
-        robust_reachability(model, target, nature="adverse")
+        reachability_probability(model, target, nature="adverse")
     for tolerance in (float("nan"), -1.0, "fine"):
         with pytest.raises(ValueError, match=r"tolerance=.*at least 0"):
-            robust_reachability(model, target, tolerance=tolerance)
+            reachability_probability(model, target, tolerance=tolerance)
     for discount in (None, 1.0, [0.5]):
         with pytest.raises(ValueError, match=r"discount=.*below 1"):
-            robust_discounted_value(model, [0, 1, 0], discount)
-    with pytest.raises(ValueError, match="model is a SparseMDP; give an IntervalMDP"):
+            optimal_value(model, [0, 1, 0], discount)
+    with pytest.raises(ValueError, match="SparseMDP has no intervals; give an IntervalMDP"):
         robust_expectation(COIN, [0, 1, 0])
     with pytest.raises(ValueError, match="not finite"):
         robust_expectation(model, [0, np.nan, 0])
     with pytest.raises(
         ValueError, match=r"target is \[0, 2, 0\]; give bool\[3\], one for each state\."
     ):
-        robust_reachability(model, [0, 2, 0])
+        reachability_probability(model, [0, 2, 0])
     with pytest.raises(ValueError, match="objective='best'"):
-        robust_reachability(model, target, objective="best")
-    with pytest.raises(ValueError, match=r"policy\[0\]=3 is not a choice of state 0"):
-        robust_reachability(model, target, policy=[3, 1, 2])
+        reachability_probability(model, target, objective="best")
+    with pytest.raises(ValueError, match=r"policy takes action 3 in state 0.*one of \[0\]"):
+        reachability_probability(model, target, policy=[3, 1, 2])
     with pytest.raises(ValueError, match="reward of state 1, choice 0 is -1"):
-        robust_total_reward(model, [0, -1, 0], target)
+        total_reward(model, [0, -1, 0], target)
     with pytest.raises(ValueError, match="differs between its successors"):
-        robust_total_reward(model, Rewards(transition=np.array([1.0, 2, 0, 0])), target)
+        total_reward(model, Rewards(transition=np.array([1.0, 2, 0, 0])), target)
 
 
 @pytest.mark.parametrize(
@@ -477,16 +449,11 @@ def test_states_that_are_none(states, message):
             optimal_satisfaction(of, "F a", states=states)
 
 
-def test_general_functions_answer_for_intervals():
-    """One function per question: they return what the robust solvers return."""
+def test_step_bounded_functions_answer_for_intervals():
     model = labelled(np.random.default_rng(13))
     target, reward = model.states_with_label("a"), np.arange(4.0)
     for nature in ("adversarial", "cooperative"):
         ask = {"nature": nature}
-        np.testing.assert_array_equal(
-            optimal_value(model, reward, 0.9, **ask).value,
-            robust_discounted_value(model, reward, 0.9, **ask).value,
-        )
         for general, given in (
             (next_probability, (target,)),
             (bounded_reachability, (target, 3)),
@@ -497,8 +464,3 @@ def test_general_functions_answer_for_intervals():
         ):
             with pytest.raises(ValueError, match="intervals"):
                 general(model.nominal, *given, **ask)
-        policy = np.asarray(model.nominal.host.row_start[:-1])
-        np.testing.assert_array_equal(
-            policy_value(model, policy, reward, 0.9, **ask).value,
-            robust_discounted_value(model, reward, 0.9, policy=policy, **ask).value,
-        )

@@ -74,7 +74,7 @@ def by_host(model, target, stay, reward, maximize):
 
 
 def of_policy(model, policy, target, stay, reward):
-    chain = induced_chain(model, model, policy)
+    chain = induced_chain(model, policy)
     if reward is None:
         return optimal.reachability(chain.mdp, target, maximize=True, stay=stay, depth=chain.depth)
     paid = chain.mean(reward, model.row_start)
@@ -144,15 +144,15 @@ def test_policies_are_evaluated_in_lanes(seed, question):
     rng, model, target, stay, reward = random_case(seed, question)
     prepared = prepare(model, target, stay=stay, reward=reward, objective="policy")
     count = np.diff(model.row_start)
-    rows = model.row_start[:-1] + rng.integers(0, count, (5, SIZE))
+    actions = rng.integers(0, count, (5, SIZE))
     solve = jax.jit(jax.vmap(lambda x: solve_prepared(prepared, policy=x)))
-    found = jax.tree.map(np.asarray, solve(rows.astype(np.int32)))
+    found = jax.tree.map(np.asarray, solve(actions.astype(np.int32)))
     weights = rng.random((5, model.num_rows)) * (rng.random((5, model.num_rows)) < 0.6)
     weights[:, model.row_start[:-1]] += 0.1
     weights /= np.add.reduceat(weights, model.row_start[:-1], 1)[:, model.host.state]
     mixed = jax.tree.map(np.asarray, solve(weights))
     for i in range(5):
-        for several, policy in ((found, rows[i]), (mixed, weights[i])):
+        for several, policy in ((found, actions[i]), (mixed, weights[i])):
             agree(lane(several, i), of_policy(model, policy, target, stay, reward))
 
 
@@ -179,7 +179,7 @@ def test_wide_rows_and_many_choices_are_split():
         assert shape[1] < 11 and shape[2] < 37
         found = solve_prepared(prepared)
         agree(found, by_host(model, target, None, None, objective == "max"), 1e-12)
-        row = np.asarray(found.policy)
+        row = model.row_start[:-1] + np.asarray(found.policy)
         assert ((row >= model.row_start[:-1]) & (row < model.row_start[1:])).all()
         value = np.asarray(found.value)
         np.testing.assert_allclose((model.host.matrix @ value)[row], value, atol=1e-12)
@@ -304,10 +304,10 @@ def test_other_rewards_are_judged(walk):
 def test_policies_are_judged():
     model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1, 1, 1])
     prepared = prepare(model, [False, True], objective="policy")
-    rows = np.array([[0, 2], [1, 2], [2, 2]])
+    actions = np.array([[0, 0], [1, 0], [2, 0]])
     weights = np.array([[0.5, 0.5, 1], [0.5, 0.6, 1], [-1, 2, 1], [np.nan, 0.5, 1]])
     for policies, statuses, values in (
-        (rows, "CONVERGED CONVERGED INVALID", [0, 1, np.nan]),
+        (actions, "CONVERGED CONVERGED INVALID", [0, 1, np.nan]),
         (weights, "CONVERGED INVALID INVALID NONFINITE", [1, np.nan, np.nan, np.nan]),
     ):
         found = jax.vmap(lambda x: solve_prepared(prepared, policy=x))(policies)

@@ -9,10 +9,11 @@ import pytest
 
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.types import Status
-from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.interval.robust_policy_iteration import greedy_distributions
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.prepared import prepare, solve_prepared
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.reference_intervals import vertices
 from tests.support import nature_word
 
@@ -129,15 +130,15 @@ def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     found = solve_prepared(
         prepare(model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature))
     )
-    host = robust_reachability(
+    host = reachability_probability(
         model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature)
     )
     p = np.asarray(found.nature)
     assert (p >= model.lower - 1e-15).all() and (p <= model.upper + 1e-15).all()
     np.testing.assert_allclose(np.add.reduceat(p, ENTRY_START[:-1]), 1, rtol=1e-14)
     fixed = _model(successor, p, np.maximum(p, 1e-300))  # what is left out has no room
-    side = robust_reachability(fixed, GOAL, stay=STAY, objective=objective)
-    mine = robust_reachability(
+    side = reachability_probability(fixed, GOAL, stay=STAY, objective=objective)
+    mine = reachability_probability(
         model, GOAL, stay=STAY, policy=np.asarray(found.policy), nature=nature_word("max", nature)
     )
     np.testing.assert_allclose(mine.value, host.value, atol=2e-6)
@@ -148,15 +149,15 @@ def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
 def test_given_policies_are_evaluated():
     successor, lower, upper, cost = _cases(4, 1)
     model = _model(successor, lower[0], upper[0])
-    policy = np.array([0, 1, 3, 4, 7], np.int32)
+    policy = np.array([0, 0, 1, 0, 1], np.int32)
     for nature in ("adversarial", "cooperative"):
         question = {"policy": policy, "nature": nature}
         found = solve_prepared(prepare(model, GOAL, **question))
-        host = robust_reachability(model, GOAL, **question)
+        host = reachability_probability(model, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, atol=1e-6)
         np.testing.assert_array_equal(found.policy, policy)
         found = solve_prepared(prepare(model, GOAL, reward=cost, **question))
-        host = robust_total_reward(model, cost, GOAL, **question)
+        host = total_reward(model, cost, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, rtol=1e-6)
 
 
@@ -185,8 +186,8 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
 
     def host(model):
         if reward is None:
-            return robust_reachability(model, goal, stay=STAY, tolerance=1e-12, **ask)
-        return robust_total_reward(model, reward, goal, tolerance=1e-12, **ask)
+            return reachability_probability(model, goal, stay=STAY, tolerance=1e-12, **ask)
+        return total_reward(model, reward, goal, tolerance=1e-12, **ask)
 
     prepared = prepare(model, goal, stay=STAY if reward is None else None, reward=reward, **ask)
 
@@ -274,8 +275,8 @@ def test_nature_gives_mass_in_order(width):
         ({"stay": STAY, "reward": np.ones(8)}, "leave stay out"),
         ({"nature": "up"}, "nature='up'"),
         ({"objective": "policy"}, "objective='policy'"),
-        ({"policy": np.zeros(5, np.int32)}, r"policy\[1\]=0 is not a choice of state 1"),
-        ({"policy": np.ones(8)}, "rows, int"),
+        ({"policy": np.full(5, 2, np.int32)}, "takes action 2 in state 0"),
+        ({"policy": np.ones(8)}, "actions, int"),
         ({"reward": -np.ones(8)}, "at least 0"),
     ],
 )

@@ -365,5 +365,5 @@ def test_options_of_interval_iteration_are_refused_where_it_is_not_used(option):
         lambda: jl.optimal_satisfaction(jl.product(coin, "F heads"), **option),
         lambda: jl.optimal_satisfaction(coin, "F heads", **option),
     ):
-        with pytest.raises(ValueError, match="options of interval iteration"):
+        with pytest.raises(ValueError, match=r"max_steps|start"):
             ask()

@@ -6,7 +6,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
-from jaxltl.core.values.undiscounted.satisfaction import as_reachability
+from jaxltl.core.values.undiscounted.acceptance import as_reachability
 from tests.core.values.undiscounted.test_optimal_actions import (
     CASES,
     A,

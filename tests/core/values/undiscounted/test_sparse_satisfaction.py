@@ -121,9 +121,7 @@ def test_bad_arguments_are_named():
 def test_options_of_other_models_are_refused():
     model = random_sparse(np.random.default_rng(0), 4)
     for option in ({"max_steps": 3}, {"start": (0, 1)}, {"nature": "adversarial"}):
-        with pytest.raises(
-            ValueError, match=r"options of interval iteration|is for models with intervals"
-        ):
+        with pytest.raises(ValueError, match=r"options for a product|is for models with intervals"):
             optimal_satisfaction(model, "F a", **option)
     for option in ({"states": [0]}, {"label_on": "exit"}):
         with pytest.raises(ValueError, match="for a model and a formula"):

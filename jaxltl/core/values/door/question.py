@@ -1,0 +1,65 @@
+"""Questions about a model, in the same form for every kind of model."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import Reward
+from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
+
+
+class Reach(NamedTuple):
+    """The probability of reaching a set of states, through the states of another one."""
+
+    target: Array | str
+    stay: Array | str | None = None
+
+
+class TotalReward(NamedTuple):
+    """The expected total reward until a set of states is reached, or for ever."""
+
+    reward: Reward
+    target: Array | str | None = None
+
+
+class DiscountedReward(NamedTuple):
+    """The expected discounted reward."""
+
+    reward: Reward
+    discount: Array | float
+
+
+class AverageReward(NamedTuple):
+    """The expected long-run average of a reward."""
+
+    reward: Reward
+
+
+class Acceptance(NamedTuple):
+    """The probability that the automaton of a product accepts."""
+
+
+Path = Reach | TotalReward | DiscountedReward | AverageReward | Acceptance
+
+
+class Question(NamedTuple):
+    """What is asked: a quantity of paths, and who chooses to what end."""
+
+    path: Path
+    objective: str = "max"  # or "min": of the system, that is, of whoever asks
+    nature: str | None = None  # "adversarial" or "cooperative", where probabilities are intervals
+    environment: str | None = None  # the same of a second player
+    policy: Array | None = None  # of the system, to evaluate; None: optimise
+
+
+class Accuracy(NamedTuple):
+    """The requested width of the enclosure; None for the default of the engine."""
+
+    tolerance: Array | float | None = None
+    relative: bool = False  # whether it is a share of the value
+
+    def width(self, default: float) -> float:
+        """The width for engines on the host; relative ones are of their own type."""
+        wanted = default if self.tolerance is None else as_width(self.tolerance)
+        return RelativeTolerance(wanted) if self.relative else wanted

@@ -1,0 +1,201 @@
+"""Engines on rows: concrete models of every kind, by exact rows or by policy, nature and two players."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats
+from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.sparse import Reward
+from jaxltl.core.sparse.interval import discounted as interval_discounted
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import RobustValues
+from jaxltl.core.sparse.interval.total_reward import total_reward
+from jaxltl.core.sparse.solvers import discounted, reachability as exact
+from jaxltl.core.types import Solution
+from jaxltl.core.values.door.question import (
+    Accuracy,
+    DiscountedReward,
+    Question,
+    Reach,
+    TotalReward,
+)
+from jaxltl.core.values.engine.host_solution import (
+    default_tolerance,
+    policy_chain,
+    solution_from_enclosure,
+    status_between,
+    with_given_policy,
+)
+from jaxltl.core.values.engine.row_form import RowForm, row_form
+from jaxltl.core.values.engine.state_quantities import (
+    clipped,
+    discounted_span,
+    finite_reward,
+    nonnegative_reward,
+    transition_reward,
+)
+from jaxltl.core.values.interval.sides import TOLERANCE, Sides, directions, sides_of
+
+# --- one player, known probabilities --------------------------------------------------------------
+
+
+def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Total rewards of exact rows."""
+    path, form = question.path, row_form(model)
+    assert isinstance(path, TotalReward)
+    earned = nonnegative_reward(form.sparse, form.reward(path.reward), "total rewards")
+    requested = accuracy.width(default_tolerance(model))
+    host, depth, maximize = form.host, 0, question.objective == "max"
+    if question.policy is not None:
+        chain = policy_chain(host, form.weights(question.policy))
+        earned = chain.mean(earned, host.row_start)
+        host, depth = chain.mdp, chain.depth
+    if path.target is None:
+        enclosure = exact.reward_forever(
+            host, earned, maximize=maximize, tolerance=requested, depth=depth
+        )
+    else:
+        target = form.states("target", path.target)
+        enclosure = exact.total_reward(
+            host, earned, target, maximize=maximize, tolerance=requested, depth=depth
+        )
+    solution = solution_from_enclosure(form, enclosure, requested, relative=True)
+    return with_given_policy(solution, question.policy)
+
+
+def discount(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Discounted rewards of exact rows; a minimum is that of the negated reward."""
+    path, form = question.path, row_form(model)
+    assert isinstance(path, DiscountedReward)
+    structure, factor = form.reward(path.reward), float(path.discount)
+    sign = 1 if question.objective == "max" or question.policy is not None else -1
+    earned, magnitude = finite_reward(form.sparse, structure)
+    largest = float(np.abs(earned).max()) / (1 - factor)
+    requested = accuracy.width(1e-8 * max(largest, 1e-300))
+    host, depth = form.host, 0
+    if question.policy is not None:
+        chain = policy_chain(host, form.weights(question.policy))
+        earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
+        host, depth = chain.mdp, chain.depth
+    enclosure = discounted.discounted_value(
+        host, sign * earned, magnitude, factor, tolerance=requested, depth=depth
+    )
+    if sign < 0:
+        low, high = -enclosure.upper, -enclosure.lower
+        enclosure = replace(enclosure, value=-enclosure.value, lower=low, upper=high)
+    solution = solution_from_enclosure(form, enclosure, requested, relative=False)
+    return with_given_policy(clipped(solution, discounted_span(structure, factor)), question.policy)
+
+
+# --- policy and nature, and games -----------------------------------------------------------------
+
+
+def reach_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Probabilities of reaching a set under intervals, and of games.
+
+    The least solution of ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the
+    distributions of row a (Nilim and El Ghaoui 2005, Iyengar 2005).
+    """
+    path, form = question.path, row_form(model)
+    assert isinstance(path, Reach)
+    requested, sides = accuracy.width(TOLERANCE), _sides(form, question)
+    target = sides.states(form.states("target", path.target))
+    stay = None
+    if path.stay is not None:
+        stay = sides.states(form.states("stay", path.stay)) | sides.added
+    values = reachability(sides.host, target, sides.query(requested), stay=stay)
+    return robust_solution(form, sides, values, question, requested)
+
+
+def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Total rewards under intervals, and of games: ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``."""
+    path, form = question.path, row_form(model)
+    assert isinstance(path, TotalReward)
+    if path.target is None:
+        raise ValueError("total rewards of games and interval models need a target; give one.")
+    requested, sides = accuracy.width(TOLERANCE), _sides(form, question)
+    target = sides.states(form.states("target", path.target))
+    reward = certain_reward(form, path.reward)
+    earned = np.where(sides.choosing, 0, reward[sides.encoded.row])
+    values = total_reward(sides.host, earned, target, sides.query(requested))
+    return robust_solution(form, sides, values, question, requested, relative=True)
+
+
+def discount_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Discounted rewards under intervals, and of games (Iyengar 2005; Shapley 1953).
+
+    ``V(s) = opt_a opt_p sum_t p_t (r(s, a, t) + discount V(t))``, by policy iteration; the bounds are
+    ``V +- |Phi V - V| / (1 - discount)``, with rounding.
+    """
+    path, form = question.path, row_form(model)
+    assert isinstance(path, DiscountedReward)
+    sides, structure, factor = (
+        _sides(form, question),
+        form.reward(path.reward),
+        float(path.discount),
+    )
+    entry = sides.encoded.entry
+    earned = np.where(entry < 0, 0, transition_reward(form.sparse, structure)[entry])
+    largest = float(np.abs(earned).max(initial=0)) / (1 - factor)
+    requested = accuracy.width(1e-8 * max(largest, 1e-300))
+    factors = np.where(sides.choosing, 1.0, factor)
+    values = interval_discounted.discounted_value(
+        interval_discounted.DiscountedModel(sides.host, earned, factors), sides.query(requested)
+    )
+    solution = robust_solution(form, sides, values, question, requested)
+    return clipped(solution, discounted_span(structure, factor))
+
+
+def _sides(form: RowForm, question: Question) -> Sides:
+    weights = None if question.policy is None else form.weights(question.policy)
+    aims = directions(question.objective, question.nature, question.environment)
+    return sides_of(form.uncertain.host, form.system, aims, weights)
+
+
+def certain_reward(form: RowForm, reward: Reward) -> Floats:
+    """Non-negative reward of each row, ``float64[R]``, if it is independent of nature."""
+    structure = form.reward(reward)
+    earned: Floats = nonnegative_reward(form.sparse, structure, "total rewards")
+    of = structure.transition
+    if of is not None and form.interval is not None:
+        each, sets = np.asarray(of), form.uncertain.host
+        start = form.host.entry_start[:-1]
+        differs = np.maximum.reduceat(each, start) != np.minimum.reduceat(each, start)
+        loose = np.logical_or.reduceat(sets.lower < sets.upper, start)
+        if (differs & loose).any():
+            row = int(np.flatnonzero(differs & loose)[0])
+            raise ValueError(
+                f"the reward of row {row} differs between its successors, whose probabilities are "
+                "intervals; put it on states that are entered, or on choices."
+            )
+    return earned
+
+
+def robust_solution(
+    form: RowForm,
+    sides: Sides,
+    values: RobustValues,
+    question: Question,
+    tolerance: float,
+    *,
+    relative: bool = False,
+) -> Solution:
+    """The solution of certified values of policy and nature."""
+    encoded, size = sides.encoded, form.sparse.num_states
+    ends = [x[:size] for x in (values.value, values.lower, values.upper)]
+    parts: dict[str, Array] = dict(
+        zip(("value", "lower", "upper"), (x.reshape(form.shape) for x in ends), strict=True)
+    )
+    if question.policy is None:
+        parts["policy"] = form.actions(encoded.policy(values.row, values.probability))
+    else:
+        parts["policy"] = np.asarray(question.policy)
+    if form.interval is not None:
+        parts["nature"] = encoded.nature(values.probability, form.host.probability)
+    status = status_between(ends[1], ends[2], float(tolerance), relative=relative)
+    parts["residual"] = np.float64(values.residual)
+    parts |= {"num_steps": np.int32(values.rounds), "status": np.int32(status)}
+    return Solution(**parts, method=values.method)

@@ -1,0 +1,183 @@
+"""The table of engines: which question of which kind of model is answered, and by what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jaxltl.core import validation
+from jaxltl.core.models.protocols import Model, PyTree
+from jaxltl.core.types import Solution, check
+from jaxltl.core.values.average import engine as average
+from jaxltl.core.values.discounted import compiled as compiled_discounted, minimax
+from jaxltl.core.values.door import row_engines
+from jaxltl.core.values.door.kinds import Kind, kind_of
+from jaxltl.core.values.door.question import (
+    Acceptance,
+    Accuracy,
+    AverageReward,
+    DiscountedReward,
+    Path,
+    Question,
+    Reach,
+    TotalReward,
+)
+from jaxltl.core.values.interval import satisfaction as interval_satisfaction
+from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
+from jaxltl.core.values.undiscounted import (
+    acceptance,
+    compiled_engines,
+    reaching,
+    sparse_satisfaction,
+)
+
+
+class Engine(NamedTuple):
+    """What answers a question of one kind of model."""
+
+    solve: Callable[..., Solution]  # of a model, a question, an accuracy and options
+    options: tuple[str, ...] = ()  # of the call that it takes
+    relative: bool = False  # whether the width may be asked relative to the value
+    # options that select an engine of another column instead
+    instead: tuple[str, ...] = ()
+    column: str = ""
+
+
+_LIMITED = ("max_steps", "start")
+_SWEPT = ("method", "max_steps", "evaluation_sweeps")
+_EXACT_REACH = Engine(
+    reaching.reach, ("method",), instead=("iterative", *_LIMITED), column="traced padded"
+)
+_COMPILED_REACH = Engine(compiled_engines.reach, ("method", *_LIMITED))
+_ROBUST_REACH = Engine(row_engines.reach_with_nature)
+_ROBUST_EARN = Engine(row_engines.earn_with_nature)
+_ROBUST_DISCOUNT = Engine(row_engines.discount_with_nature)
+_EARN, _COMPILED_EARN = Engine(row_engines.earn), Engine(compiled_engines.earn)
+_COMPILED_DISCOUNT = Engine(compiled_discounted.discounted_reward, _SWEPT)
+_DISCOUNT = Engine(row_engines.discount, instead=_SWEPT, column="traced rows")
+_DISCOUNTED_GAME = Engine(minimax.discounted_game)
+_AVERAGE = Engine(average.average, ("max_steps",))
+_ACCEPT = Engine(interval_satisfaction.accept_with_nature)
+_COMPILED_ACCEPT = Engine(acceptance.accept_padded, ("method", *_LIMITED))
+
+# For each question the engine of each kind of model, by its `column`.
+ENGINES: dict[type[Path], dict[str, Engine]] = {
+    Reach: {
+        "padded": _EXACT_REACH,
+        "rows": Engine(reaching.reach, ("method",), relative=True),
+        "intervals": _ROBUST_REACH,
+        "padded game": _ROBUST_REACH,
+        "rows game": _ROBUST_REACH,
+        "intervals game": _ROBUST_REACH,
+        "other": _COMPILED_REACH,
+        "traced padded": _COMPILED_REACH,
+        "traced other": _COMPILED_REACH,
+        "mesh padded": _COMPILED_REACH,
+    },
+    TotalReward: {
+        "padded": _EARN,
+        "rows": _EARN,
+        "intervals": _ROBUST_EARN,
+        "padded game": _ROBUST_EARN,
+        "rows game": _ROBUST_EARN,
+        "intervals game": _ROBUST_EARN,
+        "traced padded": _COMPILED_EARN,
+        "mesh padded": _COMPILED_EARN,
+    },
+    DiscountedReward: {
+        "padded": _COMPILED_DISCOUNT,
+        "rows": _DISCOUNT,
+        "intervals": _ROBUST_DISCOUNT,
+        "padded game": _ROBUST_DISCOUNT,
+        "rows game": _ROBUST_DISCOUNT,
+        "intervals game": _ROBUST_DISCOUNT,
+        "other": _COMPILED_DISCOUNT,
+        "traced padded": _COMPILED_DISCOUNT,
+        "traced rows": _COMPILED_DISCOUNT,
+        "traced other": _COMPILED_DISCOUNT,
+        "mesh padded": _COMPILED_DISCOUNT,
+        "traced padded game": _DISCOUNTED_GAME,
+        "traced rows game": _DISCOUNTED_GAME,
+    },
+    AverageReward: dict.fromkeys(
+        ("padded", "rows", "intervals", "padded game", "rows game", "intervals game"), _AVERAGE
+    ),
+    Acceptance: {
+        "padded": _COMPILED_ACCEPT,
+        "rows": Engine(sparse_satisfaction.accept_rows, relative=True),
+        "intervals": _ACCEPT,
+        "padded game": _ACCEPT,
+        "rows game": _ACCEPT,
+        "intervals game": _ACCEPT,
+        "other": _COMPILED_ACCEPT,
+        "traced padded": _COMPILED_ACCEPT,
+        "traced other": _COMPILED_ACCEPT,
+        "mesh padded": _COMPILED_ACCEPT,
+    },
+}
+
+NAMES: dict[type[Path], str] = {
+    Reach: "reachability_probability",
+    TotalReward: "total_reward",
+    DiscountedReward: "optimal_value and policy_value",
+    AverageReward: "average_reward",
+    Acceptance: "optimal_satisfaction and satisfaction_probability",
+}
+
+
+def solve(
+    model: Model,
+    question: Question,
+    accuracy: Accuracy,
+    *,
+    throw: bool = False,
+    **options: PyTree,
+) -> Solution:
+    """The answer to a question, by the engine for this kind of model.
+
+    Raises:
+      ValueError: no engine answers this question of this kind of model, a direction is given where nobody
+        has it, or an option that the engine does not take.
+      NotConverged: with `throw`, unless the solution converged.
+    """
+    kind = kind_of(model, (question.path, question.policy, accuracy.tolerance, options))
+    given = {name: x for name, x in options.items() if x is not None}
+    engine = engine_for(kind, question, given)
+    if kind.container != "intervals":
+        refuse_nature(question.nature)
+    if not kind.is_game:
+        refuse_environment(question.environment)
+    validation.choice("objective", question.objective, ("max", "min"))
+    for name in given:
+        if name not in engine.options:
+            raise ValueError(
+                f"{name} is an option of iterations on padded and dense models; {kind} is solved "
+                "without it. Leave it out."
+            )
+    if accuracy.relative and not engine.relative:
+        raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
+    solution = engine.solve(model, question, accuracy, **given)
+    return check(solution) if throw else solution
+
+
+def engine_for(kind: Kind, question: Question, given: dict[str, PyTree]) -> Engine:
+    """The engine of a kind of model; ValueError, with what can be asked of it, if there is none."""
+    path = type(question.path)
+    row = ENGINES[path]
+    if kind.column not in row:
+        known = ", ".join(NAMES[other] for other, x in ENGINES.items() if kind.column in x)
+        host = kind._replace(arrays="concrete").column in row and kind.arrays != "concrete"
+        remedy = (
+            "call it outside jit and vmap, on concrete arrays"
+            if host and kind.arrays == "traced"
+            else f"it answers {known or 'none of these questions'}"
+        )
+        raise ValueError(f"{NAMES[path]} has no answer for {kind}; {remedy}.")
+    engine = row[kind.column]
+    if isinstance(question.path, Reach) and question.path.stay is not None:
+        return engine
+    word = given.get("method")
+    chosen = {word if isinstance(word, str) else "", *given}
+    if "iterative" in chosen and question.policy is None:
+        chosen.discard("iterative")
+    return row[engine.column] if chosen & set(engine.instead) else engine

@@ -1,0 +1,134 @@
+"""Compiled engines of undiscounted questions: padded models inside ``jit`` and over a mesh."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.mesh.sharded import ShardedMDP
+from jaxltl.core.models.ops.array_namespace import jit
+from jaxltl.core.models.ops.operators import require_policy
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import ActionModel, Array, Model, base_model
+from jaxltl.core.models.sparse import Reward, Rewards
+from jaxltl.core.types import Solution, require_shape, require_states
+from jaxltl.core.values.door.question import Accuracy, Question, Reach, TotalReward
+from jaxltl.core.values.engine.host_solution import default_tolerance
+from jaxltl.core.values.undiscounted import optimum
+from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
+
+World = MDP | DenseMDP | ShardedMDP
+
+
+def states_of(model: Model, name: str, states: Array | str) -> Array:
+    """A set of states in the model's shape, from a mask or a label's name."""
+    if not isinstance(states, str):
+        require_states(name, states, model.state_shape)
+        return states
+    world = base_model(model)
+    known = getattr(world, "propositions", ())
+    if states not in known:
+        raise ValueError(
+            f"{name}={states!r}; inside jit, and over a mesh, give bool{list(model.state_shape)} or a "
+            f"label of the model: {', '.join(known) or 'it has none'}."
+        )
+    column = world.label[:, known.index(states)]  # type: ignore[attr-defined]
+    return jnp.broadcast_to(
+        column.reshape(-1, *[1] * (len(model.state_shape) - 1)), model.state_shape
+    )
+
+
+def reach(
+    model: Model,
+    question: Question,
+    accuracy: Accuracy,
+    *,
+    method: str = "auto",
+    max_steps: jax.Array | int | None = None,
+    start: tuple[jax.Array, jax.Array] | None = None,
+) -> Solution:
+    """Probabilities of reaching a set in padded models, by interval iteration or a linear system."""
+    path, policy, tolerance = question.path, question.policy, accuracy.tolerance
+    assert isinstance(path, Reach)
+    if path.stay is not None:
+        raise ValueError(
+            "until, with stay, needs concrete arrays; inside jit use prepare(model, target, stay=stay), "
+            "or the product with the formula's automaton."
+        )
+    target, padded = states_of(model, "target", path.target), cast(ActionModel, model)
+    if policy is None:
+        return optimum.optimal_reachability(
+            padded, target, tolerance, max_steps, start, objective=question.objective
+        )
+    require_policy(model, policy)
+    limit = 1_000_000 if max_steps is None else max_steps
+    return optimum.policy_reachability(padded, policy, target, tolerance, limit, method=method)
+
+
+def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+    """Total rewards of padded models inside ``jit`` and over a mesh."""
+    path, policy = question.path, question.policy
+    assert isinstance(path, TotalReward)
+    world, reward = model.mdp if isinstance(model, Product) else model, path.reward
+    if path.target is None:
+        raise ValueError(
+            "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
+            "target."
+        )
+    target = states_of(model, "target", path.target)
+    padded = cast(ActionModel, model)
+    earned = _on_choices(padded, world, reward)
+    _require_rewards(padded, world, earned)
+    requested = default_tolerance(model) if accuracy.tolerance is None else accuracy.tolerance
+    return total_reward_by_sweeps(
+        padded, earned, target, policy, requested, objective=question.objective
+    )
+
+
+def _on_choices(model: ActionModel, world: World, reward: Reward) -> Array:
+    """A reward as one on actions: ``float[S, A]``."""
+    actions = (*model.state_shape, model.num_actions)
+    if reward is None or isinstance(reward, str | Rewards):
+        named = world.rewards if isinstance(world, ShardedMDP) else {}
+        if reward not in named:
+            known = f"; it has {', '.join(named)}" if named else ": give an array"
+            raise ValueError(
+                f"reward={reward!r} is no reward of this {type(world).__name__}{known}."
+            )
+        earned = named[reward]
+        return earned if world is model else jnp.broadcast_to(earned[:, None], actions)
+    if np.shape(reward) == model.state_shape:
+        return jnp.broadcast_to(jnp.asarray(reward)[..., None], actions)
+    require_shape("reward", reward, actions)
+    return reward
+
+
+def _require_rewards(model: ActionModel, world: World, reward: Array) -> None:
+    least, state = _least_reward(model, world, reward)
+    # Inside jit the status is NONFINITE.
+    if not isinstance(least, jax.core.Tracer) and not least >= 0:
+        raise _negative(state, least)
+
+
+def _negative(state: Array | int, reward: Array | float) -> ValueError:
+    return ValueError(
+        f"the reward of a choice of state {state} is {reward:.6g}; expected total rewards need "
+        "rewards of at least 0."
+    )
+
+
+@jit()
+def _least_reward(model: ActionModel, world: World, reward: Array) -> tuple[jax.Array, jax.Array]:
+    """The least reward of an available action, and its state; NaN if one is NaN."""
+    least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)
+    least = least.reshape(world.num_states, -1).min(-1)
+    if isinstance(world, ShardedMDP):
+        least = jnp.where(world.number >= 0, least, jnp.inf)
+        number = world.number
+    else:
+        number = jnp.arange(world.num_states)
+    return jnp.min(least), number[jnp.argmin(least)]
