@@ -15,7 +15,8 @@ from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
-from jaxltl.core.logic.property_tokens import Token, TokenStream
+from jaxltl.core.logic.property_tokens import AFTER_OPERAND, BOUNDS, NUMBERS
+from jaxltl.core.logic.property_tokens import Token, TokenStream, instead_of
 from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
@@ -47,6 +48,7 @@ class Property:
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
+      coalition: of a game, the players who choose for the objective, as in `<<system>> Pmax=?`, or None.
       definitions: propositions of the formulas that are no labels: comparisons and nested properties.
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
 
@@ -69,13 +71,17 @@ class Property:
     definitions: tuple[tuple[str, Comparison | Property], ...] = ()
     aggregate: str | None = None
     among: Formula = TRUE
+    coalition: tuple[str, ...] | None = None
 
     @property
     def direction(self) -> Literal["max", "min"] | None:
-        """The optimum that decides it: a lower threshold for all policies is one on the minimum."""
+        """The optimum that decides it: a lower threshold for all policies is one on the minimum.
+
+        A coalition meets one with some policy, which is one on the maximum.
+        """
         if self.objective is not None or self.relation is None:
             return self.objective
-        return "min" if self.relation in (">", ">=") else "max"
+        return "min" if (self.relation in (">", ">=")) == (self.coalition is None) else "max"
 
     def __str__(self) -> str:
         return self.text
@@ -95,7 +101,9 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     x = 0)` is over the states of a formula, by default all: one of `min max avg sum count range
     first state forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
-    does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
+    does second: `Pmaxmin=?`, `R{"time"}minmax=?`. In a game a coalition comes before that, whose players
+    choose for the objective, and all others against it: `<<system>> Pmax=? [ PATH ]`, also of the
+    `environment`, of both or of none; a threshold is met by some of its strategies.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
     `&&` and `||`, which is for state formulas only. So temporal operators reach as far as they can,
@@ -233,6 +241,19 @@ class _Parser(TokenStream):
 
     def property_(self, name: str | None = None) -> Property:
         start = self.token
+        if self.accept("<<"):
+            players: list[str] = []
+            while self.token.text != ">>" and (not players or self.accept(",")):
+                self.require(self.token.kind == "word", "a player: system or environment")
+                players.append(self.take().text)
+            self.expect(">>", " or ','")
+            inner = self.property_(name)
+            self.require(
+                inner.operator != "multi" and inner.aggregate is None and inner.coalition is None,
+                "P, R, T or LRA after a coalition",
+                start,
+            )
+            return replace(inner, text=self.written(start), coalition=tuple(players))
         if self.accept("multi"):
             return self.multi(start, name)
         if self.accept("filter"):
@@ -281,7 +302,7 @@ class _Parser(TokenStream):
         self.require(kind in FILTERS, f"the kind of the filter: {', '.join(FILTERS)}", place)
         self.expect(",")
         first, before, inner = self.token, self.place, None
-        if first.kind == "word" and _OPERATOR.fullmatch(first.text):
+        if first.text == "<<" or (first.kind == "word" and _OPERATOR.fullmatch(first.text)):
             inner = self.property_()
         if inner is None or self.token.text not in (",", ")"):  # it begins a state formula
             self.place = before
@@ -393,10 +414,12 @@ class _Parser(TokenStream):
             return Formula("ap", proposition=name)
         if constant := self.accept("true", "false"):
             return Formula(constant)
-        if token.kind == "word" and token.text not in self.known.known | self.names.keys():
+        if token.text == "<<" or (
+            token.kind == "word" and token.text not in self.known.known | self.names.keys()
+        ):
             if token.text in "XFG":
                 return self.prefixed()
-            if _OPERATOR.fullmatch(token.text):
+            if token.text == "<<" or _OPERATOR.fullmatch(token.text):
                 nested = self.property_()
                 self.require(
                     nested.relation is not None,
@@ -421,7 +444,7 @@ class _Parser(TokenStream):
             self.expect("(")
             path = self.path(inside=True)
             self.expect(")", " or an operator")
-            self.require(self.token.text not in _AFTER_OPERAND, "a Boolean operator")
+            self.require(self.token.text not in AFTER_OPERAND, "a Boolean operator")
             return path
         except ValueError:
             after, self.place, self.definitions = self.place, place, known
@@ -436,8 +459,8 @@ class _Parser(TokenStream):
         if comparison.is_literal and isinstance(comparison.value, bool):
             return TRUE if comparison.value else FALSE
         is_variable = comparison.operator != "name" or comparison.value in self.known.variables
-        self.require(is_variable, _instead_of(start.text), start)
-        is_number = comparison.operator in _NUMBERS or comparison.is_literal
+        self.require(is_variable, instead_of(start.text), start)
+        is_number = comparison.operator in NUMBERS or comparison.is_literal
         self.require(not is_number, "a comparison, such as x+1<=3")
         return self.defined(Comparison(self.written(start), comparison))
 
@@ -552,16 +575,7 @@ class _Parser(TokenStream):
     def reach_content(self, wanted: str = "F and a state formula") -> Formula:
         start = self.token
         following = self.tokens[min(self.place + 1, len(self.tokens) - 1)]
-        is_bounded = start.text == "F" and following.text in (
-            "<=",
-            "<",
-            ">=",
-            ">",
-            "=",
-            "[",
-            "{",
-            "^",
-        )
+        is_bounded = start.text == "F" and following.text in BOUNDS
         self.require(
             not is_bounded,
             f"{wanted}; F without a bound, since a reward until a bounded path is not solved for",
@@ -573,22 +587,6 @@ class _Parser(TokenStream):
                 wanted += "; only labels and comparisons, not a path, under F"
             raise self.error(wanted, start)
         return path
-
-
-def _instead_of(word: str) -> str:
-    """The syntax expected in place of an unknown word, for error messages."""
-    if word in ("Y", "Z", "O", "H", "S", "B", "T"):
-        return "an operator of the future, X F G U W R; those of the past, such as Y O H S, are not read"
-    if set(word) <= set("XFGUWRM"):
-        return (
-            "X, F or G, with blanks between operators; U, W and R stand between two formulas, and "
-            "a M b is (b) U (a & b)"
-        )
-    return f'a label in double quotes, such as "{word}", or a comparison of variables, such as {word}=1'
-
-
-_AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")
-_NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "pow", "mod", "log")
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {

@@ -24,6 +24,9 @@ from jaxltl.core.logic.ltl import pointed
 
 
 _OPERATORS = ("+", "-", "*", "/", "^")  # that continue a number as an expression
+AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")
+NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "pow", "mod", "log")
+BOUNDS = ("<=", "<", ">=", ">", "=", "[", "{", "^")  # what follows a bounded operator
 _MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
 
 
@@ -40,7 +43,7 @@ _TOKEN = re.compile(
   | (?P<quoted>"(?:\\["\\]|[^"])*+")
   | (?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
-  | (?P<sign><=>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*%^'])
+  | (?P<sign><=>|<<|>>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*%^'])
 """,
     re.VERBOSE,
 )
@@ -232,3 +235,15 @@ class TokenStream:
 def _expected(message: str) -> str:
     """The expected syntax, for an error in an expression."""
     return message.partition("expected ")[2].rstrip(".") or message.rstrip(".")
+
+
+def instead_of(word: str) -> str:
+    """The syntax expected in place of an unknown word, for error messages."""
+    if word in ("Y", "Z", "O", "H", "S", "B", "T"):
+        return "an operator of the future, X F G U W R; those of the past, such as Y O H S, are not read"
+    if set(word) <= set("XFGUWRM"):
+        return (
+            "X, F or G, with blanks between operators; U, W and R stand between two formulas, and "
+            "a M b is (b) U (a & b)"
+        )
+    return f'a label in double quotes, such as "{word}", or a comparison of variables, such as {word}=1'

@@ -62,11 +62,12 @@ def robust_satisfaction(
     *,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
     states: ArrayLike | None = None,
     tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
-    """Robust satisfaction probability of a formula in an interval MDP; labels are read on exit."""
-    form, aims = row_form(model), directions(objective, nature)
+    """Satisfaction probability of a formula in an interval MDP or a game; labels are read on exit."""
+    form, aims = row_form(model), directions(objective, nature, environment)
     world, requested = form.uncertain, requested_width(tolerance)
     automaton, letter = automaton_and_letters(world.nominal, formula)
     states = starting_states(world, states)

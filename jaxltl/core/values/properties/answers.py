@@ -13,6 +13,7 @@ from jaxltl.core.array_types import Booleans
 from jaxltl.core.deferred import deferred_field
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
@@ -82,7 +83,7 @@ class Answer(NamedTuple):
     strategy: PropertyStrategy | None
 
 
-Model = SparseMDP | IntervalMDP
+Model = SparseMDP | IntervalMDP | Game
 
 
 def with_definitions(
@@ -93,7 +94,8 @@ def with_definitions(
     Raises:
       ValueError: a nested property is not decided in some state, or an unknown variable.
     """
-    world = model.nominal if isinstance(model, IntervalMDP) else model
+    inner = model.mdp if isinstance(model, Game) else model
+    world = inner.nominal if isinstance(inner, IntervalMDP) else inner
     columns: dict[str, Booleans] = {}
     for name, meaning in prop.definitions:
         if name in world.propositions:
@@ -115,7 +117,8 @@ def with_definitions(
         return model
     label = np.column_stack([np.asarray(world.label), *columns.values()])
     more = replace(world, label=label, propositions=(*world.propositions, *columns))
-    return replace(model, nominal=more) if isinstance(model, IntervalMDP) else more
+    changed = replace(inner, nominal=more) if isinstance(inner, IntervalMDP) else more
+    return replace(model, mdp=changed) if isinstance(model, Game) else changed
 
 
 def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:

@@ -13,6 +13,7 @@ from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward, exact_state_reward
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
 from jaxltl.core.sparse.exact import bounded
@@ -33,10 +34,10 @@ _WIDTH = 0.01  # of the bounds of the product, of which only the graph is used
 
 
 def exact_values(
-    model: SparseMDP | IntervalMDP, prop: Property, states: np.ndarray, maximize: bool
+    model: SparseMDP | IntervalMDP | Game, prop: Property, states: np.ndarray, maximize: bool
 ) -> list[Fraction | float] | None:
-    """Values at some states, fractions or infinite; None if the model is large or has intervals."""
-    if isinstance(model, IntervalMDP):
+    """Values at some states, fractions or infinite; None if it is large, a game or has intervals."""
+    if not isinstance(model, SparseMDP):
         return None
     if model.num_states > MAX_STATES or model.num_transitions > MAX_TRANSITIONS:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
-from typing import NamedTuple, TypedDict, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +19,7 @@ from jaxltl.core.logic.ltl import Formula, TRUE
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.action_numbers import rows_of_policy
 from jaxltl.core.models.construct.state_formulas import states_satisfying
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, SparseMDP
 from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
@@ -33,6 +32,13 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
     Pareto,
+)
+from jaxltl.core.values.properties.aims import (
+    CheckableModel,
+    PropertyAim,
+    aim_of,
+    checkable,
+    graph_of_model,
 )
 from jaxltl.core.values.properties.answers import (
     Answer as Answer,
@@ -63,7 +69,6 @@ _MARGIN = 1e-6  # relative difference of values of doubles and of the rationals 
 _RATIONAL = "rational arithmetic"
 TINY = 1e-12  # absolute width of bounds on rewards that is always accepted
 _AVERAGE = "averages of end components"
-_OTHER = {"max": "min", "min": "max"}
 
 
 class _Result(NamedTuple):
@@ -73,35 +78,9 @@ class _Result(NamedTuple):
     strategy: PropertyStrategy | None
 
 
-class Directions(TypedDict, total=False):
-    """Directions of the policy and of nature, as arguments of the solvers."""
-
-    objective: str
-    nature: str
-
-
-class _Aim(NamedTuple):
-    """Directions of the policy and of nature: ``"max"`` or ``"min"``."""
-
-    policy: str
-    nature: str | None = None
-
-    @property
-    def opposite(self) -> _Aim:
-        return _Aim(_OTHER[self.policy], None if self.nature is None else _OTHER[self.nature])
-
-    @property
-    def directions(self) -> Directions:
-        """Keyword arguments of the solvers."""
-        if self.nature is None:
-            return {"objective": self.policy}
-        nature = "cooperative" if self.nature == self.policy else "adversarial"
-        return {"objective": self.policy, "nature": nature}
-
-
-@validated(host=True)
+@validated(games=True, host=True)
 def solve_property(
-    model: SparseMDP | IntervalMDP,
+    model: Model,
     prop: Property | str,
     *,
     states: ArrayLike | None = None,
@@ -111,8 +90,9 @@ def solve_property(
     """Model checking: the value of a property, or its truth, with certified bounds.
 
     Args:
-      model: an interval model needs the directions of the policy and of nature, as in
-        ``Pmaxmin=?``; an interval chain that of nature.
+      model: any concrete model. An interval model needs the directions of the policy and of nature, as
+        in ``Pmaxmin=?``; an interval chain that of nature; a game a coalition of its players, system
+        and environment, as in ``<<system>> Pmax=?``. States of a product are numbered ``s * Q + q``.
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
       states: ``int[I]``; default the initial states. Not with ``multi(...)``.
       tolerance: width of the bounds, absolute for probabilities and relative otherwise.
@@ -136,13 +116,9 @@ def solve_property(
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
     """
-    if not isinstance(model, SparseMDP | IntervalMDP):
-        raise ValueError(
-            f"properties of {type(model).__name__} are not supported; give a SparseMDP "
-            "(see to_sparse) or an IntervalMDP."
-        )
+    model = checkable(model)
     if isinstance(prop, str):
-        prop = parse_property(prop, Definitions(variables=tuple(_graph(model).valuation)))
+        prop = parse_property(prop, Definitions(variables=tuple(graph_of_model(model).valuation)))
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     again = partial(solve_property, tolerance=tolerance, relative=relative)
@@ -155,17 +131,19 @@ def solve_property(
     if relative and (
         prop.operator in ("multi", "LRA")
         or prop.path == Earned("average")
-        or (isinstance(model, IntervalMDP) and prop.operator == "P")
+        or (not isinstance(model, SparseMDP) and prop.operator == "P")
     ):
         raise ValueError(
-            f"{prop.text}: relative=True is for probabilities of path formulas, without intervals, "
-            "and for total rewards."
+            f"{prop.text}: relative=True is for probabilities of path formulas, without intervals or a "
+            "second player, and for total rewards."
         )
     width = RelativeTolerance if relative else float
     if prop.operator == "multi":
-        if states is not None or isinstance(model, IntervalMDP):
+        if states is not None or not isinstance(model, SparseMDP):
             restriction = (
-                "from other than the initial states" if states is not None else "with intervals"
+                "from other than the initial states"
+                if states is not None
+                else "with intervals or a second player"
             )
             raise ValueError(
                 f"{prop.text}: multi(...) is not supported {restriction}; ask for one objective at a time."
@@ -177,7 +155,7 @@ def solve_property(
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
     tolerance = requested_width(tolerance)
-    aim = _aim(model, prop)
+    aim = aim_of(model, prop)
     solve = partial(_solved, _ModelQuery(model, states, prop.text), prop, aim)
     exact = partial(exact_values, model, prop, states, maximize=aim.policy == "max")
     result = solve(width(tolerance))
@@ -200,13 +178,11 @@ def solve_property(
     return _answer(prop, states, result, verdicts, tolerance)
 
 
-def _filter(
-    model: SparseMDP | IntervalMDP, prop: Property, states: object, tolerance: float
-) -> Answer:
+def _filter(model: CheckableModel, prop: Property, states: object, tolerance: float) -> Answer:
     """The aggregate of a property over the states of a filter."""
     if states is not None:
         raise ValueError(f"{prop.text}: a filter is over its own states; leave states out.")
-    among = np.flatnonzero(states_satisfying(_graph(model), prop.among, prop.text))
+    among = np.flatnonzero(states_satisfying(graph_of_model(model), prop.among, prop.text))
     if not among.size:
         raise ValueError(f"{prop.text}: no state satisfies {prop.among}, the states of the filter.")
     # So that sums of bounds are as narrow as the tolerance.
@@ -275,9 +251,9 @@ def _is_exact(result: _Result) -> bool:
     return bool((result.solution.lower == result.solution.upper).all())
 
 
-def _is_tiny(model: SparseMDP | IntervalMDP) -> bool:
+def _is_tiny(model: CheckableModel) -> bool:
     """True if few choices leave their state."""
-    return int(np.count_nonzero(~_graph(model).host.is_self_loop)) <= _FEW
+    return int(np.count_nonzero(~graph_of_model(model).host.is_self_loop)) <= _FEW
 
 
 def _with_values(result: _Result, exact: list[Fraction | float] | None) -> _Result:
@@ -299,9 +275,9 @@ def _with_values(result: _Result, exact: list[Fraction | float] | None) -> _Resu
     return result._replace(solution=solution)
 
 
-def _is_close(model: SparseMDP | IntervalMDP, prop: Property, result: _Result) -> bool:
+def _is_close(model: CheckableModel, prop: Property, result: _Result) -> bool:
     """True if the doubles of a model and the numbers of its source may differ in the verdict."""
-    if isinstance(model, IntervalMDP) or model.numbers.read is None:
+    if not isinstance(model, SparseMDP) or model.numbers.read is None:
         return False
     assert prop.threshold is not None
     threshold = float(prop.threshold)
@@ -334,66 +310,25 @@ def meets(
     return True if lower > threshold else False if upper <= threshold else None
 
 
-def _aim(model: SparseMDP | IntervalMDP, prop: Property) -> _Aim:
-    sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
-    if isinstance(model, IntervalMDP):
-        return _robust_aim(model, prop, sign)
-    if prop.nature is not None:
-        raise ValueError(
-            f"{prop.text}: the model has no intervals from which nature could pick; ask for "
-            f"{sign}{prop.objective}=?."
-        )
-    if prop.direction is not None:
-        return _Aim(prop.direction)
-    if not model.is_chain:
-        raise ValueError(
-            f"{prop.text}: the model has states with several choices, so the value depends on a "
-            f"strategy; ask for {sign}max=? or {sign}min=?."
-        )
-    return _Aim("max")
-
-
-def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
-    """Both directions; a threshold without them is over all strategies and choices of nature."""
-    if prop.nature is not None:
-        assert prop.objective is not None
-        return _Aim(prop.objective, prop.nature)
-    if prop.direction is not None and (model.is_chain or prop.objective is None):
-        return _Aim(prop.direction, prop.direction)
-    if model.is_chain:
-        raise ValueError(
-            f"{prop.text}: the probabilities of this chain are intervals, so the value depends on "
-            f"what nature picks from them; ask for {sign}min=? or {sign}max=?."
-        )
-    firsts = ("max", "min") if prop.objective is None else (prop.objective,)
-    listed = [f"{sign}{first}{second}=?" for first in firsts for second in ("min", "max")]
-    raise ValueError(
-        f"{prop.text}: probabilities are intervals, so the value depends on a strategy and on what "
-        f"nature picks; ask for {', '.join(listed[:-1])} or {listed[-1]}, the strategy's direction "
-        "first and nature's second."
-    )
-
-
 # --- which solver -----------------------------------------------------------------------------
 
 
-def _solved(query: _ModelQuery, prop: Property, aim: _Aim, tolerance: float) -> _Result:
+def _solved(query: _ModelQuery, prop: Property, aim: PropertyAim, tolerance: float) -> _Result:
     """The solution of a property at some states."""
     model, path = query.model, prop.path
     if prop.operator == "P":
         assert not isinstance(path, Earned)
         return query.probability(path, aim, tolerance)
     if prop.operator == "LRA" or path == Earned("average"):
-        known = _without_intervals(model, prop.text, "averages in the long run")
         reward: Reward = prop.reward
         if prop.operator == "LRA":
             assert isinstance(path, Formula)
             reward = query.where(path).astype(np.float64)
         elif prop.operator == "T":
-            reward = np.ones(model.num_rows)
-        average = average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+            reward = np.ones(graph_of_model(model).num_rows)
+        average = average_reward(model, reward, tolerance=tolerance, **aim.directions)
         return query.result(replace(average, method=_AVERAGE))
-    reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
+    reward = np.ones(graph_of_model(model).num_rows) if prop.operator == "T" else prop.reward
     target = None
     if isinstance(path, Formula):
         target = query.where(path.operands[0])
@@ -401,48 +336,33 @@ def _solved(query: _ModelQuery, prop: Property, aim: _Aim, tolerance: float) -> 
         cumulative = path.kind == "cumulative"
         solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
         return query.result(solve(model, reward, path.steps, **aim.directions), by="steps")
-    else:
-        model = _without_intervals(model, prop.text, "rewards for ever (C)")
+    elif not isinstance(model, SparseMDP):
+        raise ValueError(
+            f"{prop.text}: rewards for ever (C) are not solved for where probabilities are intervals or two "
+            "players choose; ask for those until a state is reached (F), of so many steps (C<=k) or "
+            "after them (I=k), or for the average (S)."
+        )
     return query.result(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
-
-
-def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
-    """All of a model but its intervals."""
-    return model.nominal if isinstance(model, IntervalMDP) else model
-
-
-def _without_intervals(
-    model: SparseMDP | IntervalMDP, prop: Property | str, quantity: str
-) -> SparseMDP:
-    """The model, if it is not an interval model."""
-    if not isinstance(model, IntervalMDP):
-        return model
-    raise ValueError(
-        f"{prop}: {quantity} are not solved for where probabilities are intervals; solved for are "
-        "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
-        "steps (C<=k) and after them (I=k). Ask for one of these, or give model.nominal, which is "
-        "one choice of nature."
-    )
 
 
 class _ModelQuery(NamedTuple):
     """A model and the states at which a property is asked for."""
 
-    model: SparseMDP | IntervalMDP
+    model: CheckableModel
     states: np.ndarray
     text: str
 
     def where(self, condition: Formula) -> np.ndarray:
-        return states_satisfying(_graph(self.model), condition, self.text)
+        return states_satisfying(graph_of_model(self.model), condition, self.text)
 
     def result(self, solution: Solution, by: str = "") -> _Result:
         """A solution at all states, at those that are asked for."""
         nature = None if solution.nature is None else np.asarray(solution.nature)
-        rows = rows_of_policy(_graph(self.model), solution.policy)
+        rows = rows_of_policy(graph_of_model(self.model), solution.policy)
         strategy = PropertyStrategy(rows, by, nature=nature)
         return _Result(at_states(solution, self.states), strategy)
 
-    def probability(self, path: Formula | Bounded, aim: _Aim, tolerance: float) -> _Result:
+    def probability(self, path: Formula | Bounded, aim: PropertyAim, tolerance: float) -> _Result:
         """The probability of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
             return self.within(path, aim, tolerance)
@@ -478,7 +398,7 @@ class _ModelQuery(NamedTuple):
             Solution(holds, no_policy, holds, holds, zero, zero, zero, method="the label"), None
         )
 
-    def negation(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
+    def negation(self, path: Formula, aim: PropertyAim, tolerance: float) -> _Result:
         """The probability that a formula with temporal operators is false."""
         first, right = path.operands[0], path.operands[-1]
         if path.operator == "!":
@@ -504,7 +424,7 @@ class _ModelQuery(NamedTuple):
         self,
         first: Formula,
         right: Formula,
-        aim: _Aim,
+        aim: PropertyAim,
         tolerance: float,
         *,
         complement: bool = False,
@@ -525,7 +445,7 @@ class _ModelQuery(NamedTuple):
                 self.model, target, stay=stay, tolerance=tolerance, **aim.directions
             )
         result = self.result(solution)
-        if complement or self.model.is_chain or not isinstance(self.model, SparseMDP):
+        if complement or not isinstance(self.model, SparseMDP) or self.model.is_chain:
             return result
         if self.model.num_states > QUICK_LIMIT:
             return result
@@ -533,7 +453,7 @@ class _ModelQuery(NamedTuple):
         row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
         return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 
-    def automaton(self, path: Formula, aim: _Aim, tolerance: float) -> _Result:
+    def automaton(self, path: Formula, aim: PropertyAim, tolerance: float) -> _Result:
         result = optimal_satisfaction(
             self.model, path, states=self.states, tolerance=tolerance, **aim.directions
         )
@@ -544,7 +464,7 @@ class _ModelQuery(NamedTuple):
         )  # the row may be deferred
         return _Result(replace(result.solution, method=method), strategy)
 
-    def within(self, path: Bounded, aim: _Aim, tolerance: float) -> _Result:
+    def within(self, path: Bounded, aim: PropertyAim, tolerance: float) -> _Result:
         complement, asked = path.operator == "R", aim
         if complement:
             negated = TRUE if path.left.operator == "false" else ~path.left

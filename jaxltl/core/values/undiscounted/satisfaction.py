@@ -22,7 +22,7 @@ from jaxltl.core.values.door.table import solve
 from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
-from jaxltl.core.values.interval.sides import refuse_nature
+from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
 from jaxltl.core.values.undiscounted.acceptance import require_product
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction, sparse_satisfaction
 
@@ -103,6 +103,7 @@ def optimal_satisfaction(
     nature: str | None = None,
     states: ArrayLike | None = None,
     label_on: str | None = None,
+    environment: str | None = None,
     tolerance: float | None = None,
     relative: bool = False,
     throw: bool = False,
@@ -148,7 +149,7 @@ def optimal_satisfaction(
       states: with `formula`, ``int[I]``, the requested states; default the initial ones.
       label_on: with `formula`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
         state's label; the probability is the same. Interval models read on exit.
-      environment: for games with a product, ``"adversarial"`` (default) or ``"cooperative"``.
+      environment: for games, ``"adversarial"`` (default) or ``"cooperative"``.
       tolerance, relative, throw: as for :func:`reachability_probability`.
       max_steps, start: as there; of a product.
 
@@ -184,14 +185,16 @@ def optimal_satisfaction(
             start=start,
         )
     refuse_traced("optimal_satisfaction", [("model", model), ("tolerance", tolerance)])
-    if max_steps is not None or start is not None or environment is not None:
+    if max_steps is not None or start is not None:
         raise ValueError(
-            "max_steps, start and environment are options for a product; a model with a formula is "
-            "solved without them. Leave them out, or give product(model, formula)."
+            "max_steps and start are options for a product; a model with a formula is solved without "
+            "them. Leave them out, or give product(model, formula)."
         )
     kind = kind_of(model)
     if kind.container != "intervals":
         refuse_nature(nature)
+    if not kind.is_game:
+        refuse_environment(environment)
     if relative:
         if kind.column != "rows":
             raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
@@ -200,7 +203,13 @@ def optimal_satisfaction(
         if label_on is not None:  # interval models read labels on exit
             validation.choice("label_on", label_on, ("exit",))
         found = robust_satisfaction(
-            model, formula, objective=objective, nature=nature, states=states, tolerance=tolerance
+            model,
+            formula,
+            objective=objective,
+            nature=nature,
+            environment=environment,
+            states=states,
+            tolerance=tolerance,
         )
     else:
         found = sparse_satisfaction(

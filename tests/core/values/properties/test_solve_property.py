@@ -275,12 +275,55 @@ def test_mistakes_are_named(text, message):
         solve_property(random_rewarded(1), text)
 
 
-def test_other_models_are_named_before_the_property():
-    world = jl.make_mdp([[[0]]], [[[1.0]]], label={"a": [0]})
-    with pytest.raises(ValueError, match=r"properties of MDP are not supported.*to_sparse"):
-        solve_property(world, 'P=? [ F "a" ]')
+def test_models_of_every_kind_have_properties():
+    world = jl.make_mdp([[[1, 2], [1, 2]], [[1, 1]] * 2, [[2, 2]] * 2],
+                        [[[0.5, 0.5], [0.25, 0.75]], [[1.0, 0]] * 2, [[1.0, 0]] * 2],
+                        label={"a": [1]}, initial=[1, 0, 0])  # fmt: skip
+    for model in (world, jl.models.to_dense(world), jl.to_sparse(world), jl.product(world, "F a")):
+        assert solve_property(model, 'Pmax=? [ F "a" ]').value.tolist() == [0.5]
+        assert solve_property(model, 'P>=0.25 [ F "a" ]').holds == [True]
+    with pytest.raises(ValueError, match=r"no game.*leave out the coalition"):
+        solve_property(world, '<<system>> Pmax=? [ F "a" ]')
     with pytest.raises(ValueError, match="give a property or its text"):
         solve_property(chance(0.5), 0.5)
+
+
+def test_coalitions_of_the_players_of_a_game():
+    """The system may stay away from a, and the environment takes the worse of two coins."""
+    world = jl.make_mdp([[[1, 2], [2, 2]], [[2, 3], [2, 3]], [[2, 2]] * 2, [[3, 3]] * 2],
+                        [[[0.5, 0.5], [1.0, 0]], [[0.5, 0.5], [0.25, 0.75]], [[1.0, 0]] * 2, [[1.0, 0]] * 2],
+                        label={"a": [3]}, initial=[1, 0, 0, 0])  # fmt: skip
+    game = jl.make_game(world, [True, False, True, True])
+
+    def ask(text, model=game):
+        return solve_property(model, text)
+
+    for coalition, direction, value in (
+        ("system", "max", 0.25), ("system", "min", 0), ("environment", "max", 0),
+        ("environment", "min", 0.25), ("system, environment", "max", 0.375),
+        ("system, environment", "min", 0), ("", "max", 0), ("", "min", 0.375),
+    ):  # fmt: skip
+        prop = f'<<{coalition}>> P{direction}=? [ F "a" ]'
+        assert ask(prop).value.tolist() == [value], prop
+        assert ask(f'<<{coalition}>> P{direction}=? [ F G "a" ]').value[0] == pytest.approx(value)
+        assert ask(prop, jl.product(game, "F a")).value.tolist() == [value]
+    assert ask('<<system>> P>=0.24 [ F "a" ]').holds == [True]  # by some strategy
+    assert ask('<<system>> P>=0.3 [ F "a" ]').holds == [False]
+    assert ask('<<environment>> P<=0.3 [ F "a" ]').holds == [True]
+    assert ask('<<system>> P>=1 [ F (<<environment>> P>=0.5 [ X "a" ]) ]').holds == [False]
+    assert ask('<<system>> Pmax=? [ F<=1 "a" ]').value.tolist() == [0]
+    assert ask('filter(max, <<system>> Pmax=? [ F "a" ])').value.tolist() == [1]
+    for text, message in (
+        ('Pmax=? [ F "a" ]', "who chooses for it; ask for <<system>> Pmax="),
+        ('<<me>> Pmax=? [ F "a" ]', "player='me'; choose system or environment"),
+        ('<<system>> P=? [ F "a" ]', "say what the coalition wants"),
+        ('<<system>> Pmaxmin=? [ F "a" ]', "no intervals"),
+        ('<<system>> multi(Pmax=? [ F "a" ])', "after a coalition"),
+        ('<<system Pmax=? [ F "a" ]', ">>"),
+        ("<<system>> Rmax=? [ C ]", "rewards for ever"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ask(text)
 
 
 @pytest.mark.parametrize(
