@@ -40,7 +40,55 @@ class Acceptance(NamedTuple):
     """The probability that the automaton of a product accepts."""
 
 
-Path = Reach | TotalReward | DiscountedReward | AverageReward | Acceptance
+class NextStep(NamedTuple):
+    """The probability that the next state is in a set."""
+
+    target: Array | str
+
+
+class ReachWithin(NamedTuple):
+    """The probability of reaching a set within a number of steps."""
+
+    target: Array | str
+    num_steps: int
+    stay: Array | str | None = None
+
+
+class RewardOfSteps(NamedTuple):
+    """The expected reward of a number of steps."""
+
+    reward: Reward
+    num_steps: int
+
+
+class RewardAfterSteps(NamedTuple):
+    """The expected reward of the state after a number of steps."""
+
+    reward: Reward
+    num_steps: int
+
+
+class ReachAtCost(NamedTuple):
+    """The probability of reaching a set before more than a bound of reward is earned."""
+
+    target: Array | str
+    reward: Reward
+    bound: float
+    stay: Array | str | None = None
+
+
+Path = (
+    Reach
+    | TotalReward
+    | DiscountedReward
+    | AverageReward
+    | Acceptance
+    | NextStep
+    | ReachWithin
+    | RewardOfSteps
+    | RewardAfterSteps
+    | ReachAtCost
+)
 
 
 class Question(NamedTuple):

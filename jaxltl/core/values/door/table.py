@@ -17,9 +17,14 @@ from jaxltl.core.values.door.question import (
     Accuracy,
     AverageReward,
     DiscountedReward,
+    NextStep,
     Path,
     Question,
     Reach,
+    ReachAtCost,
+    ReachWithin,
+    RewardAfterSteps,
+    RewardOfSteps,
     TotalReward,
 )
 from jaxltl.core.values.interval import satisfaction as interval_satisfaction
@@ -29,6 +34,7 @@ from jaxltl.core.values.undiscounted import (
     compiled_engines,
     reaching,
     sparse_satisfaction,
+    step_engine,
 )
 
 
@@ -59,6 +65,8 @@ _DISCOUNTED_GAME = Engine(minimax.discounted_game)
 _AVERAGE = Engine(average.average, ("max_steps",))
 _ACCEPT = Engine(interval_satisfaction.accept_with_nature)
 _COMPILED_ACCEPT = Engine(acceptance.accept_padded, ("method", *_LIMITED))
+
+CONCRETE = ("padded", "rows", "intervals", "padded game", "rows game", "intervals game")
 
 # For each question the engine of each kind of model, by its `column`.
 ENGINES: dict[type[Path], dict[str, Engine]] = {
@@ -99,9 +107,12 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "traced padded game": _DISCOUNTED_GAME,
         "traced rows game": _DISCOUNTED_GAME,
     },
-    AverageReward: dict.fromkeys(
-        ("padded", "rows", "intervals", "padded game", "rows game", "intervals game"), _AVERAGE
-    ),
+    AverageReward: dict.fromkeys(CONCRETE, _AVERAGE),
+    NextStep: dict.fromkeys(CONCRETE, Engine(step_engine.reach_next)),
+    ReachWithin: dict.fromkeys(CONCRETE, Engine(step_engine.reach_within, ("by_step",))),
+    RewardOfSteps: dict.fromkeys(CONCRETE, Engine(step_engine.reward_of_steps, ("by_step",))),
+    RewardAfterSteps: dict.fromkeys(CONCRETE, Engine(step_engine.reward_after_steps, ("by_step",))),
+    ReachAtCost: dict.fromkeys(CONCRETE, Engine(step_engine.reach_at_cost, ("by_level",))),
     Acceptance: {
         "padded": _COMPILED_ACCEPT,
         "rows": Engine(sparse_satisfaction.accept_rows, relative=True),
@@ -121,6 +132,11 @@ NAMES: dict[type[Path], str] = {
     TotalReward: "total_reward",
     DiscountedReward: "optimal_value and policy_value",
     AverageReward: "average_reward",
+    NextStep: "next_probability",
+    ReachWithin: "bounded_reachability",
+    RewardOfSteps: "cumulative_reward",
+    RewardAfterSteps: "instantaneous_reward",
+    ReachAtCost: "reward_bounded_reachability",
     Acceptance: "optimal_satisfaction and satisfaction_probability",
 }
 

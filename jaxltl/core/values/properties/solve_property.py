@@ -49,6 +49,7 @@ from jaxltl.core.values.properties.answers import (
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
 from jaxltl.core.values.properties.exact_thresholds import exact_values, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
+from jaxltl.core.values.undiscounted.step_engine import bounded_avoidance
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.reaching import avoidance_probability
@@ -487,7 +488,7 @@ class _ModelQuery(NamedTuple):
                 ~unfolded(path) if complement else unfolded(path), asked, tolerance
             )
         if complement and isinstance(tolerance, RelativeTolerance):
-            avoided = bounded.bounded_avoidance(
+            avoided = bounded_avoidance(
                 self.model, target, path.upper, stay=stay, **asked.directions
             )
             if avoided is not None:

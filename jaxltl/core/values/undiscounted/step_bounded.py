@@ -5,43 +5,23 @@ Solved in double precision; bounds include all rounding.
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-from typing import NamedTuple, cast
-
-import numpy as np
-
-from jaxltl.core import validation
-from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import Reward, reward_structure
-from jaxltl.core.sparse.bounded.backup import StepReward
-from jaxltl.core.sparse.bounded.reward_bounded import BudgetLevel, in_units, until_at_cost
-from jaxltl.core.sparse.bounded.row_game import RowGame
-from jaxltl.core.sparse.bounded.step_bounded import (
-    StepBoundedValues,
-    avoidance,
-    next_step,
-    total,
-    until,
-)
+from jaxltl.core.models.sparse import Reward
 from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.host_solution import with_given_policy
-from jaxltl.core.values.engine.row_form import RowForm, row_form
-from jaxltl.core.values.engine.state_quantities import (
-    PROBABILITY,
-    Span,
-    finite_reward,
-    reward_span,
-    solution_from_error,
-    state_reward,
-    transition_reward,
+from jaxltl.core.values.door.question import (
+    Accuracy,
+    NextStep,
+    Question,
+    ReachAtCost,
+    ReachWithin,
+    RewardAfterSteps,
+    RewardOfSteps,
 )
+from jaxltl.core.values.door.table import solve
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.values.interval.sides import directions, refuse_environment, refuse_nature
 
 
-@validated(games=True, host=True)
+@validated(games=True)
 def next_probability(
     model: Model,
     target: Array | str,
@@ -71,12 +51,11 @@ def next_probability(
       >>> found.value.tolist(), found.policy.tolist()
       ([0.25, 1.0], [0, 0])
     """
-    problem = _problem(model, objective, nature, environment, policy)
-    values = next_step(problem.game, problem.form.states("target", target))
-    return problem.solution(values, PROBABILITY)
+    question = Question(NextStep(target), objective, nature, environment, policy)
+    return solve(model, question, Accuracy())
 
 
-@validated(games=True, host=True)
+@validated(games=True)
 def bounded_reachability(
     model: Model,
     target: Array | str,
@@ -126,28 +105,13 @@ def bounded_reachability(
       >>> bounded_reachability(model, [False, True], 3).value.tolist()
       [0.875, 1.0]
     """
-    steps = validation.integer("num_steps", num_steps)
-    problem = _problem(model, objective, nature, environment, policy)
-    goal, free = problem.form.states("target", target), problem.passable(stay)
-    return problem.solution(until(problem.game, goal, free, steps, by_step), PROBABILITY)
+    question = Question(
+        ReachWithin(target, num_steps, stay), objective, nature, environment, policy
+    )
+    return solve(model, question, Accuracy(), by_step=by_step or None)
 
 
-def bounded_avoidance(
-    model: Model,
-    target: Array,
-    num_steps: int,
-    *,
-    stay: Array,
-    objective: str = "max",
-    nature: str | None = None,
-) -> Solution | None:
-    """Complement of :func:`bounded_reachability`, relatively exact; None for many steps."""
-    problem = _problem(model, objective, nature, None, None)
-    values = avoidance(problem.game, target, stay, num_steps)
-    return None if values is None else problem.solution(values, PROBABILITY)
-
-
-@validated(games=True, host=True)
+@validated(games=True)
 def cumulative_reward(
     model: Model,
     reward: Reward,
@@ -180,22 +144,11 @@ def cumulative_reward(
       >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
       [1.75, 0.0]
     """
-    steps = validation.integer("num_steps", num_steps)
-    problem = _problem(model, objective, nature, environment, policy)
-    rewards = problem.form.reward(reward)
-    earned, magnitude = finite_reward(problem.form.sparse, rewards)
-    entry = None
-    if problem.game.sets is not None:
-        entry = transition_reward(problem.form.sparse, rewards)
-        magnitude = np.maximum.reduceat(np.abs(entry), problem.form.sparse.host.entry_start[:-1])
-        entry = entry[problem.entry]
-    paid = StepReward(earned[problem.row], magnitude[problem.row], entry)
-    start = np.zeros(problem.game.mdp.num_states)
-    values = total(problem.game, paid, start, steps, by_step)
-    return problem.solution(values, reward_span(rewards, steps))
+    question = Question(RewardOfSteps(reward, num_steps), objective, nature, environment, policy)
+    return solve(model, question, Accuracy(), by_step=by_step or None)
 
 
-@validated(games=True, host=True)
+@validated(games=True)
 def instantaneous_reward(
     model: Model,
     reward: Reward,
@@ -230,15 +183,11 @@ def instantaneous_reward(
       >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
       [0.125, 0.0]
     """
-    steps = validation.integer("num_steps", num_step)
-    problem = _problem(model, objective, nature, environment, policy)
-    final = state_reward(problem.form.sparse, problem.form.reward(reward))
-    zero = np.zeros(problem.game.mdp.num_rows)
-    values = total(problem.game, StepReward(zero, zero), final, steps, by_step)
-    return problem.solution(values, (float(final.min()), float(final.max())))
+    question = Question(RewardAfterSteps(reward, num_step), objective, nature, environment, policy)
+    return solve(model, question, Accuracy(), by_step=by_step or None)
 
 
-@validated(games=True, host=True)
+@validated(games=True)
 def reward_bounded_reachability(
     model: Model,
     target: Array | str,
@@ -282,72 +231,7 @@ def reward_bounded_reachability(
       >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
       [0.875, 1.0]
     """
-    problem = _problem(model, objective, nature, environment, policy)
-    goal, free = problem.form.states("target", target), problem.passable(stay)
-    validation.require_in_range("bound", bound, validation.Range(0, math.inf, open_above=True))
-    sparse, host = problem.form.sparse, problem.form.sparse.host
-    # Rewards of transitions are not their expectation here.
-    if np.ndim(cast(Array, reward)) < len(problem.form.shape) + 2:
-        reward = problem.form.reward(reward)
-    cost = transition_reward(sparse, reward_structure(sparse, reward))
-    if (cost < 0).any():
-        e = int(np.flatnonzero(cost < 0)[0])
-        raise ValueError(
-            f"the reward is {cost[e]:.9g} from state {host.state[host.row[e]]} to "
-            f"{host.successor[e]}; a bound on rewards needs rewards of at least 0."
-        )
-    counted = np.where((free & ~goal)[host.state[host.row]], cost, 0)
-    units, limit = in_units(counted, bound)
-    values = until_at_cost(problem.game, goal, free, (units[problem.entry], limit), by_level)
-    return problem.solution(values, PROBABILITY, limit + 1)
-
-
-# --- any model as a game on rows ---------------------------------------------------------------
-
-
-class _Problem(NamedTuple):
-    """A model as a game on rows, under the given policy."""
-
-    form: RowForm
-    game: RowGame
-    row: Integers  # int[R'], int[T'], the model's rows and entries
-    entry: Integers
-    policy: Array | None
-
-    def passable(self, stay: Array | str | None) -> Booleans:
-        everywhere = np.ones(self.form.sparse.num_states, bool)
-        return everywhere if stay is None else self.form.states("stay", stay)
-
-    def solution(
-        self, values: StepBoundedValues | BudgetLevel, span: Span, num_levels: int | None = None
-    ) -> Solution:
-        """The :class:`Solution` of values of the rows."""
-        steps = values.num_steps if isinstance(values, StepBoundedValues) else num_levels
-        row = self.row[values.row]
-        solution = solution_from_error(values.value, values.error, row, steps or 0, span=span)
-        shape, form = self.form.shape, self.form
-        parts: dict[str, Array] = {
-            name: getattr(solution, name).reshape(shape) for name in ("value", "lower", "upper")
-        }
-        parts["policy"] = form.number[row].astype(np.int32).reshape(*row.shape[:-1], *shape)
-        parts["nature"] = None if self.policy is not None else values.probability
-        method = "step by step" if num_levels is None else "level by level of the reward"
-        return with_given_policy(replace(solution, **parts, method=method), self.policy)
-
-
-def _problem(
-    model: Model, objective: str, nature: str | None, environment: str | None, policy: Array | None
-) -> _Problem:
-    form = row_form(model)
-    aims = directions(objective, nature, environment)
-    if form.interval is None:
-        refuse_nature(nature)
-    if form.system is None:
-        refuse_environment(environment)
-    host, sets = form.host, None if form.interval is None else form.interval.host
-    own = np.ones(host.num_states, bool) if form.system is None else form.system
-    maximizes = np.where(own, aims.system, aims.environment)
-    game = RowGame(host, maximizes, sets, aims.nature)
-    if policy is None:
-        return _Problem(form, game, np.arange(host.num_rows), np.arange(host.num_transitions), None)
-    return _Problem(form, *game.under(form.weights(policy), own), policy)
+    question = Question(
+        ReachAtCost(target, reward, bound, stay), objective, nature, environment, policy
+    )
+    return solve(model, question, Accuracy(), by_level=by_level or None)

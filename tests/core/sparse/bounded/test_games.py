@@ -6,6 +6,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.sparse.bounded import backup
 from jaxltl.core.types import check
+from jaxltl.core.values.engine.row_form import row_of_action
 from jaxltl.core.values.undiscounted.step_bounded import (
     bounded_reachability,
     cumulative_reward,
@@ -90,7 +91,8 @@ def test_choices_of_all_steps_attain_the_value_of_a_game(seed):
     host, target, num_steps = game.mdp.host, case.b, 6
     found = bounded_reachability(game, target, num_steps, by_step=True)
     value = target.astype(float)
-    for row in found.policy[::-1]:
+    rows = np.stack([row_of_action(game.mdp, x) for x in found.policy[::-1]])
+    for row in rows:
         assert (host.state[row] == np.arange(6)).all()
         value = np.where(target, 1, host.expectation(value)[row])
     np.testing.assert_allclose(value, found.value, atol=1e-14)

@@ -315,7 +315,7 @@ def test_coalitions_of_the_players_of_a_game():
     assert ask('filter(max, <<system>> Pmax=? [ F "a" ])').value.tolist() == [1]
     for text, message in (
         ('Pmax=? [ F "a" ]', "who chooses for it; ask for <<system>> Pmax="),
-        ('<<me>> Pmax=? [ F "a" ]', "player='me'; choose system or environment"),
+        ('<<me>> Pmax=? [ F "a" ]', "player='me'; choose one of system, environment"),
         ('<<system>> P=? [ F "a" ]', "say what the coalition wants"),
         ('<<system>> Pmaxmin=? [ F "a" ]', "no intervals"),
         ('<<system>> multi(Pmax=? [ F "a" ])', "after a coalition"),
