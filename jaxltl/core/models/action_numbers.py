@@ -48,8 +48,8 @@ def rows_of_policy(
             "state, or the weights of actions with one more axis."
         )
     number = row_actions(model)
-    found, row = host.first_choice(number == policy[host.state])
-    for s in first_true(~found & where):
+    some, row = host.first_choice(number == policy[host.state])
+    for s in first_true(~some & where):
         known = number[host.row_start[s] : host.row_start[s + 1]].tolist()
         raise ValueError(
             f"the policy takes action {policy[s]} in state {_named(s, shape)}, which is not available; "

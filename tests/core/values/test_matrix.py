@@ -316,7 +316,95 @@ for path, exact in {
 # SparseMDP. Groups: models, games on them, products of models, and products of games. Of traced models
 # all other questions are refused.
 CONCRETE = """
-
+reach max                          +++++++ +++++++ +++++++ +++++++
+until max                          +++++++ +++++++ +++++++ +++++++
+reward max                         +++++++ +++++++ +++++++ +++++++
+discounted max                     +++++++ +++++++ +++++++ +++++++
+average max                        +++++++ +++++++ +++++++ +++++++
+reach max, helped                  .....++ .....++ .....++ .....++
+until max, helped                  .....++ .....++ .....++ .....++
+reward max, helped                 .....++ .....++ .....++ .....++
+discounted max, helped             .....++ .....++ .....++ .....++
+average max, helped                .....++ .....++ .....++ .....++
+reach min                          +++++++ +++++++ +++++++ +++++++
+until min                          +++++++ +++++++ +++++++ +++++++
+reward min                         +++++++ +++++++ +++++++ +++++++
+discounted min                     +++++++ +++++++ +++++++ +++++++
+average min                        +++++++ +++++++ +++++++ +++++++
+reach min, helped                  .....++ .....++ .....++ .....++
+until min, helped                  .....++ .....++ .....++ .....++
+reward min, helped                 .....++ .....++ .....++ .....++
+discounted min, helped             .....++ .....++ .....++ .....++
+average min, helped                .....++ .....++ .....++ .....++
+prepared reach max                 +++++++ ....... +++++.. .......
+within 3 max                       +++++++ +++++++ +++++++ +++++++
+next max                           +++++++ +++++++ +++++++ +++++++
+reward of 3 steps max              +++++++ +++++++ +++++++ +++++++
+reward after 3 steps max           +++++++ +++++++ +++++++ +++++++
+within a budget max                +++++++ +++++++ +++++++ +++++++
+within 3 max, helped               .....++ .....++ .....++ .....++
+next max, helped                   .....++ .....++ .....++ .....++
+reward of 3 steps max, helped      .....++ .....++ .....++ .....++
+reward after 3 steps max, helped   .....++ .....++ .....++ .....++
+within a budget max, helped        .....++ .....++ .....++ .....++
+prepared reach min                 +++++++ ....... +++++.. .......
+within 3 min                       +++++++ +++++++ +++++++ +++++++
+next min                           +++++++ +++++++ +++++++ +++++++
+reward of 3 steps min              +++++++ +++++++ +++++++ +++++++
+reward after 3 steps min           +++++++ +++++++ +++++++ +++++++
+within a budget min                +++++++ +++++++ +++++++ +++++++
+within 3 min, helped               .....++ .....++ .....++ .....++
+next min, helped                   .....++ .....++ .....++ .....++
+reward of 3 steps min, helped      .....++ .....++ .....++ .....++
+reward after 3 steps min, helped   .....++ .....++ .....++ .....++
+within a budget min, helped        .....++ .....++ .....++ .....++
+discounted of both players         +++++.. +++++.. +++++.. +++++..
+policy: reach                      +++++++ +++++++ +++++++ +++++++
+policy: reward                     +++++++ +++++++ +++++++ +++++++
+policy: discounted                 +++++++ +++++++ +++++++ +++++++
+policy: average                    +++++++ +++++++ +++++++ +++++++
+policy: within 3                   +++++++ +++++++ +++++++ +++++++
+policy: next                       +++++++ +++++++ +++++++ +++++++
+policy: reward of 3 steps          +++++++ +++++++ +++++++ +++++++
+policy: reward after 3 steps       +++++++ +++++++ +++++++ +++++++
+policy: within a budget            +++++++ +++++++ +++++++ +++++++
+policy: discounted, worst case     +++++.. +++++.. +++++.. +++++..
+F b max                            +++++++ +++++++ +++++++ +++++++
+F b min                            +++++++ +++++++ +++++++ +++++++
+F b max, helped                    .....++ .....++ .....++ .....++
+policy: F b                        ....... ....... +++++++ +++++++
+F b by all optimal actions         ....... ....... .++.... .......
+F b surely                         +++++.. +++++.. ....... .......
+G a max                            +++++++ +++++++ +++++++ +++++++
+G a min                            +++++++ +++++++ +++++++ +++++++
+G a max, helped                    .....++ .....++ .....++ .....++
+policy: G a                        ....... ....... +++++++ +++++++
+G a by all optimal actions         ....... ....... .++.... .......
+G a surely                         +++++.. +++++.. ....... .......
+a U b max                          +++++++ +++++++ +++++++ +++++++
+a U b min                          +++++++ +++++++ +++++++ +++++++
+a U b max, helped                  .....++ .....++ .....++ .....++
+policy: a U b                      ....... ....... +++++++ +++++++
+a U b by all optimal actions       ....... ....... .++.... .......
+a U b surely                       +++++.. +++++.. ....... .......
+G F b max                          +++++++ +++++++ +++++++ +++++++
+G F b min                          +++++++ +++++++ +++++++ +++++++
+G F b max, helped                  .....++ .....++ .....++ .....++
+policy: G F b                      ....... ....... +++++++ +++++++
+G F b by all optimal actions       ....... ....... .++.... .......
+G F b surely                       +++++.. +++++.. ....... .......
+F G a max                          +++++++ +++++++ +++++++ +++++++
+F G a min                          +++++++ +++++++ +++++++ +++++++
+F G a max, helped                  .....++ .....++ .....++ .....++
+policy: F G a                      ....... ....... +++++++ +++++++
+F G a by all optimal actions       ....... ....... .++.... .......
+F G a surely                       +++++.. +++++.. ....... .......
+policy: steps to F b               ....... ....... .++.... .......
+policy: visits                     +++++.. ....... +++++.. .......
+property F "b"                     +++++++ +++++++ +++++++ +++++++
+property "a" U "b"                 +++++++ +++++++ +++++++ +++++++
+property G F "b"                   +++++++ +++++++ +++++++ +++++++
+property "a" U<=3 "b"              +++++++ +++++++ +++++++ +++++++
 """
 TRACED = """
 reach max                          .++.... ....... .++.... .......

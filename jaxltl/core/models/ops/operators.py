@@ -470,12 +470,12 @@ def row_weights(
         weight = np.zeros(host.num_rows)
         weight[row[np.broadcast_to(where, row.shape)]] = 1
         return weight
-    given = weights_of_policy(model, policy, shape)
-    weight = given.astype(np.float64)
+    taken = weights_of_policy(model, policy, shape)
+    weight = taken.astype(np.float64)
     require_weights(host, weight, row_tolerance(policy.dtype), where, shape)
-    if (small := underflows(given, policy.dtype)) is not None:
+    if (small := underflows(taken, policy.dtype)) is not None:
         row = int(np.argmax(small))
-        text = underflow_text(given[row], policy.dtype)
+        text = underflow_text(taken[row], policy.dtype)
         place = row_actions(model)[row], host.state[row]
         raise ValueError(f"the policy's weight of action {place[0]} in state {place[1]} {text}.")
     return cast(np.ndarray, weight)

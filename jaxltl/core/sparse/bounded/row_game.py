@@ -74,8 +74,8 @@ class RowGame:
 
         The weights ``float64[R]`` of a state are not negative; those of the policy's states count.
         """
-        mdp, given = self.mdp, states[self.mdp.state]
-        row = np.flatnonzero(~given | (weight > 0))
+        mdp, ruled = self.mdp, states[self.mdp.state]
+        row = np.flatnonzero(~ruled | (weight > 0))
         count = np.bincount(mdp.state[row], minlength=mdp.num_states)
         start = offsets_from_counts(count)
         part, entry = mdp.select(start, row)

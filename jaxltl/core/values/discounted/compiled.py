@@ -200,8 +200,10 @@ def discounted_reward(
         reward = jax.tree.map(jnp.negative, reward)
     sweeps = _SWEEPS if evaluation_sweeps is None else evaluation_sweeps
     limits = steps, sweeps
-    found = _optimal_value(form, reward, factor, method=method, tolerance=tolerance, limits=limits)
-    return reshape_solution(model, negated(found) if minimize else found)
+    solution = _optimal_value(
+        form, reward, factor, method=method, tolerance=tolerance, limits=limits
+    )
+    return reshape_solution(model, negated(solution) if minimize else solution)
 
 
 @jit()

@@ -141,13 +141,12 @@ def discounted_game(model: Model, question: Question, accuracy: Accuracy) -> Sol
         game = replace(game, system=jnp.ones_like(game.system))
     sign = 1 if question.objective == "max" or question.policy is not None else -1
     reward = path.reward if sign > 0 else jax.tree.map(jnp.negative, path.reward)
-    given = game, reward, path.discount
+    numbers, width = (reward, path.discount), {"tolerance": accuracy.tolerance}
     if question.policy is None:
-        found = minimax_value(*given, tolerance=accuracy.tolerance)
+        solution = minimax_value(game, *numbers, **width)
     else:
-        game, *rest = given
-        found = strategy_value(game, question.policy, *rest, tolerance=accuracy.tolerance)
-    return found if sign > 0 else negated(found)
+        solution = strategy_value(game, question.policy, *numbers, **width)
+    return solution if sign > 0 else negated(solution)
 
 
 @validated(games=True, per=_PER, method=_METHODS)

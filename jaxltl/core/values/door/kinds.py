@@ -15,7 +15,7 @@ from jaxltl.core.models.protocols import Model, PyTree, base_model
 from jaxltl.core.models.sparse import SparseMDP
 
 
-class Kind(NamedTuple):
+class ModelKind(NamedTuple):
     """What of a model decides which engine answers."""
 
     is_game: bool  # whether there is a second player
@@ -39,7 +39,7 @@ class Kind(NamedTuple):
         return f"{base} with traced arrays" if self.arrays == "traced" else base
 
 
-def kind_of(model: Model, given: PyTree = None) -> Kind:
+def kind_of(model: Model, question: PyTree = None) -> ModelKind:
     """The kind of a model that is asked with some arrays; ValueError for what is no model."""
     if not hasattr(model, "state_shape"):
         raise ValueError(validation.unsupported_model(model))
@@ -56,5 +56,5 @@ def kind_of(model: Model, given: PyTree = None) -> Kind:
     if is_sharded(model):
         arrays, container = "mesh", "padded"
     else:
-        arrays = "traced" if is_traced((model, given)) else "concrete"
-    return Kind(is_game, container, arrays, has_memory)
+        arrays = "traced" if is_traced((model, question)) else "concrete"
+    return ModelKind(is_game, container, arrays, has_memory)

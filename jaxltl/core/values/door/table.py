@@ -11,7 +11,7 @@ from jaxltl.core.types import Solution, check
 from jaxltl.core.values.average import engine as average
 from jaxltl.core.values.discounted import compiled as compiled_discounted, minimax
 from jaxltl.core.values.door import row_engines
-from jaxltl.core.values.door.kinds import Kind, kind_of
+from jaxltl.core.values.door.kinds import ModelKind, kind_of
 from jaxltl.core.values.door.question import (
     Acceptance,
     Accuracy,
@@ -152,19 +152,19 @@ def solve(
     """The answer to a question, by the engine for this kind of model.
 
     Raises:
-      ValueError: no engine answers this question of this kind of model, a direction is given where nobody
+      ValueError: no engine answers this question of this kind of model, a direction is selected where nobody
         has it, or an option that the engine does not take.
       NotConverged: with `throw`, unless the solution converged.
     """
     kind = kind_of(model, (question.path, question.policy, accuracy.tolerance, options))
-    given = {name: x for name, x in options.items() if x is not None}
-    engine = engine_for(kind, question, given)
+    selected = {name: x for name, x in options.items() if x is not None}
+    engine = engine_for(kind, question, selected)
     if kind.container != "intervals":
         refuse_nature(question.nature)
     if not kind.is_game:
         refuse_environment(question.environment)
     validation.choice("objective", question.objective, ("max", "min"))
-    for name in given:
+    for name in selected:
         if name not in engine.options:
             raise ValueError(
                 f"{name} is an option of iterations on padded and dense models; {kind} is solved "
@@ -172,11 +172,11 @@ def solve(
             )
     if accuracy.relative and not engine.relative:
         raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
-    solution = engine.solve(model, question, accuracy, **given)
+    solution = engine.solve(model, question, accuracy, **selected)
     return check(solution) if throw else solution
 
 
-def engine_for(kind: Kind, question: Question, given: dict[str, PyTree]) -> Engine:
+def engine_for(kind: ModelKind, question: Question, selected: dict[str, PyTree]) -> Engine:
     """The engine of a kind of model; ValueError, with what can be asked of it, if there is none."""
     path = type(question.path)
     row = ENGINES[path]
@@ -192,8 +192,8 @@ def engine_for(kind: Kind, question: Question, given: dict[str, PyTree]) -> Engi
     engine = row[kind.column]
     if isinstance(question.path, Reach) and question.path.stay is not None:
         return engine
-    word = given.get("method")
-    chosen = {word if isinstance(word, str) else "", *given}
+    word = selected.get("method")
+    chosen = {word if isinstance(word, str) else "", *selected}
     if "iterative" in chosen and question.policy is None:
         chosen.discard("iterative")
     return row[engine.column] if chosen & set(engine.instead) else engine

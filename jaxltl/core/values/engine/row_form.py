@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.construct.convert import keep_with_model, to_sparse
@@ -109,6 +110,8 @@ class RowForm:
 
 def row_form(model: Model) -> RowForm:
     """The rows of a concrete model, product, game or interval model."""
+    if not hasattr(model, "state_shape"):
+        raise ValueError(validation.unsupported_model(model))
     system, lazy = None, model
     if isinstance(model, Game):
         system, lazy = np.asarray(model.system, bool).ravel(), model.mdp

@@ -20,7 +20,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 TOLERANCE = 1e-6
 
 
-class Directions(NamedTuple):
+class PlayerAims(NamedTuple):
     """What each side does to the value: True if it maximises."""
 
     system: bool
@@ -40,7 +40,7 @@ def nature_direction(nature: str | None, objective: str) -> str:
 
 def directions(
     objective: str, nature: str | None = None, environment: str | None = None
-) -> Directions:
+) -> PlayerAims:
     """The directions of an objective of the system, against or with nature and the environment."""
     system = require_objective(objective) == "max"
     sides = []
@@ -49,7 +49,7 @@ def directions(
             name, "adversarial" if side is None else side, ("adversarial", "cooperative")
         )
         sides.append(system == (known == "cooperative"))
-    return Directions(system, *sides)
+    return PlayerAims(system, *sides)
 
 
 def requested_width(tolerance: object) -> float:
@@ -110,7 +110,7 @@ class Sides(NamedTuple):
 
 
 def sides_of(
-    host: UncertainMDP, system: Booleans | None, aims: Directions, weights: Floats | None = None
+    host: UncertainMDP, system: Booleans | None, aims: PlayerAims, weights: Floats | None = None
 ) -> Sides:
     """The sides of a model, in a game with the states ``bool[S]`` of the system.
 
@@ -128,7 +128,7 @@ def sides_of(
     return Sides(not aims.nature, aims.nature, choices_as_nature(host, moved, 0 * rows, rows))
 
 
-def _under(host: UncertainMDP, system: Booleans | None, aims: Directions, weights: Floats) -> Sides:
+def _under(host: UncertainMDP, system: Booleans | None, aims: PlayerAims, weights: Floats) -> Sides:
     # The remaining choices are those of the environment.
     maximize = aims.nature if system is None else aims.environment
     own = np.ones(host.mdp.num_states, bool) if system is None else system

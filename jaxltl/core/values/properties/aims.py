@@ -55,12 +55,12 @@ class PropertyAim(NamedTuple):
     @property
     def directions(self) -> Directions:
         """Keyword arguments of the solvers."""
-        found: Directions = {"objective": self.policy}
+        aims: Directions = {"objective": self.policy}
         if self.nature is not None:
-            found["nature"] = "cooperative" if self.nature == self.policy else "adversarial"
+            aims["nature"] = "cooperative" if self.nature == self.policy else "adversarial"
         if self.environment is not None:
-            found["environment"] = self.environment
-        return found
+            aims["environment"] = self.environment
+        return aims
 
 
 def aim_of(model: CheckableModel, prop: Property) -> PropertyAim:

@@ -57,11 +57,11 @@ def _tolerances(model: Model, accuracy: Accuracy, *, exact: bool) -> tuple[float
     """The width of the enclosure that counts as converged, and the width to aim for."""
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
     requested = accuracy.width(default_tolerance(model))
-    given = accuracy.tolerance is not None
-    if exact and not given:
+    is_set = accuracy.tolerance is not None
+    if exact and not is_set:
         requested = 2 * eps**0.5
     small = model.num_states <= _FINE_LIMIT
-    if exact and (not given or small):
+    if exact and (not is_set or small):
         return requested, min(requested, max(4 * eps, 1e-12 if small else 1e-11))
     return requested, requested
 

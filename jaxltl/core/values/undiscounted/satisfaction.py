@@ -74,8 +74,8 @@ def satisfaction_probability(
       0.75
     """
     question = Question(Acceptance(), "max", nature, environment, policy)
-    given = None if method == "auto" else method
-    return solve(require_product(model), question, Accuracy(tolerance), throw=throw, method=given)
+    named = None if method == "auto" else method
+    return solve(require_product(model), question, Accuracy(tolerance), throw=throw, method=named)
 
 
 @overload
@@ -202,7 +202,7 @@ def optimal_satisfaction(
     if kind.is_game or kind.container == "intervals":
         if label_on is not None:  # interval models read labels on exit
             validation.choice("label_on", label_on, ("exit",))
-        found = robust_satisfaction(
+        answer = robust_satisfaction(
             model,
             formula,
             objective=objective,
@@ -212,7 +212,7 @@ def optimal_satisfaction(
             tolerance=tolerance,
         )
     else:
-        found = sparse_satisfaction(
+        answer = sparse_satisfaction(
             to_sparse(model),
             formula,
             objective=objective,
@@ -221,5 +221,5 @@ def optimal_satisfaction(
             tolerance=tolerance,
         )
     if throw:
-        check(found.solution)
-    return found
+        check(answer.solution)
+    return answer
