@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_bytes
-from jaxltl.core.models.construct.padded import row_actions, to_padded
+from jaxltl.core.models.action_numbers import row_actions
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models import MDP, Game, IntervalMDP, SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays

@@ -52,7 +52,7 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
     ), reward
 
 
-def _on_form(lazy: Model, reward: Reward) -> Reward:
+def _on_form(lazy: Model, reward: Array) -> Reward:
     """A reward ``[S, A]`` of a sparse model, or ``[S, Q]`` or ``[S, Q, A]`` of a product, on its rows."""
     if isinstance(reward, str | Rewards) or np.ndim(reward) < 2:
         return reward
@@ -134,8 +134,10 @@ def _row_numbers(lazy: Model) -> tuple[Array, Array]:
     if not is_traced(lazy):
         sparse = to_sparse(lazy)
         return row_actions(sparse), sparse.host.state
-    form = product_rows(lazy.mdp, lazy) if isinstance(lazy, Product) else lazy
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    assert isinstance(world, SparseMDP)
+    form = product_rows(world, lazy) if isinstance(lazy, Product) else world
     state = segment_ids(form.row_start, form.num_rows)
-    if form.action is None or base_model(lazy).action_names:
+    if form.action is None or world.action_names:
         return jnp.arange(state.size) - jnp.asarray(form.row_start)[state], state
     return jnp.asarray(form.action), state

@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from numpy.typing import NDArray
 
-from jaxltl.core.models.construct.padded import row_actions
+from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP

@@ -474,9 +474,9 @@ def row_weights(
     weight = taken.astype(np.float64)
     require_weights(host, weight, row_tolerance(policy.dtype), where, shape)
     if (small := underflows(taken, policy.dtype)) is not None:
-        row = int(np.argmax(small))
-        text = underflow_text(taken[row], policy.dtype)
-        place = row_actions(model)[row], host.state[row]
+        first = int(np.argmax(small))
+        text = underflow_text(taken[first], policy.dtype)
+        place = row_actions(model)[first], host.state[first]
         raise ValueError(f"the policy's weight of action {place[0]} in state {place[1]} {text}.")
     return cast(np.ndarray, weight)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import jax
 
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.sparse import Reward
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.compiled import (
     action_value as action_value,
@@ -20,7 +21,7 @@ _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iter
 @validated(games=True, method=_METHODS)
 def optimal_value(
     model: Model,
-    reward: jax.Array,
+    reward: Reward,
     discount: jax.Array | float,
     *,
     objective: str = "max",
@@ -87,8 +88,8 @@ def optimal_value(
 @validated(games=True)
 def policy_value(
     model: Model,
-    policy: jax.Array,
-    reward: jax.Array,
+    policy: Array,
+    reward: Reward,
     discount: jax.Array | float,
     *,
     nature: str | None = None,

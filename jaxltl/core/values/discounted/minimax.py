@@ -141,11 +141,11 @@ def discounted_game(model: Model, question: Question, accuracy: Accuracy) -> Sol
         game = replace(game, system=jnp.ones_like(game.system))
     sign = 1 if question.objective == "max" or question.policy is not None else -1
     reward = path.reward if sign > 0 else jax.tree.map(jnp.negative, path.reward)
-    numbers, width = (reward, path.discount), {"tolerance": accuracy.tolerance}
-    if question.policy is None:
-        solution = minimax_value(game, *numbers, **width)
+    width, policy = accuracy.tolerance, question.policy
+    if policy is None:
+        solution = minimax_value(game, reward, path.discount, tolerance=width)
     else:
-        solution = strategy_value(game, question.policy, *numbers, **width)
+        solution = strategy_value(game, policy, reward, path.discount, tolerance=width)
     return solution if sign > 0 else negated(solution)
 
 

@@ -74,7 +74,8 @@ def padded_solution(
     value = np.clip(enclosure.value.astype(dtype), low, high)
     ends = tuple(x.reshape(model.state_shape) for x in (value, low, high))
     policy = policy.reshape(model.state_shape)
-    return to_jax(_solution(enclosure, ends, policy, tolerance, relative))
+    solution: Solution = to_jax(_solution(enclosure, ends, policy, tolerance, relative))
+    return solution
 
 
 def _solution(

@@ -96,7 +96,11 @@ class RowForm:
 
     def _of_world_rows(self, policy: Array) -> Array:
         """Weights ``float[R, Q]`` of a world's rows as those of the product's."""
-        world, host = getattr(self.world, "nominal", self.world), self.host
+        world = self.world
+        if isinstance(world, IntervalMDP):
+            world = world.nominal
+        assert isinstance(world, SparseMDP)
+        host = self.host
         count = self.shape[-1]
         if policy.shape != (world.num_rows, count):
             return policy

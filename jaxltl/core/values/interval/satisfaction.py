@@ -77,7 +77,7 @@ def robust_satisfaction(
     )
     system = None if form.system is None else form.system[product.base_state]
     values = _solved(sides_of(host, system, aims), host, verdicts, requested)
-    row = product.base_row[values.row].astype(np.int32)
+    row: Array = product.base_row[values.row].astype(np.int32)
     solution = _solution_at(values, product.start, product.start.shape, requested)
     solution = replace(solution, policy=row)
     return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")

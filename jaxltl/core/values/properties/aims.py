@@ -8,6 +8,7 @@ from jaxltl.core import validation
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.values.engine.row_form import row_form
@@ -23,7 +24,7 @@ def checkable(model: Model) -> CheckableModel:
         return model
     form = row_form(model)
     inner = form.sparse if form.interval is None else form.interval
-    return inner if form.system is None else Game(inner, form.system)
+    return inner if form.system is None else Game(inner, to_jax(form.system))
 
 
 def graph_of_model(model: CheckableModel) -> SparseMDP:

@@ -73,7 +73,8 @@ def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
     """Total rewards of padded models inside ``jit`` and over a mesh."""
     path, policy = question.path, question.policy
     assert isinstance(path, TotalReward)
-    world, reward = model.mdp if isinstance(model, Product) else model, path.reward
+    world: Array = model.mdp if isinstance(model, Product) else model
+    reward = path.reward
     if path.target is None:
         raise ValueError(
             "total rewards for ever are found on the host; inside jit, or over a mesh, give a "

@@ -13,7 +13,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.refusals import refuse_traced
 from jaxltl.core.types import Solution, check
 from jaxltl.core.values.door.kinds import kind_of
@@ -30,7 +30,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction, sp
 @validated(games=True, method=("auto", "direct", "iterative"))
 def satisfaction_probability(
     model: Product | Game,
-    policy: jax.Array,
+    policy: Array,
     *,
     nature: str | None = None,
     environment: str | None = None,

@@ -132,9 +132,10 @@ def bounded_avoidance(
     stay: Array,
     objective: str = "max",
     nature: str | None = None,
+    environment: str | None = None,
 ) -> Solution | None:
     """Complement of step-bounded reachability, relatively exact; None for many steps."""
-    problem = _problem(model, Question(NextStep(target), objective, nature))
+    problem = _problem(model, Question(NextStep(target), objective, nature, environment))
     values = avoidance(problem.game, target, stay, num_steps)
     return None if values is None else problem.solution(values, PROBABILITY)
 
