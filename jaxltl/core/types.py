@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import reduce
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import chex
 import jax
@@ -52,6 +52,14 @@ class NotConverged(RuntimeError):
     """
 
 
+class AtInitial(NamedTuple):
+    """The mean of a quantity over the initial distribution, with certified bounds."""
+
+    value: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+
+
 @brief(drawn=True)
 @struct.dataclass
 class Solution:
@@ -70,6 +78,8 @@ class Solution:
       nature: of interval models, ``float[T]``: the distribution that nature chooses for each row.
         No policy exceeds the value against an adversarial nature that uses it; policy and a
         cooperative nature attain the value together.
+      initial: the initial distribution of the model, in the shape of the value; None where the
+        solver does not know it.
 
     Example:
       >>> import jaxltl as jl
@@ -80,6 +90,8 @@ class Solution:
       ([0.5, 1.0, 0.0], 'CONVERGED')
       >>> bool((found.lower <= found.value).all() and (found.value <= found.upper).all())
       True
+      >>> float(found.at_initial.value)  # the states are equally likely at first
+      0.5
     """
 
     value: jax.Array
@@ -91,6 +103,43 @@ class Solution:
     status: jax.Array
     method: str = struct.field(pytree_node=False, default="")
     nature: jax.Array | None = None
+    initial: jax.Array | None = struct.field(default=None, repr=False)
+
+    @property
+    def at_initial(self) -> AtInitial:
+        """Value, lower and upper from the initial distribution; ValueError without one.
+
+        ``sum_s initial(s) value(s)``, of bounds rounded outwards. Of a batch, one for each lane.
+        Differentiable as the value is.
+        """
+        if self.initial is None:
+            raise ValueError(
+                "this solution has no initial distribution; weigh its value by that of the model."
+            )
+        axes = tuple(range(jnp.ndim(self.num_steps), jnp.ndim(self.value)))
+        xp = jnp if isinstance(self.value, jax.Array) else np
+        share = xp.asarray(self.initial, self.value.dtype)
+        share = share / share.sum(axes, keepdims=True)
+
+        counts = share > 0
+        total = xp.where(counts, share * xp.where(counts, self.value, 0), 0).sum(axes)
+        stop = jax.lax.stop_gradient if xp is jnp else lambda x: x
+
+        def bound(x: jax.Array, end: int) -> jax.Array:
+            x = xp.where(counts, x, 0)
+            mean = xp.where(counts, share * x, 0).sum(axes)
+            size = xp.where(counts & xp.isfinite(x), share * xp.abs(x), 0).sum(axes)
+            slack = (x.size + 4) * xp.finfo(x.dtype).eps * size
+            # One state, or equal bounds, need no rounding.
+            least = xp.where(counts, x, xp.inf).min(axes)
+            same = least == xp.where(counts, x, -xp.inf).max(axes)
+            return cast(jax.Array, xp.where(same, least, mean + end * slack))
+
+        low, high = bound(stop(self.lower), -1), bound(stop(self.upper), 1)
+        inside = stop(xp.clip(total, low, high))
+        if xp is np:
+            return AtInitial(inside, low, high)
+        return AtInitial(xp.where(inside == total, total, total - stop(total) + inside), low, high)
 
 
 def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:

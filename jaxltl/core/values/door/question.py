@@ -10,10 +10,16 @@ from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, 
 
 
 class Reach(NamedTuple):
-    """The probability of reaching a set of states, through the states of another one."""
+    """The probability of reaching a set of states."""
 
     target: Array | str
-    stay: Array | str | None = None
+
+
+class Until(NamedTuple):
+    """The probability of reaching a set of states through the states of another one."""
+
+    target: Array | str
+    stay: Array | str
 
 
 class TotalReward(NamedTuple):
@@ -79,6 +85,7 @@ class ReachAtCost(NamedTuple):
 
 Path = (
     Reach
+    | Until
     | TotalReward
     | DiscountedReward
     | AverageReward

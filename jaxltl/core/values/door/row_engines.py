@@ -21,6 +21,7 @@ from jaxltl.core.values.door.question import (
     Question,
     Reach,
     TotalReward,
+    Until,
 )
 from jaxltl.core.values.engine.host_solution import (
     default_tolerance,
@@ -100,11 +101,11 @@ def reach_with_nature(model: Model, question: Question, accuracy: Accuracy) -> S
     distributions of row a (Nilim and El Ghaoui 2005, Iyengar 2005).
     """
     path, form = question.path, row_form(model)
-    assert isinstance(path, Reach)
+    assert isinstance(path, Reach | Until)
     requested, sides = accuracy.width(TOLERANCE), _sides(form, question)
     target = sides.states(form.states("target", path.target))
     stay = None
-    if path.stay is not None:
+    if isinstance(path, Until):
         stay = sides.states(form.states("stay", path.stay)) | sides.added
     values = reachability(sides.host, target, sides.query(requested), stay=stay)
     return robust_solution(form, sides, values, question, requested)

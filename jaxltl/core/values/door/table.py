@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from jaxltl.core import validation
@@ -11,6 +12,7 @@ from jaxltl.core.types import Solution, check
 from jaxltl.core.values.average import engine as average
 from jaxltl.core.values.discounted import compiled as compiled_discounted, minimax
 from jaxltl.core.values.door import row_engines
+from jaxltl.core.values.door.called import called
 from jaxltl.core.values.door.kinds import ModelKind, kind_of
 from jaxltl.core.values.door.question import (
     Acceptance,
@@ -26,6 +28,7 @@ from jaxltl.core.values.door.question import (
     RewardAfterSteps,
     RewardOfSteps,
     TotalReward,
+    Until,
 )
 from jaxltl.core.values.interval import satisfaction as interval_satisfaction
 from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
@@ -51,9 +54,9 @@ class Engine(NamedTuple):
 
 _LIMITED = ("max_steps", "start")
 _SWEPT = ("method", "max_steps", "evaluation_sweeps")
-_EXACT_REACH = Engine(
-    reaching.reach, ("method",), instead=("iterative", *_LIMITED), column="traced padded"
-)
+_HOST_REACH = Engine(reaching.reach, ("method",))
+_ROW_REACH = Engine(reaching.reach, ("method",), relative=True)
+_EXACT_REACH = _HOST_REACH._replace(instead=("iterative", *_LIMITED), column="traced padded")
 _COMPILED_REACH = Engine(compiled_engines.reach, ("method", *_LIMITED))
 _ROBUST_REACH = Engine(row_engines.reach_with_nature)
 _ROBUST_EARN = Engine(row_engines.earn_with_nature)
@@ -72,7 +75,7 @@ CONCRETE = ("padded", "rows", "intervals", "padded game", "rows game", "interval
 ENGINES: dict[type[Path], dict[str, Engine]] = {
     Reach: {
         "padded": _EXACT_REACH,
-        "rows": Engine(reaching.reach, ("method",), relative=True),
+        "rows": _ROW_REACH,
         "intervals": _ROBUST_REACH,
         "padded game": _ROBUST_REACH,
         "rows game": _ROBUST_REACH,
@@ -81,6 +84,14 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "traced padded": _COMPILED_REACH,
         "traced other": _COMPILED_REACH,
         "mesh padded": _COMPILED_REACH,
+    },
+    Until: {
+        "padded": _HOST_REACH,
+        "rows": _ROW_REACH,
+        "intervals": _ROBUST_REACH,
+        "padded game": _ROBUST_REACH,
+        "rows game": _ROBUST_REACH,
+        "intervals game": _ROBUST_REACH,
     },
     TotalReward: {
         "padded": _EARN,
@@ -127,8 +138,18 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
     },
 }
 
+# Where no compiled engine answers inside jit, a program calls the host.
+for _path, _row in ENGINES.items():
+    for _column in CONCRETE:
+        if _column in _row:
+            _share = _path in (TotalReward, AverageReward)
+            _row.setdefault(
+                f"traced {_column}", Engine(called(_row[_column].solve, relative=_share))
+            )
+
 NAMES: dict[type[Path], str] = {
     Reach: "reachability_probability",
+    Until: "reachability_probability",
     TotalReward: "total_reward",
     DiscountedReward: "optimal_value and policy_value",
     AverageReward: "average_reward",
@@ -152,7 +173,7 @@ def solve(
     """The answer to a question, by the engine for this kind of model.
 
     Raises:
-      ValueError: no engine answers this question of this kind of model, a direction is selected where nobody
+      ValueError: no engine answers this question of this kind of model, a direction is stated where nobody
         has it, or an option that the engine does not take.
       NotConverged: with `throw`, unless the solution converged.
     """
@@ -173,6 +194,7 @@ def solve(
     if accuracy.relative and not engine.relative:
         raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
     solution = engine.solve(model, question, accuracy, **selected)
+    solution = replace(solution, initial=getattr(model, "initial", None))
     return check(solution) if throw else solution
 
 
@@ -190,8 +212,6 @@ def engine_for(kind: ModelKind, question: Question, selected: dict[str, PyTree])
         )
         raise ValueError(f"{NAMES[path]} has no answer for {kind}; {remedy}.")
     engine = row[kind.column]
-    if isinstance(question.path, Reach) and question.path.stay is not None:
-        return engine
     word = selected.get("method")
     chosen = {word if isinstance(word, str) else "", *selected}
     if "iterative" in chosen and question.policy is None:

@@ -54,11 +54,6 @@ def reach(
     """Probabilities of reaching a set in padded models, by interval iteration or a linear system."""
     path, policy, tolerance = question.path, question.policy, accuracy.tolerance
     assert isinstance(path, Reach)
-    if path.stay is not None:
-        raise ValueError(
-            "until, with stay, needs concrete arrays; inside jit use prepare(model, target, stay=stay), "
-            "or the product with the formula's automaton."
-        )
     target, padded = states_of(model, "target", path.target), cast(ActionModel, model)
     if policy is None:
         return optimum.optimal_reachability(

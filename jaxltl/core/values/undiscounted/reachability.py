@@ -6,7 +6,7 @@ import jax
 
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Solution
-from jaxltl.core.values.door.question import Accuracy, Question, Reach
+from jaxltl.core.values.door.question import Accuracy, Question, Reach, Until
 from jaxltl.core.values.door.table import solve
 from jaxltl.core.values.engine.validated import validated
 
@@ -78,9 +78,10 @@ def reachability_probability(
       >>> round(reachability_probability(mdp, np.array([False, True, False])).value[0].item(), 3)
       0.5
     """
+    path = Reach(target) if stay is None else Until(target, stay)
     return solve(
         model,
-        Question(Reach(target, stay), objective, nature, environment, policy),
+        Question(path, objective, nature, environment, policy),
         Accuracy(tolerance, relative),
         throw=throw,
         method=None if method == "auto" else method,

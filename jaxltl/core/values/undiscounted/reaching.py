@@ -14,7 +14,7 @@ from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution
-from jaxltl.core.values.door.question import Accuracy, Question, Reach
+from jaxltl.core.values.door.question import Accuracy, Question, Reach, Until
 from jaxltl.core.values.engine.host_solution import (
     default_tolerance,
     padded_solution,
@@ -28,17 +28,25 @@ from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, fastest_optimum
 _FINE_LIMIT = 4096  # states up to which bounds are as narrow as the dtype allows; it costs a round
 
 
-def reach(model: Model, question: Question, accuracy: Accuracy) -> Solution:
+def reach(
+    model: Model, question: Question, accuracy: Accuracy, *, method: str = "auto"
+) -> Solution:
     """The probabilities by the engine on rows, or by the layers of a large product."""
+    if method == "iterative":
+        raise ValueError(
+            "method='iterative' is for policies on padded and dense models, without stay; leave it out."
+        )
     path, policy, objective = question.path, question.policy, question.objective
-    assert isinstance(path, Reach)
-    if policy is None and path.stay is None and not isinstance(path.target, str):
+    assert isinstance(path, Reach | Until)
+    stay = path.stay if isinstance(path, Until) else None
+    if policy is None and stay is None and not isinstance(path.target, str):
         solution = _by_layers(model, path.target, accuracy.tolerance, objective)
         if solution is not None:
             return solution
     form = row_form(model)
     target = form.states("target", path.target)
-    stay = None if path.stay is None else form.states("stay", path.stay)
+    if stay is not None:
+        stay = form.states("stay", stay)
     # An optimum of a small model is as close as possible in any case, for its ties.
     exact = stay is None and form.is_padded and (accuracy.tolerance is None or policy is None)
     requested, fine = _tolerances(model, accuracy, exact=exact)
