@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.types import Status
-from jaxltl.core.values.interval.robust import robust_reachability
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.io.model_files import read_model, write_model
 
 REPEATS = 2
@@ -186,7 +186,7 @@ def measure(name: str, size: int, folder: Path, objectives: tuple[str, ...] = ("
             for _ in range(REPEATS):
                 fresh = model.replace(lower=model.lower)  # nothing is remembered
                 begin = time.process_time()
-                found = robust_reachability(fresh, target, objective=objective, nature=nature)
+                found = reachability_probability(fresh, target, objective=objective, nature=nature)
                 ours.append(time.process_time() - begin)
                 value, seconds = storm(peer, f'P{objective}=? [F "goal"]', nature == "cooperative")
                 theirs.append(seconds)
@@ -235,7 +235,7 @@ def prepared() -> None:
             jax.block_until_ready(one(question, a, b))
         clock.append(time.process_time())
         for a, b in zip(lower[:few], upper[:few], strict=True):
-            robust_reachability(model.replace(lower=a, upper=b), target, nature=nature)
+            reachability_probability(model.replace(lower=a, upper=b), target, nature=nature)
         clock.append(time.process_time())
         batch, loop, host = np.diff(clock)
         print(

@@ -14,42 +14,23 @@ from jaxltl.core.models.product import Product
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_ROWS = (
-    "of a game on a SparseMDP or an IntervalMDP "
-    "(make_game(to_sparse(game.mdp), game.system.ravel()) if it is on padded actions)"
-)
-_DISCOUNTED = (
-    "minimax_value(game, reward, discount), or robust_discounted_value of one on intervals"
-)
-_STRATEGY = "strategy_value(game, strategy, reward, discount), the worst case of a strategy"
-_REACHING = (
-    f"winning_region(game, objective), or robust_reachability(game, target, policy=...), {_ROWS}"
-)
-_REWARD = f"robust_total_reward(game, reward, target), {_ROWS}"
-_FORMULA = "winning_region(game, formula), or optimal_satisfaction(game, formula), without product"
+_VALUE = "optimal_value(game, reward, discount), or policy_value of a strategy of the system"
+_FORMULA = "winning_region(game, formula), or optimal_satisfaction of the game with the formula or of its product"
 
 # What to ask of a game instead, for each solver; games have no counterpart of the others.
 _INSTEAD = {
-    "optimal_value": _DISCOUNTED,
-    "policy_value": _STRATEGY,
-    "soft_value": _DISCOUNTED,
-    "boltzmann_value": _DISCOUNTED,
-    "occupancy_measure": _STRATEGY,
-    "total_reward": _REWARD,
-    "hitting_time": _REWARD,
-    "reachability_probability": _REACHING,
-    "prepare": _REACHING,
-    "satisfaction_probability": _FORMULA,
-    "optimal_satisfaction": _FORMULA,
+    "soft_value": _VALUE,
+    "boltzmann_value": _VALUE,
+    "occupancy_measure": _VALUE,
+    "hitting_time": "total_reward(game, reward, target, policy=...), a reward of 1 for each step",
+    "prepare": "reachability_probability or total_reward of the game",
     "optimal_actions": "permissive_strategy(game, formula), whose actions keep the system winning; "
     + _FORMULA,
-    "solve_property": _FORMULA,
     "task_performance": _FORMULA,
 }
 _OTHERWISE = (
-    "minimax_value, strategy_value, average_reward, bounded_reachability, winning_region, or "
-    "robust_reachability, robust_total_reward, robust_discounted_value and optimal_satisfaction "
-    f"with a formula, {_ROWS}"
+    "reachability_probability, total_reward, optimal_value, average_reward, optimal_satisfaction or "
+    "solve_property of the game, or winning_region"
 )
 
 
