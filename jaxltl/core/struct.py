@@ -52,13 +52,12 @@ def register(
     compiled program.
     """
     arrays, static = tuple(arrays), tuple(static)
+    names, first, last = (*arrays, *static, *text), len(arrays), len(arrays) + len(static)
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in arrays)
 
     def flatten(tree: ClassT) -> tuple[tuple[object, ...], tuple[object, ...]]:
-        leaves, values, texts = (
-            tuple(getattr(tree, name) for name in names) for names in (arrays, static, text)
-        )
-        return leaves, (values, _TextField(texts))
+        fields = tuple([getattr(tree, name) for name in names])
+        return fields[:first], (fields[first:last], _TextField(fields[last:]))
 
     def flatten_with_keys(
         tree: ClassT,
@@ -71,7 +70,6 @@ def register(
         private_values = (
             text.values() if any(isinstance(x, jax.core.Tracer) for x in leaves) else texts.values
         )
-        names = (*arrays, *static, *text)
         return cls(**dict(zip(names, (*leaves, *values, *private_values), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)

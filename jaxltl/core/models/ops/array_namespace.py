@@ -29,10 +29,10 @@ _inside_callback: ContextVar[bool] = ContextVar("inside_callback", default=False
 
 def is_traced(tree: PyTree) -> bool:
     """True if the host cannot read a tree: an array is a tracer, or lies on several devices."""
-    return any(
-        isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated)
-        for x in jax.tree.leaves(tree)
-    )
+    for x in jax.tree.leaves(tree):
+        if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated):
+            return True
+    return False
 
 
 def namespace(*trees: PyTree) -> tuple[PyTree, ...]:
