@@ -54,7 +54,6 @@ def test_shapes_are_named():
         ([3], r"target has shape \(1,\); expected \(4,\).*np.isin\(np.arange\(4\), \[3\]\)"),
         ({1, 3}, r"np.isin\(np.arange\(4\), \[1, 3\]\)"),
         ([0, 1, 2, 3], r"target is \[0, 1, 2, 3\]; give bool\[4\].*np.isin"),
-        ("goal", "target='goal'; give bool.*model.label"),
         (np.array([0.5, 0, 0, 1]), r"target is \[0.5, 0.0, 0.0, 1.0\]; give bool\[4\]"),
     ],
 )
@@ -65,9 +64,8 @@ def test_sets_of_states_are_masks(given, message):
         lambda: jl.total_reward(world, np.ones((4, 4)), given),
         lambda: jl.values.hitting_time(world, np.zeros(4, int), given),
         lambda: jl.prepare(jl.to_sparse(world), given),
+        lambda: jl.values.bounded_reachability(world, given, 3),
     ]
-    if not isinstance(given, str):  # a label
-        solvers.append(lambda: jl.values.bounded_reachability(world, given, 3))
     for solve in solvers:
         with pytest.raises(ValueError, match=message):
             solve()

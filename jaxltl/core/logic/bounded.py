@@ -1,4 +1,4 @@
-"""Path formulas with bounds on steps or rewards, and reward objectives of properties."""
+"""Path formulas with bounds or conditions, and reward objectives of properties."""
 
 from __future__ import annotations
 
@@ -47,6 +47,17 @@ class Bounded:
         if self.operator == "R" and self.left == FALSE:
             return f"G{bound} {right}"
         return f"{left} {self.operator}{bound} {right}"
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """A path formula given another one, written `F "a" || F "b"` as in Storm."""
+
+    event: Formula
+    condition: Formula
+
+    def __str__(self) -> str:
+        return f"{self.event} || {self.condition}"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any, Literal, TypeVar
 
 from jaxltl.core.language.parser import SIMPLE
-from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
@@ -44,7 +44,7 @@ class Property:
         within intervals; None where only one is said, or none.
       relation, threshold: the comparison, None for `=?`.
       reward: for `"R"`, the name, or None for the one without a name, or the only one of the model.
-      path: for `"P"` a formula or a bounded one, for `"T"` and `"R"` `F` of a state formula or
+      path: for `"P"` a formula, a bounded or a conditional one, for `"T"` and `"R"` `F` of a state formula or
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
@@ -64,7 +64,7 @@ class Property:
     relation: Relation | None = None
     threshold: Fraction | None = None
     reward: str | None = None
-    path: Formula | Bounded | Earned = TRUE
+    path: Formula | Bounded | Conditional | Earned = TRUE
     parts: tuple[Property, ...] = ()
     name: str | None = None
     nature: Literal["max", "min"] | None = None
@@ -93,17 +93,17 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     Of a probability: `Pmax=? [ PATH ]`, `Pmin=?`, `P=?`, or a threshold such as `P>=0.9` or
     `Pmax<1/3`. A path is any formula of linear temporal logic over labels in quotes, with
     `X F G U W R`; within `F G U W R` a bound on steps (`F<=10`, `U<10`, `F[2,5]`, `F=3`, `F>=4`)
-    or, outermost, on a reward (`F{"time"}<=5 "goal"`). Of a reward: `R{"name"}max=? [ F "goal" ]`,
-    `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`. Expected steps: `Tmin=? [ F "goal" ]`.
-    Time in the long run: `LRAmax=? [ "up" ]`. Several at once: `multi(P, P, ...)`.
+    or, outermost, on a reward (`F{"time"}<=5 "goal"`); `F "a" || F "b"` is the first given the second.
+    Of a reward: `R{"name"}max=? [ F "goal" ]`, `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`.
+    Expected steps: `Tmin=? [ F "goal" ]`. Time in the long run: `LRAmax=? [ "up" ]`. Several at once:
+    `multi(P, P, ...)`.
     State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
     `P>=0.9 [ F P>0.5 [ X "a" ] ]`. A state formula is a property too. `filter(min, P=? [ F "a" ],
     x = 0)` is over the states of a formula, by default all: one of `min max avg sum count range
     first state forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
-    does second: `Pmaxmin=?`, `R{"time"}minmax=?`. In a game a coalition comes before that, whose players
-    choose for the objective, and all others against it: `<<system>> Pmax=? [ PATH ]`, also of the
-    `environment`, of both or of none; a threshold is met by some of its strategies.
+    second: `Pmaxmin=?`, `R{"time"}minmax=?`. In a game a coalition comes before that, whose players choose
+    for the objective: `<<system>> Pmax=? [ PATH ]`; a threshold is met by some of its strategies.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
     `&&` and `||`, which is for state formulas only. So temporal operators reach as far as they can,
@@ -337,20 +337,24 @@ class _Parser(TokenStream):
 
     # --- paths, from loosest to tightest ---
 
-    def path(self, inside: bool = False) -> _Path:
-        """A path; one `inside` parentheses is no side of Storm's conditional probability."""
+    def condition(self, inside: bool = False) -> _Path | Conditional:
+        """A path, or two, of which the second one is the condition of the first; not `inside` parentheses."""
         operands, sign = [self.conjunction()], self.token
         while self.accept("||"):
             operands.append(self.conjunction())
-        paths = [x for x in operands if isinstance(x, Bounded) or not is_boolean(x)]
-        self.require(
-            inside or len(operands) == 1 or not paths,
-            "one path: || of two paths is the conditional probability of the first given the second "
-            "in Storm, which is not solved for; for the probability of at least one of them, write "
-            "(PATH) | (PATH)",
-            sign,
-        )
-        return operands[0] if len(operands) == 1 else Formula("|", tuple(map(self.plain, operands)))
+        if len(operands) == 1:
+            return operands[0]
+        plain = [self.plain(x) for x in operands]
+        if inside or all(map(is_boolean, plain)):
+            return Formula("|", tuple(plain))
+        self.require(len(plain) == 2, "one condition; (PATH) | (PATH) is one of several", sign)
+        return Conditional(*plain)
+
+    def path(self, inside: bool = False) -> _Path:
+        path, last = self.condition(inside), self.last
+        if isinstance(path, Conditional):
+            raise self.error("one path; a condition, ||, stands outermost in P", last)
+        return path
 
     def conjunction(self) -> _Path:
         return self.chain("&&", "&", self.until)
@@ -589,8 +593,8 @@ class _Parser(TokenStream):
         return path
 
 
-_CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {
-    "P": _Parser.path,
+_CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Conditional | Earned]] = {
+    "P": _Parser.condition,
     "R": _Parser.reward_content,
     "T": _Parser.reach_content,
     "LRA": _Parser.state_content,

@@ -8,6 +8,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Integers
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import describe_row
 from jaxltl.core.validation import first_true
 
 
@@ -78,12 +79,10 @@ def weights_of_policy(
         )
     none = np.ones(policy.shape, bool)
     none[host.state, number] = False
-    for state, action in np.argwhere(none & (policy != 0))[:1].tolist():
-        known = number[host.row_start[state] : host.row_start[state + 1]].tolist()
-        raise ValueError(
-            f"the policy takes action {action} in state {_named(state, shape)}, which is not available; "
-            f"choose among {known}."
-        )
+    wrong = none & (policy != 0)
+    for state in np.flatnonzero(wrong.any(1))[:1].tolist():
+        place = (state,) if shape is None else np.unravel_index(state, shape)
+        raise ValueError(f"{describe_row(np.where(wrong, np.nan, policy)[state], place)}.")
     return policy[host.state, number]
 
 

@@ -336,6 +336,20 @@ def test_names_of_a_program_are_used_in_properties():
     assert len(found) == 6
 
 
+def test_conditions_stand_outermost():
+    (prop,) = parse_properties('P>=0.5 [ F<=1 "a" || G !"b" ]')
+    assert str(prop.path) == "a | X a || G !b"
+    assert parse_properties('P=? [ (F "a" || F "b") ]')[0].path.operator == "|"
+    assert parse_properties('P=? [ F ("a" || "b") ]')[0].path.operands[0].operator == "|"
+
+
+def test_coalitions_stand_before_the_operator():
+    (prop,) = parse_properties('"p": <<system, environment>> Rmin=? [ F "a" ]')
+    assert (prop.coalition, prop.name, prop.direction) == (("system", "environment"), "p", "min")
+    sure, rare = parse_properties('<<system>> P>=0.5 [ F "a" ] <<>> P<0.5 [ F "a" ]')
+    assert (sure.direction, rare.direction, rare.coalition) == ("max", "min", ())
+
+
 NEAR_MISSES = {
     'R=? [ F<=3 "a" ]': "column 8: found '<=', .* F without a bound",
     "R=? [ F<=3 a ]": "column 8: found '<=', .* F without a bound",
@@ -344,9 +358,8 @@ NEAR_MISSES = {
     'P=? [ O "a" ]': "column 7: found 'O', .* those of the past",
     "P=? [ O a ]": "column 7: found 'O', .* those of the past",
     "P=? [ WX a ]": "column 7: found 'WX', .* with blanks between",
-    'P=? [ F "a" || F "b" ]': "column 13: .*conditional probability.*at least one of them",
-    'P=? [ "a" U "b" || "c" ]': "conditional probability",
-    'P=? [ F<=3 "a" || F "b" || "c" ]': "conditional probability",
+    'P=? [ F<=3 "a" || F "b" || "c" ]': "column 16: .*one condition",
+    'R=? [ F "a" || F "b" ]': "one path; a condition",
     "Pmax=? [ F a ]": 'column 12: found .a., expected a label in double quotes, such as "a"',
 }
 

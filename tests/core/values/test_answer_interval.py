@@ -381,8 +381,6 @@ def test_what_has_no_intervals_takes_one_direction():
             "Rminmax=? [ C ]",
             r"rewards for ever \(C\) are not solved for where probabilities are int",
         ),
-        ("Rminmax=? [ S ]", r"averages in the long run"),
-        ('LRAminmax=? [ "goal1" ]', r"averages in the long run"),
         ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
         ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),
     ],

@@ -30,7 +30,9 @@ _inside_callback: ContextVar[bool] = ContextVar("inside_callback", default=False
 def is_traced(tree: PyTree) -> bool:
     """True if the host cannot read a tree: an array is a tracer, or lies on several devices."""
     for x in jax.tree.leaves(tree):
-        if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated):
+        if isinstance(x, jax.core.Tracer) or (
+            isinstance(x, jax.Array) and not x.is_fully_replicated
+        ):
             return True
     return False
 

@@ -18,6 +18,7 @@ from jaxltl.core import validation
 from jaxltl.core.models.refusals import refuse_game, refuse_traced
 from jaxltl.core.models.protocols import Array, PyTree, base_model
 from jaxltl.core.models.sparse import Rewards
+from jaxltl.core.suggestions import unknown_keyword
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
 
@@ -57,9 +58,13 @@ def validated(
     def decorate(solve: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(solve)
         optional = {x.name for x in signature.parameters.values() if x.default is None}
+        takes_more = any(x.kind is x.VAR_KEYWORD for x in signature.parameters.values())
 
         @wraps(solve)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in signature.parameters and not takes_more:
+                    raise unknown_keyword(solve.__name__, name, signature.parameters)
             bound = signature.bind(*args, **kwargs)
             if not games:
                 refuse_game(solve.__name__, bound.arguments.items())

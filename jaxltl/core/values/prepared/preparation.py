@@ -10,19 +10,18 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core import struct
 
-from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.refusals import of_one_player
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.protocols import Model, PyTree
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, refuse_underflow
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
-from jaxltl.core.types import require_states
 from jaxltl.core.values.prepared.block_iteration import Blocks
+from jaxltl.core.values.engine.row_form import row_form
 from jaxltl.core.values.engine.state_quantities import nonnegative_reward
 from jaxltl.core.values.interval.sides import refuse_nature
 from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval
@@ -99,9 +98,9 @@ class Prepared:
 @of_one_player
 def prepare(
     model: Model | IntervalMDP,
-    target: chex.Array,
+    target: Array | str,
     *,
-    stay: chex.Array | None = None,
+    stay: Array | str | None = None,
     reward: str | Rewards | chex.Array | None = None,
     policy: chex.Array | None = None,
     objective: str = "max",
@@ -113,9 +112,9 @@ def prepare(
     infinity, and orders the others in blocks of equal shape, in reverse topological order.
 
     Args:
-      model: a concrete SparseMDP, or any argument of :func:`to_sparse`.
-      target: ``bool[S]``.
-      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
+      model: a concrete model of one player.
+      target: ``bool[S]``, a label's name, or a Boolean formula of labels.
+      stay: in the same forms, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of
         reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
       policy: of an IntervalMDP, actions ``int32[S]`` to be evaluated; default: optimise.
@@ -163,14 +162,15 @@ def prepare(
             "policy to solve_prepared."
         )
     validation.choice("objective", objective, ("max", "min", "policy"))
-    sparse = to_sparse(model)
-    host = sparse.host
-    require_states("target", target, model.state_shape)
-    target = np.asarray(target, bool).ravel()
+    form = row_form(model)
+    sparse, host, target = form.sparse, form.host, form.states("target", target)
     if stay is not None:
-        require_states("stay", stay, model.state_shape)
-        stay = np.asarray(stay, bool).ravel()
-    cost = None if reward is None else nonnegative_reward(sparse, reward, "prepared solves")
+        stay = form.states("stay", stay)
+    cost = (
+        None
+        if reward is None
+        else nonnegative_reward(sparse, form.reward(reward), "prepared solves")
+    )
     if objective == "policy":
         plan = plan_policy(host, target, stay, cost)
     elif cost is None:

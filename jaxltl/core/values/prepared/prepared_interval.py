@@ -44,7 +44,6 @@ from jaxltl.core.values.interval.robust_policy_iteration import (
 from jaxltl.core.values.door.row_engines import certain_reward
 from jaxltl.core.values.engine.row_form import row_form
 from jaxltl.core.values.interval.sides import nature_direction
-from jaxltl.core.values.engine.state_quantities import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
@@ -130,8 +129,9 @@ def prepare_interval(
     """Preprocessed question about an interval model, see `prepare`."""
     refuse_ball(model, "prepare has no rule for its derivatives")
     direction = nature_direction(nature, objective)
-    target = state_mask(model.nominal, target, "target")
-    stay = None if stay is None else state_mask(model.nominal, stay, "stay")
+    form = row_form(model)
+    target = form.states("target", target)
+    stay = None if stay is None else form.states("stay", stay)
     host: UncertainMDP = model.host
     entry: Array = np.arange(model.num_transitions)
     if policy is not None:
@@ -145,7 +145,7 @@ def prepare_interval(
     up, large = objective == "max", direction == "max"
     if policy is not None:
         up = large  # without choices, the policy has the objective of nature
-    cost = None if reward is None else certain_reward(row_form(model), reward)
+    cost = None if reward is None else certain_reward(form, reward)
     if cost is None:
         plan = plan_reachability(host, target, stay, Query(up, large))
     else:

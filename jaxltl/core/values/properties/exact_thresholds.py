@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property
@@ -104,8 +104,12 @@ class _ExactQuery:
         structure = reward_structure(self.model, prop.reward)
         return exact_reward(self.model, self.numbers, structure, self.reward_name(prop.reward))
 
-    def probability(self, path: Formula | Bounded, maximize: bool) -> Values:
+    def probability(self, path: Formula | Bounded | Conditional, maximize: bool) -> Values:
         """The probability of a path formula."""
+        if isinstance(path, Conditional):
+            both = self.probability(path.event & path.condition, maximize)
+            alone = self.probability(path.condition, maximize)
+            return [x / y for x, y in zip(both, alone, strict=True)]
         if isinstance(path, Bounded):
             return self.within(path, maximize)
         if is_boolean(path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxltl.core.logic.bounded import Bounded, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property
@@ -61,8 +61,12 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
                 f"{MAX_UNFOLDED_STEPS} steps."
             )
         path = unfolded(path)
+    if isinstance(path, Conditional):
+        raise ValueError(
+            f"{prop.text}: inside multi(...) there are no conditional probabilities, ||; write "
+            "(PATH) | (PATH) for at least one of two paths."
+        )
     assert isinstance(path, Formula)
-
     if path.operator not in ("F", "G", "U") or not all(is_boolean(f) for f in path.operands):
         return {"formula": path}
     stay, right = (states_satisfying(model, path.operands[i], prop.text) for i in (0, -1))

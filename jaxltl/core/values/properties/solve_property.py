@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.deferred import Deferred
-from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula, TRUE
@@ -363,10 +363,14 @@ class _ModelQuery(NamedTuple):
         strategy = PropertyStrategy(rows, by, nature=nature)
         return _Result(at_states(solution, self.states), strategy)
 
-    def probability(self, path: Formula | Bounded, aim: PropertyAim, tolerance: float) -> _Result:
+    def probability(
+        self, path: Formula | Bounded | Conditional, aim: PropertyAim, tolerance: float
+    ) -> _Result:
         """The probability of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
             return self.within(path, aim, tolerance)
+        if isinstance(path, Conditional):
+            return self.conditional(path, aim, tolerance)
         if is_boolean(path):
             return self.state_formula(path)
         if path.operator == "!":
@@ -390,6 +394,32 @@ class _ModelQuery(NamedTuple):
             case "R":
                 return self.until(~first, ~right, aim, tolerance, complement=True)
         raise AssertionError(path.operator)
+
+    def conditional(self, path: Conditional, aim: PropertyAim, tolerance: float) -> _Result:
+        """``P(A and B) / P(B)`` of a chain, with both probabilities relatively exact."""
+        if not isinstance(self.model, SparseMDP) or not self.model.is_chain:
+            raise ValueError(
+                f"{self.text}: conditional probabilities, ||, are solved for in Markov chains; here the "
+                "condition may depend on a strategy. For at least one of two paths write (PATH) | (PATH)."
+            )
+        width = RelativeTolerance(float(tolerance) / 4)
+        both = self.probability(path.event & path.condition, aim, width).solution
+        alone = self.probability(path.condition, aim, width).solution
+        low, high = np.asarray(alone.lower), np.asarray(alone.upper)
+        for state in self.states[high == 0][:1].tolist():
+            raise ValueError(
+                f"{self.text}: the condition {path.condition} has probability 0 in state {state}, so that "
+                "no probability under it is defined; ask for other states."
+            )
+        lower = np.nextafter(np.asarray(both.lower) / high, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            upper = np.where(low > 0, np.nextafter(np.asarray(both.upper) / low, 2), 1)
+        upper = np.minimum(upper, 1)
+        value = np.clip(np.asarray(both.value) / np.maximum(alone.value, high / 2), lower, upper)
+        parts: dict[str, Array] = {"value": value, "lower": lower, "upper": upper}
+        parts["status"] = np.maximum(both.status, alone.status)
+        method = f"quotient of two probabilities, {alone.method}"
+        return _Result(replace(both, **parts, method=method), None)
 
     def state_formula(self, path: Formula) -> _Result:
         holds: Array = self.where(path).astype(np.float64)[self.states]

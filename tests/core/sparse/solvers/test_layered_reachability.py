@@ -9,7 +9,7 @@ import pytest
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import transition_matrix
 from jaxltl.core.sparse.solvers import layered_reachability as layers
-from jaxltl.core.values.undiscounted import reachability
+from jaxltl.core.values.undiscounted import reaching
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.support import random_product
 
@@ -55,9 +55,9 @@ def attained(model, target, policy):
 def check(model, target, objective, monkeypatch, tolerance):
     other = reachability_probability(model, target, objective=objective)
     with monkeypatch.context() as patch:
-        patch.setattr(reachability, "QUICK_LIMIT", 0)
+        patch.setattr(reaching, "QUICK_LIMIT", 0)
         patch.setattr(layers, "_MET", 0)
-        ours = reachability._by_layers(model, target, tolerance, objective)
+        ours = reaching._by_layers(model, target, tolerance, objective)
     if ours is None:
         return False
     eps = np.finfo(np.asarray(ours.lower).dtype).eps
@@ -100,7 +100,7 @@ def test_as_closely_as_the_numbers_allow(monkeypatch):
     assert np.mean(done) > 0.8
     model, target = next(cases(1, 6))
     with monkeypatch.context() as patch:
-        patch.setattr(reachability, "QUICK_LIMIT", 0)
-        assert reachability._by_layers(model, target, 1e-3, "max") is None  # so small a world
+        patch.setattr(reaching, "QUICK_LIMIT", 0)
+        assert reaching._by_layers(model, target, 1e-3, "max") is None  # so small a world
         patch.setattr(layers, "_MET", 0)
-        assert reachability._by_layers(model, target, 0.0, "max") is None
+        assert reaching._by_layers(model, target, 0.0, "max") is None

@@ -288,6 +288,54 @@ def test_models_of_every_kind_have_properties():
         solve_property(chance(0.5), 0.5)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_conditional_probabilities_are_quotients(seed):
+    """Against the chain with the memory of which of the two labels were seen."""
+    rng = np.random.default_rng(seed)
+    size = 6
+    matrix = rng.dirichlet(np.ones(size) / 2, size) * (rng.random((size, size)) < 0.5)
+    matrix[np.arange(size), rng.integers(size, size=size)] += 0.1
+    matrix /= matrix.sum(1, keepdims=True)
+    marks = rng.random((size, 2)) < 0.25
+    model = jl.to_sparse(jl.from_dense(matrix[:, None], label=marks, propositions=["a", "b"]))
+    seen = np.zeros((2, 2, size, 2, 2, size))
+    for a, b, s, t in np.ndindex(2, 2, size, size):
+        seen[a, b, s, a | int(marks[t, 0]), b | int(marks[t, 1]), t] = matrix[s, t]
+    limit = np.linalg.matrix_power(seen.reshape(4 * size, -1), 2**20).reshape(
+        2, 2, size, 2, 2, size
+    )
+    start = [limit[int(marks[s, 0]), int(marks[s, 1]), s].sum(-1) for s in range(size)]
+    for s, mass in enumerate(start):
+        text = 'P=? [ F "a" || F "b" ]'
+        if mass[:, 1].sum() < 1e-12:
+            with pytest.raises(ValueError, match=rf"has probability 0 in state {s}"):
+                solve_property(model, text, states=[s])
+            continue
+        found = solve_property(model, text, states=[s])
+        exact = mass[1, 1] / mass[:, 1].sum()
+        assert found.status == Status.CONVERGED
+        assert found.lower[0] - 1e-9 <= exact <= found.upper[0] + 1e-9
+        assert found.upper[0] - found.lower[0] <= 1e-6
+        less = solve_property(model, 'P>=0.5 [ F "a" || F "b" ]', states=[s]).holds[0]
+        assert less == (exact >= 0.5) or abs(exact - 0.5) < 1e-9
+    negated = solve_property(model, 'P=? [ G !"a" || true ]', states=[0]).value[0]
+    assert negated == pytest.approx(start[0][0].sum(), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('Pmax=? [ F "a" || F "b" ]', "Markov chains"),
+        ('Pmax=? [ F "a" || F "b" || F "a" ]', "one condition"),
+        ('Rmax=? [ F "a" || F "b" ]', "\\|\\|"),
+        ('multi(Pmax=? [ F "a" || F "b" ])', "no conditional probabilities"),
+    ],
+)
+def test_conditions_that_are_not_solved_for(text, message):
+    with pytest.raises(ValueError, match=message):
+        solve_property(random_rewarded(1), text)
+
+
 def test_coalitions_of_the_players_of_a_game():
     """The system may stay away from a, and the environment takes the worse of two coins."""
     world = jl.make_mdp([[[1, 2], [2, 2]], [[2, 3], [2, 3]], [[2, 2]] * 2, [[3, 3]] * 2],
