@@ -455,7 +455,7 @@ discount = 0.5'''
         (("!r U y", "!r U U y"), "column 6"),
         (("!r U y", "!red U y"), "the formula mentions the proposition 'red'"),
         (("!r U y", "!r & r"), "[task] formula: nothing satisfies it"),
-        (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 5"),
+        (("discount = 0.9", "discount = 0.9\nguess = [1, 2]"), "guess has 2 numbers; there are 5"),
         (
             ("discount = 0.9", 'discount = 0.9\navoid = ["q"]'),
             "[learner] avoid: 'q' is not a propos",

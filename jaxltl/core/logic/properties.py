@@ -109,9 +109,7 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     `&&` and `||`, which is for state formulas only. So temporal operators reach as far as they can,
     as in PRISM and Storm:
     `G F "a" & "b"` is `G F ("a" & "b")`. A property may have a name, `"p1": ...`, and `//`
-    begins a comment.
-
-    A text may declare constants (``const int k = 3;``), formulas and labels as programs do, and
+    begins a comment. A text may declare constants (``const int k = 3;``), formulas and labels as programs do, and
     write constants in place of numbers.
 
     Args:
@@ -351,10 +349,10 @@ class _Parser(TokenStream):
         return Conditional(*plain)
 
     def path(self, inside: bool = False) -> _Path:
-        path, last = self.condition(inside), self.last
-        if isinstance(path, Conditional):
-            raise self.error("one path; a condition, ||, stands outermost in P", last)
-        return path
+        path = self.condition(inside)
+        if not isinstance(path, Conditional):
+            return path
+        raise self.error("one path; a condition, ||, stands outermost in P", self.last)
 
     def conjunction(self) -> _Path:
         return self.chain("&&", "&", self.until)

@@ -350,7 +350,7 @@ def test_options_have_one_meaning_on_the_host_and_in_programs(name):
 def test_rows_and_weights_are_one_policy():
     model, _, inputs, _ = example()
     rows = np.asarray(model.row_start[1:] - 1)
-    actions, weight = np.asarray(model.action)[rows], np.zeros(model.num_rows)
+    actions, weight = model.rank[rows], np.zeros(model.num_rows)
     weight[rows] = 1
     for name in ("policy_value", "occupancy_measure", "strategy_value"):
         one, other = (
