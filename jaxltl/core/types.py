@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -123,7 +124,7 @@ class Solution:
 
         counts = share > 0
         total = xp.where(counts, share * xp.where(counts, self.value, 0), 0).sum(axes)
-        stop = jax.lax.stop_gradient if xp is jnp else lambda x: x
+        stop: Callable[[Any], Any] = jax.lax.stop_gradient if xp is jnp else np.asarray
 
         def bound(x: jax.Array, end: int) -> jax.Array:
             x = xp.where(counts, x, 0)
