@@ -30,6 +30,7 @@ from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
+from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.validation import errors_in
 from jaxltl.io.files import write_bytes
 from jaxltl.io.umb.members import tar_pieces, write_gzip
@@ -191,9 +192,7 @@ def _problem(
     name = prop.reward
     if prop.operator == "R" and reward is not None:
         name = name or "reward"
-        if not isinstance(reward, Rewards) and np.ndim(reward) == 2:
-            reward = np.asarray(reward)[sparse.host.state, np.asarray(sparse.action)]
-        sparse = replace(sparse, rewards={name: reward_structure(sparse, reward)})
+        sparse = replace(sparse, rewards={name: row_form(model).reward(reward)})
     elif prop.operator == "R":
         name = name or next(iter(sparse.rewards), None)
     path: dict[str, object] = {}
@@ -273,19 +272,12 @@ def _mask(sparse: SparseMDP, text: str) -> Booleans:
 
 def _offsets(model: Model, solution: Solution, problem: _Certified) -> Integers:
     """The policy as numbers of rows within their states."""
-    policy, start = np.asarray(solution.policy), np.asarray(problem.host.row_start, np.int64)
+    policy = np.asarray(solution.policy)
     if policy.ndim != len(model.state_shape) or not np.issubdtype(policy.dtype, np.integer):
-        raise ValueError("solution.policy is randomised or missing; expected a row of each state.")
-    inner = model.mdp if isinstance(model, Game) else model
-    chosen = policy.ravel().astype(np.int64)
-    if not isinstance(inner, SparseMDP | IntervalMDP):  # actions, not rows
-        rows, action = problem.host.state, np.asarray(problem.sparse.action)
-        match = np.flatnonzero(action == chosen[rows])
-        chosen = start[:-1].copy()
-        chosen[rows[match]] = match
-    count = np.diff(start)
-    offset = chosen - start[:-1]
-    return np.where((offset >= 0) & (offset < count), offset, 0)
+        raise ValueError(
+            "solution.policy is randomised or missing; expected an action of each state."
+        )
+    return row_of_action(problem.sparse, policy) - problem.host.row_start[:-1]
 
 
 def _claim(

@@ -8,7 +8,6 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.checker import main
-from jaxltl.core.values import robust_discounted_value
 from jaxltl.io import read_umb, write_certificate
 
 SIZE = 12
@@ -99,7 +98,7 @@ def test_intervals(seed, directions, tmp_path, capsys):
     found = jl.reachability_probability(rough, goal, objective=objective, nature=nature)
     write_certificate(path, rough, found, f'P{directions}=? [ F "goal" ]')
     assert width(verified(path, capsys)) < 1e-4
-    found = robust_discounted_value(rough, "cost", 0.9, objective=objective, nature=nature)
+    found = jl.optimal_value(rough, "cost", 0.9, objective=objective, nature=nature)
     write_certificate(path, rough, found, f'R{{"cost"}}{directions}=? [ C ]', discount=0.9)
     verified(path, capsys)
 
