@@ -554,7 +554,7 @@ def _soft_plan(
         model,
         rewards,
         hparams.discount,
-        initial=guess,
+        guess=guess,
         method=hparams.method,
         tolerance=hparams.tolerance,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -265,13 +265,6 @@ def unsupported_model(model: object) -> str:
         f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "
         "them."
     )
-
-
-def options(function: str, values: Mapping[str, object], **defaults: Any) -> tuple[Any, ...]:
-    """The values of optional keywords with these defaults; TypeError for another, as Python raises."""
-    if unknown := sorted(values.keys() - defaults.keys()):
-        raise unknown_keyword(function, unknown[0], defaults)
-    return tuple({**defaults, **values}.values())
 
 
 def keywords(function: str, names: Iterable[str], options: type) -> None:

@@ -269,7 +269,7 @@ def _solve(
             raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
         return soft_value(problem.model, reward, hparams.discount)
     return boltzmann_value(
-        problem.model, reward, hparams.discount, initial=guess, adjoint=hparams.adjoint
+        problem.model, reward, hparams.discount, guess=guess, adjoint=hparams.adjoint
     )
 
 

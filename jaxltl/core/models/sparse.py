@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeAlias, TypedDict, Unpack, cast
+from typing import Any, TypedDict, Unpack, cast
 
 import chex
 import jax
@@ -18,6 +18,12 @@ from numpy.typing import DTypeLike
 from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.models.number_source import NumberSource
+from jaxltl.core.models.rewards import (
+    Reward as Reward,
+    Rewards as Rewards,
+    default_reward as default_reward,
+    listed_names,
+)
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.protocols import PyTree
@@ -33,45 +39,6 @@ _PADDED = (
     "solvers of values, and prepare; not by permissive strategies, learners and rollouts."
 )
 Array = Any  # NumPy's in double precision as it is read, or JAX's
-
-
-@brief
-@struct.dataclass
-class Rewards:
-    """A reward structure, the sum of up to three parts; absent parts are zero.
-
-    Attributes:
-      state, choice, transition: ``float[S]``, ``float[R]`` and ``float[T]``, earned by each step from
-        a state, by a choice and by a transition.
-
-    Example:
-      >>> import jaxltl as jl
-      >>> steps = Rewards(state=[1, 1, 0])
-      >>> model = make_sparse(None, [0, 1, 2, 3], [1, 2, 2], [1, 1, 1], rewards={"steps": steps})
-      >>> jl.total_reward(model, "steps", np.array([False, False, True])).value.tolist()
-      [2.0, 1.0, 0.0]
-    """
-
-    state: Array | None = None
-    choice: Array | None = None
-    transition: Array | None = None
-
-    def gathered(self, state: Array, choice: Array, transition: Array) -> Rewards:
-        """The rewards at given indices of each part."""
-        return Rewards(
-            _taken(self.state, state),
-            _taken(self.choice, choice),
-            _taken(self.transition, transition),
-        )
-
-
-def _taken(x: Array | None, index: Array) -> Array | None:
-    if x is None:
-        return None
-    return gather(x, index) if is_traced((x, index)) else np.asarray(x)[index]
-
-
-Reward: TypeAlias = str | Rewards | Array | None
 
 
 @brief(drawn=True)
@@ -228,7 +195,7 @@ def reward_structure(model: SparseMDP, reward: str | Rewards | chex.Array | None
     if isinstance(reward, str):
         if reward not in model.rewards:
             raise ValueError(
-                f"there is no reward {reward!r}; the model has {_listed(model.rewards)}."
+                f"there is no reward {reward!r}; the model has {listed_names(model.rewards)}."
             )
         reward = model.rewards[reward]
     if not isinstance(reward, Rewards):
@@ -263,17 +230,6 @@ def _traced_reward(model: SparseMDP, reward: Rewards) -> Array:
     return total
 
 
-def default_reward(rewards: Mapping[str, object]) -> str:
-    """The name of the reward that is meant without one: that without a name, or the only one."""
-    if "" in rewards or len(rewards) == 1:
-        return "" if "" in rewards else next(iter(rewards))
-    raise ValueError(f"name the reward: the model has {_listed(rewards)}.")
-
-
-def _listed(names: Mapping[str, object]) -> str:
-    return ", ".join(map(repr, names)) or "none"
-
-
 def _shaped(model: SparseMDP, reward: Array) -> Rewards:
     reward = reward if isinstance(reward, jax.Array) else validation.float_array("reward", reward)
     for size, name in _sizes(model):
@@ -303,7 +259,12 @@ def make_sparse(
     probability: chex.Array,
     *,
     initial: chex.Array | None = None,
-    **annotations: Unpack[Annotations],
+    label: chex.Array | Mapping[str, Sequence[int]] | None = None,
+    propositions: Sequence[str] = (),
+    rewards: Mapping[str, Rewards] | None = None,
+    action: chex.Array | None = None,
+    action_names: Sequence[str] = (),
+    valuation: Mapping[str, chex.Array] | None = None,
 ) -> SparseMDP:
     """Validated :class:`SparseMDP` from arrays, as NumPy arrays in double precision.
 
@@ -317,8 +278,8 @@ def make_sparse(
       successor: ``int[T]``, in ``[0, S)``.
       probability: ``float[T]``.
       initial: ``float[S]``, a distribution; default: uniform.
-      annotations: `label` and `propositions` as for :func:`~jaxltl.core.models.mdp.make_mdp`, and
-        `rewards`, `action`, `action_names` and `valuation` as in :class:`SparseMDP`.
+      label, propositions: as for :func:`~jaxltl.core.models.mdp.make_mdp`.
+      rewards, action, action_names, valuation: as in :class:`SparseMDP`.
 
     Returns:
       :class:`SparseMDP`.
@@ -333,7 +294,18 @@ def make_sparse(
       >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
       (2, 3, 4, False)
     """
-    model = sparse_part(row_start, entry_start, successor, probability, **annotations)
+    model = sparse_part(
+        row_start,
+        entry_start,
+        successor,
+        probability,
+        label=label,
+        propositions=propositions,
+        rewards=rewards,
+        action=action,
+        action_names=action_names,
+        valuation=valuation,
+    )
     return replace(model, initial=checked_initial(initial, model.num_states))
 
 

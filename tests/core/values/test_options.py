@@ -70,8 +70,8 @@ def calls(kind):
         (jl.total_reward, reach | {"reward": earned}, until | {"reward": ones, "policy": policy}),
         (jl.optimal_value, discounted, method | {"max_steps": 9, "method": "auto"}),
         (jl.policy_value, discounted | {"policy": policy}, method | {"policy": policy}),
-        (jl.soft_value, discounted, method | {"method": "newton", "initial": ones}),
-        (values.boltzmann_value, discounted, {"method": "damped", "initial": ones}),
+        (jl.soft_value, discounted, method | {"method": "newton", "guess": ones}),
+        (values.boltzmann_value, discounted, {"method": "damped", "guess": ones}),
         (
             jl.occupancy_measure,
             {"model": model, "policy": policy, "discount": 0.9},

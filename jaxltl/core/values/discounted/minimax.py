@@ -8,7 +8,7 @@ sparse model quantities on actions are ``[R]``, and an action is a row.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, Unpack
+from typing import NamedTuple
 
 import chex
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core import validation
-from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.compiled import compiled_form, compiled_policy, reshape_solution
@@ -64,7 +64,7 @@ def minimax_value(
     method: str = "policy_iteration",
     allowed: chex.Array | None = None,
     tolerance: chex.Numeric | None = None,
-    **options: Unpack[SolverOptions],
+    max_steps: chex.Numeric = 100_000,
 ) -> Solution:
     """Minimax value: discounted reward that the system secures against every environment.
 
@@ -108,7 +108,6 @@ def minimax_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([4.0, 4.0], [1, 0])
     """
-    (max_steps,) = validation.options("minimax_value", options, max_steps=100_000)
     game_model = as_game(game)
     form, reward = compiled_form(game_model, reward)
     if allowed is not None:
@@ -160,7 +159,7 @@ def strategy_value(
     environment: chex.Array | str = "adversarial",
     method: str = "policy_iteration",
     tolerance: chex.Numeric | None = None,
-    **options: Unpack[SolverOptions],
+    max_steps: chex.Numeric = 100_000,
 ) -> Solution:
     """Discounted value of a strategy, against the worst case or a policy of the environment.
 
@@ -193,7 +192,6 @@ def strategy_value(
       >>> [round(v, 4) for v in worst.value.tolist()]
       [2.0, 2.0]
     """
-    (max_steps,) = validation.options("strategy_value", options, max_steps=100_000)
     game_model = as_game(game)
     form, reward = compiled_form(game_model, reward)
     if isinstance(environment, str):

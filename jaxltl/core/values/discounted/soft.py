@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import reduce
-from typing import NamedTuple, Unpack
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from jaxltl.core import validation
 from jaxltl.core.models.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.array_namespace import jit
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
@@ -35,7 +34,7 @@ from jaxltl.core.values.engine.certificates import backup_error, most_choices, r
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import System
-from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core.values.engine.validated import validated
 
 
 _LEAST = 0.95  # of the logarithm of the least normal number, to which probabilities may fall
@@ -48,17 +47,17 @@ def soft_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
-    initial: jax.Array | None = None,
+    guess: jax.Array | None = None,
     method: str = "newton",
     tolerance: jax.Array | float | None = None,
-    **options: Unpack[SolverOptions],
+    max_steps: jax.Array | int = 100_000,
 ) -> Solution:
     """Soft (maximum-entropy) value, ``V = log sum_a exp(R + discount * P V)`` (3.4).
 
     Args:
       model, reward, discount, tolerance: as in
         :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
-      initial: ``float[S]``, the first iterate; default zero.
+      guess: ``float[S]``, the first iterate; default zero.
       method: ``"newton"`` (soft policy iteration) or ``"value_iteration"``.
       max_steps: maximal number of steps of the method; default 100,000.
 
@@ -76,10 +75,9 @@ def soft_value(
       >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
       1.3863
     """
-    (max_steps,) = validation.options("soft_value", options, max_steps=100_000)
     form, reward = compiled_form(model, reward)
     return reshape_solution(
-        model, _soft_value(form, reward, discount, initial, (tolerance, max_steps), method=method)
+        model, _soft_value(form, reward, discount, guess, (tolerance, max_steps), method=method)
     )
 
 
@@ -88,7 +86,7 @@ def _soft_value(
     model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
-    initial: jax.Array | None,
+    guess: jax.Array | None,
     limits: tuple[jax.Array | float | None, jax.Array | int],
     *,
     method: str,
@@ -96,7 +94,7 @@ def _soft_value(
     tolerance, max_steps = limits
     problem = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
-    start = first_iterate(model, initial)
+    start = first_iterate(model, guess)
     value, image, n, _ = newton.solve(
         sweep_operator(model),
         newton.Method(soft_maximum, judge, newton=method == "newton"),
@@ -235,13 +233,13 @@ def boltzmann_expansion(num_actions: ArrayLike) -> Array:
     return expansion if xp is jnp else float(expansion)
 
 
-def first_iterate(model: Model, initial: jax.Array | None) -> jax.Array:
+def first_iterate(model: Model, guess: jax.Array | None) -> jax.Array:
     """The first iterate of a value, ``float[N]``, from one in the model's shape; zero for None."""
-    if initial is None:
+    if guess is None:
         return jnp.zeros(model.num_states, model.dtype)
-    if np.shape(initial) != (model.num_states,):
-        require_shape("initial", initial, model.state_shape)
-    return jnp.asarray(initial, model.dtype).ravel()
+    if np.shape(guess) != (model.num_states,):
+        require_shape("guess", guess, model.state_shape)
+    return jnp.asarray(guess, model.dtype).ravel()
 
 
 @validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
@@ -250,21 +248,22 @@ def boltzmann_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
-    initial: jax.Array | None = None,
+    guess: jax.Array | None = None,
     method: str = "damped",
     tolerance: jax.Array | float | None = None,
-    **options: Unpack[SolverOptions],
+    adjoint: str = "exact",
+    max_steps: jax.Array | int = 5_000,
 ) -> Solution:
     """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
 
     ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator contracts only
     while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can have several fixed points, one
-    for each region of `initial`: damped steps of one half are polished by Newton's method, the
+    for each region of `guess`: damped steps of one half are polished by Newton's method, the
     enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached.
 
     Args:
       model, reward, discount: as in :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
-      initial: ``float[S]``, the first iterate; default zero.
+      guess: ``float[S]``, the first iterate; default zero.
       method: ``"damped"``, or ``"newton"`` for Newton steps only, which may also find repelling
         fixed points.
       tolerance: width of the enclosure where the operator contracts, of the residual elsewhere;
@@ -285,14 +284,11 @@ def boltzmann_value(
       >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
       2.0
     """
-    adjoint, max_steps = validation.options(
-        "boltzmann_value", options, adjoint="exact", max_steps=5_000
-    )
     form, reward = compiled_form(model, reward)
     return reshape_solution(
         model,
         _boltzmann_value(
-            form, reward, discount, initial, (tolerance, max_steps), options=(adjoint, method)
+            form, reward, discount, guess, (tolerance, max_steps), options=(adjoint, method)
         ),
     )
 
@@ -302,7 +298,7 @@ def _boltzmann_value(
     model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
-    initial: jax.Array | None,
+    guess: jax.Array | None,
     limits: tuple[jax.Array | float | None, jax.Array | int],
     *,
     options: tuple[str, str],
@@ -311,7 +307,7 @@ def _boltzmann_value(
     discount = jnp.asarray(discount, model.dtype)
     criterion = _criterion(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
-    start = first_iterate(model, initial)
+    start = first_iterate(model, guess)
     damping = jnp.where(criterion.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n, _ = newton.solve(
         sweep_operator(model),

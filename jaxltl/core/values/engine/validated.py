@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import wraps
-from typing import ParamSpec, TypedDict, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,19 +26,9 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class SolverOptions(TypedDict, total=False):
-    """Rarely needed options of iterative solvers; the help of each describes those that it takes."""
-
-    adjoint: str
-    evaluation_sweeps: jax.Array | int | None
-    max_steps: jax.Array | int | None
-    relative: bool
-    start: tuple[jax.Array, jax.Array] | None
-
-
 WORDS = {"objective": ("max", "min"), "over": ("mean", "worst"), "label_on": ("entry", "exit")}
 BOOLEANS = ("relative", "by_step", "by_level")
-NUMBERS = ("reward", "initial")  # arrays, which may be lists
+NUMBERS = ("reward", "initial", "guess")  # arrays, which may be lists
 
 
 def validated(
@@ -71,10 +61,6 @@ def validated(
             if host:
                 refuse_traced(solve.__name__, bound.arguments.items())
             arguments = dict(bound.arguments)
-            options = {k: x for k, x in arguments.pop("options", {}).items() if x is not None}
-            arguments.update(options)
-            if "options" in bound.arguments:
-                bound.arguments["options"] = options
             for name, known in (WORDS | words).items():
                 if name in arguments and (arguments[name] is not None or name not in optional):
                     choice(name, arguments[name], known)
@@ -83,8 +69,7 @@ def validated(
                     validation.boolean(name, arguments[name])
             for name in NUMBERS:
                 if arguments.get(name) is not None:
-                    place = options if name in options else bound.arguments
-                    place[name] = arguments[name] = _numbers(name, arguments)
+                    bound.arguments[name] = arguments[name] = _numbers(name, arguments)
             traced = traced_arguments(
                 {name: x for name, x in arguments.items() if x is not None or name not in optional}
             )
@@ -92,8 +77,7 @@ def validated(
                 return solve(*bound.args, **bound.kwargs)
             for name, value in traced.items():
                 valid = RANGES[name]
-                place = options if name in options else bound.arguments
-                place[name] = jnp.where(valid.contains(value), value, valid.low)
+                bound.arguments[name] = jnp.where(valid.contains(value), value, valid.low)
             result: R = invalidated(solve(*bound.args, **bound.kwargs), argument_status(traced))
             return result
 

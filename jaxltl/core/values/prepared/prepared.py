@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, TypeAlias, Unpack
+from typing import NamedTuple, TypeAlias
 
 import chex
 import jax
@@ -14,7 +14,6 @@ from jax import lax
 
 from jaxltl.core.graphs.end_components import recurrent
 from jaxltl.core.models.ops.array_namespace import jit
-from jaxltl.core import validation
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
 from jaxltl.core.models.protocols import PyTree
@@ -31,7 +30,7 @@ from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.implicit_diff import LinearSystem, attach_derivative, implicit
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import RowSystem, row_system
-from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.prepared.block_iteration import SLACK, Problem, State, enclose_cycles
 from jaxltl.core.values.prepared.preparation import Prepared, prepare
 from jaxltl.core.values.prepared.prepared_interval import (
@@ -56,7 +55,7 @@ def solve_prepared(
     reward: chex.Array | None = None,
     policy: chex.Array | None = None,
     tolerance: chex.Array | float | None = None,
-    **options: Unpack[SolverOptions],
+    max_steps: chex.Array | int | None = None,
 ) -> Solution:
     """Solves a prepared question, with other probabilities, intervals or rewards.
 
@@ -94,7 +93,7 @@ def solve_prepared(
       >>> round(found.value[0].item(), 3), found.status.item()
       (0.25, 0)
     """
-    (max_steps,) = validation.options("solve_prepared", options, max_steps=100_000)
+    max_steps = 100_000 if max_steps is None else max_steps
     if isinstance(prepared, PreparedInterval):
         if probability is not None or policy is not None:
             raise ValueError("a question about intervals takes lower and upper ends and a reward.")

@@ -233,7 +233,7 @@ def backup(model, reward, discount, value):
 
 def test_the_answer_depends_on_the_start_where_there_are_several():
     low = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99)
-    high = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99, initial=jnp.array([15.0, 0.0]))
+    high = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99, guess=jnp.array([15.0, 0.0]))
     np.testing.assert_allclose([low.value[0], high.value[0]], [0.3345, 20.0], atol=1e-3)
 
 
