@@ -1,0 +1,74 @@
+"""Questions without a compiled engine, inside ``jit``: the host answers, lane by lane."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.core.types import Status
+
+WORLD = jl.make_mdp(
+    [[[1, 2], [1, 2]], [[1, 1]] * 2, [[2, 2]] * 2],
+    [[[0.5, 0.5], [0.25, 0.75]], [[1.0, 0]] * 2, [[1.0, 0]] * 2],
+    label={"a": [1]},
+    initial=[1, 0, 0],
+)
+GAME = jl.make_game(WORLD, [False, True, True])
+
+
+@pytest.mark.parametrize(
+    ("model", "value"), [(jl.to_sparse(WORLD), 0.5), (GAME, 0.25), (jl.product(GAME, "F a"), 0.25)]
+)
+def test_a_label_is_reached_as_on_the_host(model, value):
+    found = jax.jit(lambda m: jl.reachability_probability(m, "a"))(model)
+    assert found.status == Status.CONVERGED
+    assert found.lower.dtype == jnp.zeros(()).dtype
+    assert float(found.at_initial.value) == value
+    host = jl.reachability_probability(model, "a")
+    np.testing.assert_array_equal(found.policy, host.policy)
+
+
+def test_lanes_have_their_own_answers():
+    first = jnp.array([0.1, 0.4, 0.9])
+
+    def value(p):
+        row = jnp.stack([p, 1 - p])
+        world = WORLD.replace(probability=WORLD.probability.at[0, 1].set(row))
+        game = jl.make_game(WORLD, [False, True, True]).replace(mdp=world)
+        return jl.average_reward(game, jnp.array([[0.0, 0], [1.0, 1], [0.0, 0]])).at_initial
+
+    found = jax.jit(jax.vmap(value))(first)
+    np.testing.assert_allclose(found.value, np.minimum(first, 0.5), atol=1e-5)
+    assert (found.lower <= found.value).all() and (found.value <= found.upper).all()
+
+
+def test_what_a_program_cannot_raise_is_a_status():
+    model = jl.to_sparse(WORLD)
+    solve = jax.jit(lambda p: jl.reachability_probability(model, "a", policy=p).status)
+    assert int(solve(jnp.array([1, 0, 0]))) == Status.CONVERGED
+    assert int(solve(jnp.array([2, 0, 0]))) == Status.INVALID
+    with pytest.raises(ValueError, match="target has shape"):
+        jax.jit(lambda m: jl.reachability_probability(m, jnp.ones(2, bool)))(GAME)
+    with pytest.raises(ValueError, match="there are no labels|'b'"):
+        jl.reachability_probability(GAME, "b")
+
+
+def test_values_of_the_host_have_no_derivatives():
+    def value(p):
+        game = GAME.replace(mdp=WORLD.replace(probability=p))
+        return jl.reachability_probability(game, "a").at_initial.value
+
+    with pytest.raises(TypeError, match="no derivatives"):
+        jax.grad(value)(WORLD.probability)
+
+
+def test_options_and_throw_are_refused_where_nobody_reads_them():
+    with pytest.raises(ValueError, match="max_steps is an option"):
+        jax.jit(lambda m: jl.reachability_probability(m, "a", max_steps=3))(GAME)
+    with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda m: jl.reachability_probability(m, "a", throw=True))(GAME)
+    sparse = jl.to_sparse(WORLD)
+    slow = {"tolerance": 0.0, "throw": True}
+    with pytest.raises(jl.NotConverged):
+        jl.optimal_value(sparse, [0.1, 0.2, 0.3], 0.9, **slow)
