@@ -13,23 +13,10 @@ from jaxltl.core.validation import first_true
 
 
 def row_actions(model: SparseMDP) -> Integers:
-    """The action number of each row, ``int[R]``; distinct within a state.
-
-    The number that the model gives where its actions have numbers and no names, as
-    :func:`~jaxltl.core.models.construct.convert.to_sparse` gives them; else, and where two rows of a state
-    share one, the rank of the row among those of its state.
-    """
+    """The action number of each row, ``int[R]``: :attr:`SparseMDP.action_number`."""
     if not isinstance(model, SparseMDP):
         raise ValueError(validation.unsupported_model(model))
-    if model.action is None or model.action_names:
-        return model.rank
-    number, state = np.asarray(model.action), model.host.state
-    ascending = (state[1:] > state[:-1]) | (number[1:] > number[:-1])
-    if not ascending.all():
-        place = state * np.int64(number.max() + 1) + number
-        if np.unique(place).size < place.size:
-            return model.rank
-    return number
+    return model.action_number
 
 
 def rows_of_policy(
@@ -48,7 +35,11 @@ def rows_of_policy(
             f"policy has shape {policy.shape}; expected ({host.num_states},), an action for each "
             "state, or the weights of actions with one more axis."
         )
-    number = row_actions(model)
+    number, start = row_actions(model), host.row_start[:-1]
+    ranks = (policy >= 0) & (policy < np.diff(host.row_start))
+    if ranks.all() and (number[start + policy] == policy).all():  # as in most models
+        rows: Integers = start + policy
+        return rows
     some, row = host.first_choice(number == policy[host.state])
     for s in first_true(~some & where):
         known = number[host.row_start[s] : host.row_start[s + 1]].tolist()

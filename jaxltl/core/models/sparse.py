@@ -133,6 +133,22 @@ class SparseMDP:
         probability = np.asarray(self.probability, np.float64)
         return HostMDP(row_start, entry_start, successor, probability)
 
+    @cached_property
+    def action_number(self) -> np.ndarray:
+        """``int[R]``, the action number of each row in policies; distinct within a state.
+
+        The number in `action` where actions have numbers and no names, as ``to_sparse`` gives them; else, and where
+        two rows of a state share one, the rank of the row among those of its state.
+        """
+        if self.action is None or self.action_names:
+            return self.rank
+        number, state = np.asarray(self.action), self.host.state
+        if not ((state[1:] > state[:-1]) | (number[1:] > number[:-1])).all():
+            place = state * np.int64(number.max() + 1) + number
+            if np.unique(place).size < place.size:
+                return self.rank
+        return number
+
     @property
     def rank(self) -> np.ndarray:
         """``int[R]``, the number of each row among those of its state."""

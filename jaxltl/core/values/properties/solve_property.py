@@ -359,7 +359,10 @@ class _ModelQuery(NamedTuple):
     def result(self, solution: Solution, by: str = "") -> _Result:
         """A solution at all states, at those that are asked for."""
         nature = None if solution.nature is None else np.asarray(solution.nature)
-        rows = rows_of_policy(graph_of_model(self.model), solution.policy)
+        graph = graph_of_model(self.model)
+        rows: Array = np.arange(graph.num_states)
+        if not graph.is_chain:
+            rows = rows_of_policy(graph, solution.policy)
         strategy = PropertyStrategy(rows, by, nature=nature)
         return _Result(at_states(solution, self.states), strategy)
 
@@ -480,7 +483,8 @@ class _ModelQuery(NamedTuple):
             return result
         if self.model.num_states > QUICK_LIMIT:
             return result
-        host, chosen = self.model.host, rows_of_policy(self.model, solution.policy)
+        assert result.strategy is not None
+        host, chosen = self.model.host, result.strategy.row
         row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
         return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 
