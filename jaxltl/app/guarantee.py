@@ -1,4 +1,4 @@
-"""Guarantees of learned policies: optimal actions, or a satisfaction probability to attain."""
+"""Makes learned policies meet a task file's demands: optimal actions, a least probability, few steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers of symbol grounding: the table, certified policies, robust policies, and the query.
+"""Uses of inferred symbol meanings: a table, the most informative state to ask about, robust policies.
 
 Example: the demonstrations leave open which of two cells is the goal; one policy visits both.
   >>> import jax.numpy as jnp
