@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from jaxltl.core.models.ops.array_namespace import is_traced, namespace
 from jaxltl.core.models.ops.kernels import segment_ids
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
+from jaxltl.core.models.protocols import ActionModel, Array, Model, PyTree, base_model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
@@ -36,14 +37,14 @@ def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
         system = jnp.asarray(model.system).reshape(form.state_shape)
         return (model if form is model.mdp else Game(form, system)), reward
     if is_sharded(model):
-        return _named_reward(model, reward)
+        return _of_actions(*_named_reward(model, reward))
     lazy = model
     if isinstance(model, Product) and isinstance(model.mdp, SparseMDP):
         model = product_rows(model.mdp, model) if is_traced(model) else to_sparse(model)
     if hasattr(base_model(model), "nominal"):
         raise ValueError(validation.unsupported_model(base_model(model)))
     if not isinstance(model, SparseMDP):
-        return model, reward
+        return _of_actions(model, reward)
     if reward is not None:
         reward = reward_structure(model, _on_form(lazy, reward))
     none = np.zeros((model.num_states, 0), bool)
@@ -63,6 +64,14 @@ def _on_form(lazy: Model, reward: Array) -> Reward:
         return reward
     _, number, state, table = namespace(*_row_numbers(lazy), reward)
     return Rewards(choice=table.reshape(lazy.num_states, -1)[state, number])
+
+
+def _of_actions(model: Model, reward: Array) -> tuple[Model, Array]:
+    """A model, and a reward of states as one of its actions."""
+    if reward is not None and jnp.shape(reward) == model.state_shape:
+        actions = (*model.state_shape, cast(ActionModel, model).num_actions)
+        reward = jnp.broadcast_to(jnp.asarray(reward)[..., None], actions)
+    return model, reward
 
 
 def _named_reward(model: Model, reward: Reward) -> tuple[Model, Array]:

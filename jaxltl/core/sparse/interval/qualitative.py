@@ -136,6 +136,46 @@ def almost_sure_states(
         inside = reached
 
 
+def preventing_choices(
+    model: UncertainMDP, goal: Booleans, query: Query
+) -> tuple[Integers, Booleans]:
+    """Rows ``int[S]`` and entries ``bool[T]`` by which those that minimise prevent almost-sure states.
+
+    Outside of :func:`almost_sure_states`, and with two that minimise outside of the prob1 states, the
+    absorbing goal is then missed with positive probability: by the rows where the policy minimises,
+    and by distributions whose support are the entries, where nature may keep to these.
+    """
+    mdp, both = model.mdp, not (query.maximize or query.nature_maximizes)
+    source = mdp.state[mdp.row]
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    entries = np.ones(mdp.num_transitions, bool)
+    inside = np.ones(mdp.num_states, bool)
+    if both:
+        inside = attractor_against_nature(model, goal, all_rows=True)
+        row = np.where(inside, row, mdp.first_choice(model.can_stay_in(~inside))[1])
+        entries = inside[source] | ~inside[mdp.successor]
+        return np.where(inside, shortest_path_rows(mdp, ~inside, ~goal[mdp.state]), row), entries
+    while True:
+        if query.nature_maximizes:
+            away, leaving = _attractor(model, ~inside, query.maximize, None)
+            row = np.where(inside & away, leaving, row)
+        else:
+            away = positive_under_all_policies(mdp, ~inside)
+        inside = inside & ~away
+        if query.nature_maximizes:
+            reached = positive_under_all_policies(mdp, goal & inside, among=inside)
+            avoiding = mdp.first_choice(~mdp.support.some_successor_in(reached))[1]
+            row = np.where(inside & ~reached, avoiding, row)
+        else:
+            kept = ~mdp.support.some_successor_in(~inside) & inside[mdp.state]
+            reached = attractor_against_nature(model, goal & inside, all_rows=False, rows=kept)
+            stuck = (inside & ~reached)[mdp.state] & kept
+            entries &= ~(stuck[mdp.row] & reached[mdp.successor])
+        if (reached == inside).all():
+            return row, entries
+        inside = reached
+
+
 def joint_end_components(
     model: UncertainMDP, states: Booleans | None = None, entries: Booleans | None = None
 ) -> tuple[SparseEndComponents, Booleans]:

@@ -13,6 +13,7 @@ from jaxltl.core.sparse.interval.qualitative import (
     almost_sure_states,
     attracting_rows,
     joint_end_components,
+    preventing_choices,
     zero_one_states,
 )
 from jaxltl.core.sparse.interval.reachability import (
@@ -89,14 +90,18 @@ def _total_reward(
     value, lower, upper = (
         np.where(finite, x, np.inf) for x in (values.value, values.lower, values.upper)
     )
-    # Nature's distributions are arbitrary at infinite values and in rows that are not taken.
+    # Nature's distributions are arbitrary in rows that are not taken.
     taken, open_ = np.zeros(absorbing.mdp.num_rows, bool), finite[part.mdp.state]
     taken[origin[open_]] = True
     chance = np.where(taken[absorbing.mdp.row], 0, absorbing.mdp.probability)
     chance[entry[open_[part.mdp.row]]] = values.probability[open_[part.mdp.row]]
-    values = replace(
-        values, value=value, lower=lower, upper=upper, row=origin[values.row], probability=chance
-    )
+    rows = origin[values.row]
+    if not finite.all() and (query.maximize or query.nature_maximizes):
+        away, entries = preventing_choices(absorbing, target, query.opposite)
+        rows = np.where(finite, rows, away)
+        infinite = ~finite[absorbing.mdp.state[absorbing.mdp.row]]
+        chance = np.where(infinite, absorbing.interior_distributions(entries), chance)
+    values = replace(values, value=value, lower=lower, upper=upper, row=rows, probability=chance)
     return without_absorbing(model, absorbing, row, target, values)
 
 

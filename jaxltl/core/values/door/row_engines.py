@@ -32,6 +32,7 @@ from jaxltl.core.values.engine.host_solution import (
 )
 from jaxltl.core.values.engine.row_form import RowForm, row_form
 from jaxltl.core.values.engine.state_quantities import (
+    Span,
     clipped,
     discounted_span,
     finite_reward,
@@ -88,7 +89,8 @@ def discount(model: Model, question: Question, accuracy: Accuracy) -> Solution:
         low, high = -enclosure.upper, -enclosure.lower
         enclosure = replace(enclosure, value=-enclosure.value, lower=low, upper=high)
     solution = solution_from_enclosure(form, enclosure, requested, relative=False)
-    return with_given_policy(clipped(solution, discounted_span(structure, factor)), question.policy)
+    solution = _within(solution, discounted_span(structure, factor), requested)
+    return with_given_policy(solution, question.policy)
 
 
 # --- policy and nature, and games -----------------------------------------------------------------
@@ -147,7 +149,15 @@ def discount_with_nature(model: Model, question: Question, accuracy: Accuracy) -
         interval_discounted.DiscountedModel(sides.host, earned, factors), sides.query(requested)
     )
     solution = robust_solution(form, sides, values, question, requested)
-    return clipped(solution, discounted_span(structure, factor))
+    return _within(solution, discounted_span(structure, factor), requested)
+
+
+def _within(solution: Solution, span: Span, requested: float) -> Solution:
+    """A solution within the span of its quantity, which may make it narrow enough."""
+    solution = clipped(solution, span)
+    ends = np.asarray(solution.lower), np.asarray(solution.upper)
+    status = status_between(*ends, float(requested), relative=False)
+    return replace(solution, status=np.int32(status))  # type: ignore[arg-type]
 
 
 def _sides(form: RowForm, question: Question) -> Sides:

@@ -71,9 +71,8 @@ def row_reward(model: Model, sparse: SparseMDP, reward: Reward) -> Reward:
         actions = (*shape, padded.num_actions)
         if earned.shape == (*actions, padded.num_successors):
             weight = np.asarray(padded.successor_probability, np.float64)
-            pairs = (
-                (weight * np.where(weight > 0, earned, 0)).sum(-1).reshape(sparse.num_states, -1)
-            )
+            sums = (weight * np.where(weight > 0, earned, 0)).sum(-1)
+            pairs = (sums / np.where(sums != 0, weight.sum(-1), 1)).reshape(sparse.num_states, -1)
             return Rewards(choice=pairs[sparse.host.state, row_actions(sparse)])
         if earned.shape not in ((sparse.num_rows,), (sparse.num_transitions,)):
             require_shape("reward", earned, actions)
@@ -124,7 +123,7 @@ def discounted_span(rewards: Rewards, discount: float) -> Span:
 def clipped(solution: Solution, span: Span) -> Solution:
     """A solution of NumPy arrays within the span of its quantity."""
     parts: dict[str, Array] = {
-        name: np.clip(getattr(solution, name), *span) for name in ("value", "lower", "upper")
+        name: np.clip(getattr(solution, name), *span) + 0.0 for name in ("value", "lower", "upper")
     }
     return replace(solution, **parts)
 

@@ -412,3 +412,13 @@ def test_single_precision_means_the_discount_as_given(place):
     exact = Fraction(float(reward[0, 0])) / (1 - Fraction(float(number)))
     assert Fraction(low) <= exact <= Fraction(high)
     assert (high - low < 3e-7) == (place != "argument")
+
+
+@pytest.mark.parametrize("players", [1, 2])
+def test_a_reward_of_states_is_one_of_their_actions(players):
+    world = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
+    model = jl.make_game(world, [True, False]) if players == 2 else world
+    reward = np.array([1.0, 2.0])
+    for solve in (jl.optimal_value, jax.jit(jl.optimal_value)):
+        assert np.allclose(solve(model, reward, 0.5).value, [3, 4])
+    assert np.allclose(jl.policy_value(model, np.array([0, 0]), reward, 0.5).value, [2, 4])
