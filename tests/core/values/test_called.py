@@ -43,6 +43,13 @@ def test_lanes_have_their_own_answers():
     assert (found.lower <= found.value).all() and (found.value <= found.upper).all()
 
 
+def test_a_concrete_product_stays_concrete_inside_jit():
+    model = jl.product(jl.to_sparse(WORLD), "F a")
+    reward = jnp.ones(model.state_shape).at[1].set(3.0)
+    value = jax.jit(lambda discount: jl.optimal_value(model, reward, discount).value)(0.5)
+    np.testing.assert_allclose(value, jl.optimal_value(model, reward, 0.5).value, rtol=1e-5)
+
+
 def test_what_a_program_cannot_raise_is_a_status():
     model = jl.to_sparse(WORLD)
     solve = jax.jit(lambda p: jl.reachability_probability(model, "a", policy=p).status)

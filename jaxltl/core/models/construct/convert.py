@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.product import Product, flat_successor
-from jaxltl.core.models.ops.array_namespace import namespace
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace
 from jaxltl.core.models.ops.kernels import segment_ids
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
@@ -44,7 +44,10 @@ def to_sparse(model: Model) -> SparseMDP:
     if isinstance(model, SparseMDP):
         return model
     if isinstance(model, Product):
-        return _product(model)
+        if is_traced(model):
+            return _product(model)
+        with jax.ensure_compile_time_eval():  # a concrete model stays so inside jit
+            return _product(model)
     if not isinstance(model, MDP | DenseMDP):
         raise ValueError(validation.unsupported_model(model))
     used, available = support(model), np.asarray(model.available)
