@@ -101,7 +101,7 @@ def reshape_solution(model: Model, solution: Solution) -> Solution:
         value=one(solution.value),
         lower=one(solution.lower),
         upper=one(solution.upper),
-        policy=one(jnp.asarray(_row_numbers(lazy)[0])[policy])
+        policy=one(jnp.asarray(_row_numbers(lazy)[0], jnp.int32)[policy])
         if is_deterministic(policy)
         else policy,
     )
@@ -147,6 +147,10 @@ def _row_numbers(lazy: Model) -> tuple[Array, Array]:
     assert isinstance(world, SparseMDP)
     form = product_rows(world, lazy) if isinstance(lazy, Product) else world
     state = segment_ids(form.row_start, form.num_rows)
+    rank = jnp.arange(state.size) - jnp.asarray(form.row_start)[state]
     if form.action is None or world.action_names:
-        return jnp.arange(state.size) - jnp.asarray(form.row_start)[state], state
-    return jnp.asarray(form.action), state
+        return rank, state
+    number = jnp.asarray(form.action)
+    order = jnp.lexsort((number, state))
+    same = (jnp.diff(number[order]) == 0) & (jnp.diff(state[order]) == 0)
+    return jnp.where(same.any(), rank, number), state  # as SparseMDP.action_number

@@ -50,6 +50,52 @@ def test_a_concrete_product_stays_concrete_inside_jit():
     np.testing.assert_allclose(value, jl.optimal_value(model, reward, 0.5).value, rtol=1e-5)
 
 
+@pytest.mark.parametrize("number", [None, [3, 1, 0, 2], [1, 1, 0, 0]])
+def test_actions_inside_jit_have_the_numbers_of_those_outside(number):
+    # Numbers that a state has twice are none; actions are then numbered in their order.
+    model = jl.make_sparse(
+        [0, 2, 3, 4], [0, 2, 4, 5, 6], [1, 2] * 3, [0.25, 0.75, 0.5, 0.5, 1, 1], action=number
+    )
+    known = model.action_number
+    reward = np.zeros((3, known.max() + 1))
+    reward[0, known[:2]] = [7.0, 5.0]
+
+    def ask(model, reward):
+        best = jl.optimal_value(model, reward, 0.5)
+        return best, jl.policy_value(model, best.policy, reward, 0.5)
+
+    best, again = jax.jit(ask)(model, reward)
+    assert best.policy.tolist() == [known[0], *known[2:]] and best.policy.dtype == jnp.int32
+    for found in best, again, jl.optimal_value(model, reward, 0.5):
+        np.testing.assert_allclose(found.value, [7, 0, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ask", "match"),
+    [
+        (lambda m: jl.reachability_probability(m, "zz"), "target mentions .*'zz'"),
+        (lambda m: jl.reachability_probability(m, "a", stay="F a"), "stay: .* temporal"),
+        (lambda m: jl.reachability_probability(m, "a", policy=jnp.zeros(7, int)), "policy has"),
+        (lambda m: jl.reachability_probability(m, "a", policy=jnp.ones((7, 2))), "policy has"),
+        (lambda m: jl.average_reward(m, np.ones((7, 2))), "reward has shape"),
+        (lambda m: jl.average_reward(m, "zz"), "'zz'"),
+        (lambda m: jl.average_reward(m, None), "reward"),
+        (lambda m: jl.values.bounded_reachability(m, "a", -1), "num_steps=-1"),
+        (lambda m: jl.values.bounded_reachability(m, "a", 2, by_step=True), "outside jit"),
+        (lambda m: jl.values.reward_bounded_reachability(m, "a", np.ones(3), -1.0), "bound=-1"),
+    ],
+)
+@pytest.mark.parametrize("model", [jl.to_sparse(WORLD), GAME])
+def test_what_no_numbers_make_right_is_raised_at_once(model, ask, match):
+    with pytest.raises(ValueError, match=match):
+        jax.jit(ask)(model)
+
+
+def test_a_game_needs_a_target_inside_jit():
+    with pytest.raises(ValueError, match="need a target"):
+        jax.jit(lambda m: jl.total_reward(m, jnp.ones(3)))(GAME)
+
+
 def test_what_a_program_cannot_raise_is_a_status():
     model = jl.to_sparse(WORLD)
     solve = jax.jit(lambda p: jl.reachability_probability(model, "a", policy=p).status)

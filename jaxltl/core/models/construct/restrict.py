@@ -19,7 +19,7 @@ from jaxltl.core.models.ops.choices import choice_mask
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
 from jaxltl.core.validation import first_true
-from jaxltl.core.models.protocols import ActionModel, Model, ModelT
+from jaxltl.core.models.protocols import ActionModel, Model, ModelT, base_model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.components import forward_reachable
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
@@ -31,7 +31,8 @@ def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP, a Product or a Game.
-      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse or interval model, or a
+        game on one, ``bool[R]``.
 
     Returns:
       A model of the same kind and states; the mask is its available actions.
@@ -55,6 +56,13 @@ def _with_allowed(model: Model, allowed: chex.Array) -> Model:
         return _with_rows(model, allowed)
     if not isinstance(model, MDP | DenseMDP | Product | Game):
         raise ValueError(validation.unsupported_model(model))
+    if isinstance(base_model(model), SparseMDP | IntervalMDP):
+        if isinstance(model, Game) and base_model(model) is model.mdp:
+            return replace(model, mdp=with_allowed(model.mdp, allowed))
+        raise ValueError(
+            "a product of a sparse or an interval model takes no mask of actions; restrict the world "
+            "first, product(with_allowed(world, rows), formula), or write the product out by to_sparse."
+        )
     shape = (*model.state_shape, model.num_actions)
     allowed = allowed if isinstance(allowed, jax.Array) else np.asarray(allowed)
     if allowed.shape != shape or allowed.dtype != bool:

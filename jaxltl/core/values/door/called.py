@@ -9,8 +9,9 @@ import jax.numpy as jnp
 
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.types import Solution, require_states
+from jaxltl.core.types import Solution
 from jaxltl.core.values.door.question import Accuracy, Question
+from jaxltl.core.values.door.shapes import require_known_parts
 from jaxltl.core.values.engine.host_callback import on_host_inside_jit, solution_layout
 
 Solver = Callable[[Model, Question, Accuracy], Solution]
@@ -24,10 +25,7 @@ def called(solve: Solver, *, relative: bool = False) -> Solver:
     """
 
     def inside(model: Model, question: Question, accuracy: Accuracy) -> Solution:
-        for name in ("target", "stay"):
-            states = getattr(question.path, name, None)
-            if states is not None and not isinstance(states, str):
-                require_states(name, states, model.state_shape)
+        require_known_parts(model, question)
         asked = question, accuracy
         leaves, tree = jax.tree.flatten(asked, is_leaf=lambda x: isinstance(x, str))
         arrays = [x if is_traced(x) else None for x in leaves]

@@ -187,6 +187,12 @@ def solve(
     validation.choice("objective", question.objective, ("max", "min"))
     for name in selected:
         if name not in engine.options:
+            host = ENGINES[type(question.path)].get(kind._replace(arrays="concrete").column)
+            if host is not None and name in host.options and kind.arrays == "traced":
+                raise ValueError(
+                    f"{kind} is solved without {name}; leave it out, or call it outside jit and vmap, on "
+                    "concrete arrays."
+                )
             raise ValueError(
                 f"{name} is an option of iterations on padded and dense models; {kind} is solved "
                 "without it. Leave it out."

@@ -131,3 +131,15 @@ def test_a_refused_mask_names_the_memory():
     model = jl.product(world, "F a")
     with pytest.raises(ValueError, match="no action is left in state 0 with memory 1"):
         jl.with_allowed(model, np.array([[[True], [False]]] * 2))
+
+
+@pytest.mark.parametrize("intervals", [False, True])
+def test_games_on_rows_are_narrowed_by_their_rows(intervals):
+    world = jl.make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1.0, 1, 1], label={"a": [1]})
+    base = jl.make_interval(world, [1.0, 1, 1], [1.0, 1, 1]) if intervals else world
+    game, rows = jl.make_game(base, [True, True]), np.array([True, False, True])
+    assert jl.reachability_probability(game, "a").value.tolist() == [1, 1]
+    kept = jl.with_allowed(game, rows)
+    assert jl.reachability_probability(kept, "a").value.tolist() == [0, 1]
+    with pytest.raises(ValueError, match="restrict the world"):
+        jl.with_allowed(jl.product(base, "F a"), np.ones((2, 2, 2), bool))
