@@ -91,6 +91,17 @@ def test_what_no_numbers_make_right_is_raised_at_once(model, ask, match):
         jax.jit(ask)(model)
 
 
+@pytest.mark.parametrize("text", ["a & !b", "!a | b", "true", "a xor init", "a"])
+def test_formulas_of_labels_are_read_inside_jit(text):
+    world = WORLD.replace(label=jnp.array([[0, 1], [1, 0], [1, 1]], bool), propositions=("a", "b"))
+    for model in world, jl.product(world, "F a"):
+        found = jax.jit(lambda m: jl.reachability_probability(m, text).value)(model)
+        np.testing.assert_allclose(found, jl.reachability_probability(model, text).value)
+    for wrong, match in ("F a", "temporal"), ("c", "mentions .*'c'"):
+        with pytest.raises(ValueError, match=match):
+            jax.jit(lambda m, x=wrong: jl.reachability_probability(m, x))(world)
+
+
 def test_a_game_needs_a_target_inside_jit():
     with pytest.raises(ValueError, match="need a target"):
         jax.jit(lambda m: jl.total_reward(m, jnp.ones(3)))(GAME)

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.logic.labels import require_known, satisfying
+from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.ops.array_namespace import jit
-from jaxltl.core.models.ops.operators import require_policy
+from jaxltl.core.models.ops.operators import require_policy, unpadded_states
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model, base_model
 from jaxltl.core.models.sparse import Reward, Rewards
@@ -25,20 +27,28 @@ World = MDP | DenseMDP | ShardedMDP
 
 
 def states_of(model: Model, name: str, states: Array | str) -> Array:
-    """A set of states in the model's shape, from a mask or a label's name."""
+    """A set of states in the model's shape, from a mask or a Boolean formula of labels."""
     if not isinstance(states, str):
         require_states(name, states, model.state_shape)
         return states
-    world = base_model(model)
-    known = getattr(world, "propositions", ())
-    if states not in known:
-        raise ValueError(
-            f"{name}={states!r}; inside jit, and over a mesh, give bool{list(model.state_shape)} or a "
-            f"label of the model: {', '.join(known) or 'it has none'}."
-        )
-    column = world.label[:, known.index(states)]  # type: ignore[attr-defined]
+    world = cast(World, base_model(model))
+    formula, labels = as_formula(states), getattr(world, "propositions", ())
+    used = formula.propositions
+    require_known(used, (*labels, "init"), name)
+    # The truth of the formula for each combination of its labels.
+    place = np.arange(2 ** len(used))
+    combinations = (place[:, None] >> np.arange(len(used))) & 1 > 0
+    truth = jnp.asarray(satisfying(combinations, used, formula, name))
+    combination: Array = jnp.zeros(world.num_states, jnp.int32)
+    for i, label in enumerate(used):
+        if label in labels:
+            column = world.label[:, labels.index(label)]
+        else:
+            column = world.initial > 0
+        combination = combination + jnp.where(column, 2**i, 0)
+    inside = truth[combination] & unpadded_states(world)
     return jnp.broadcast_to(
-        column.reshape(-1, *[1] * (len(model.state_shape) - 1)), model.state_shape
+        inside.reshape(-1, *[1] * (len(model.state_shape) - 1)), model.state_shape
     )
 
 
