@@ -79,7 +79,9 @@ def expected_reward(model: Model, reward: jax.Array) -> jax.Array:
         # A reward at probability 0 does not count, but the derivative in the probability does.
         counts = (weight > 0) | jnp.isfinite(reward)
         return jnp.sum(weight * jnp.where(counts, reward, 0), axis=-1)
-    raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
+    raise ValueError(
+        f"reward has shape {reward.shape}; expected {model.state_shape}, {actions} or {transitions}."
+    )
 
 
 def reward_size(model: Model, reward: PyTree) -> jax.Array:

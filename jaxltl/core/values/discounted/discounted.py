@@ -40,8 +40,7 @@ def optimal_value(
 
     Args:
       model: any model.
-      reward: ``float[S, A]``, of concrete models ``float[S]`` too; of a padded model
-        ``float[S, A, K]``; of a sparse model a name or as of
+      reward: ``float[S]`` or ``float[S, A]``; of a padded model ``float[S, A, K]``; of a sparse model a name or as of
         :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       objective: ``"max"`` or ``"min"``, of the system.

@@ -76,7 +76,7 @@ def minimax_value(
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; rewards at environment states count. In
+      reward: ``float[S]``, ``float[S, A]`` or ``float[S, A, K]``; rewards at environment states count. In
         a game on a sparse model as of :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.

@@ -196,12 +196,12 @@ def test_rewards_on_transitions_count_by_their_expectation():
 def test_bad_arguments_are_named():
     mdp = as_mdp(reference.random_model(np.random.default_rng(3), *SHAPE))
     reward, policy = jnp.zeros(SHAPE[:2]), jnp.zeros(5, int)
-    shape = r"reward has shape \(5,\); expected \(5, 3\) or \(5, 3, 2\)"
+    shape = r"reward has shape \(4,\); expected \(5,\), \(5, 3\) or \(5, 3, 2\)"
     for solve in (jl.optimal_value, jl.soft_value, jl.values.boltzmann_value):
         with pytest.raises(ValueError, match=shape):
-            solve(mdp, jnp.zeros(5), 0.9)
+            solve(mdp, jnp.zeros(4), 0.9)
     with pytest.raises(ValueError, match=shape):
-        jl.policy_value(mdp, policy, jnp.zeros(5), 0.9)
+        jl.policy_value(mdp, policy, jnp.zeros(4), 0.9)
     with pytest.raises(ValueError, match=r"policy has shape \(4,\)"):
         jl.policy_value(mdp, policy[:4], reward, 0.9)
     with pytest.raises(ValueError, match="method='fast'; choose one of auto, policy_iteration"):

@@ -712,7 +712,7 @@ def small_game():
     [
         ("method='newton'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, method="newton")),
         ("per='turn'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, per="turn")),
-        ("reward has shape", lambda g: minimax_value(g, jnp.zeros(2), 0.5)),
+        ("reward has shape", lambda g: minimax_value(g, jnp.zeros(3), 0.5)),
         (
             "allowed has shape",
             lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, allowed=[True] * 2),
