@@ -44,8 +44,8 @@ def average_reward(
       :class:`Solution`; `value` is ``float64`` in the shape of the states. `policy` attains the bound on
       the safe side (`lower` of a maximum), for both players of a game and with `nature` of interval
       models: actions ``int32[S]``. `residual` is half the width of the gain's
-      widest enclosure. PRECISION where bounds are valid and wider than the tolerance. Concrete arrays
-      only; not differentiable.
+      widest enclosure. PRECISION where bounds are valid and wider than the tolerance. Solved on the
+      host, inside ``jit`` too; not differentiable.
 
     Raises:
       ValueError: the reward, the objective, the policy, or `nature` of a model without intervals.

@@ -25,11 +25,12 @@ def status_between(
 ) -> Status:
     """CONVERGED if bounds are as narrow as the tolerance, or both infinite; else PRECISION.
 
-    A relative tolerance is a share of the lower bound, and so at most the same of the value.
+    A relative tolerance is a share of the bound nearer to 0, and so at most the same of the value.
     """
     finite = np.isfinite(high)
     width = np.where(finite, high, 0) - np.where(finite, low, 0)
-    scale = np.where(finite, low, 1) if relative else 1
+    scale = np.where((low < 0) & (high > 0), 0, np.minimum(np.abs(low), np.abs(high)))
+    scale = np.where(finite, scale, 1) if relative else 1
     narrow = (width <= tolerance * scale) & (finite | (low == high))
     return Status.CONVERGED if narrow.all() else Status.PRECISION
 

@@ -41,7 +41,7 @@ def reachability_probability(
       model: any model.
       target: ``bool[S]``, a label's name, or a Boolean formula of labels.
       stay: in the same forms, the states that a path may visit before the target (until); default
-        all. Concrete models only.
+        all.
       policy: actions ``int32[S]`` or their weights ``float[S, A]``: evaluate this policy, of a game
         the system's. Default: optimise. Of sparse models also weights of rows ``float[R]``.
       objective: ``"max"`` or ``"min"``, of the system; of a given policy without a second player or
@@ -65,12 +65,13 @@ def reachability_probability(
       optimum's `policy` is ``int32[S]`` and attains its bound on the safe side (`lower` for a
       maximum, `upper` for a minimum); on a concrete padded model it is the fastest such policy, see
       :func:`optimal_satisfaction`. Differentiable in the policy and in the probabilities, one-sided
-      where one of them is 0 (see "Derivatives" in the documentation of solutions). Of interval models
+      where one of them is 0 (see "Derivatives" in the documentation of solutions); inside ``jit`` not with
+      `stay`, and not of sparse and interval models and games, which the host solves there too. Of interval models
       with `nature`; :func:`robust_sensitivity` has the derivatives in their ends.
 
     Raises:
-      ValueError: a shape is wrong, the objective or method is unknown, or `stay` or a sparse model
-        is traced.
+      ValueError: a shape is wrong, the objective or method is unknown, a direction is stated where nobody
+        has it, or an option is of another kind of model.
 
     Example:
       >>> from jaxltl import from_dense

@@ -37,7 +37,7 @@ def next_probability(
       model, target, objective, nature, environment, policy: as for :func:`bounded_reachability`.
 
     Returns:
-      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      :class:`Solution`, as of :func:`bounded_reachability`. Solved on the host, inside ``jit`` too; not
       differentiable.
 
     Raises:
@@ -92,8 +92,8 @@ def bounded_reachability(
       :class:`Solution`; `value` is ``float64`` in the shape of the states, exactly 0 or 1 where the
       graph decides. `policy` is the first action of each state;
       with `by_step` the choices of all steps in order, with an axis ``[n]`` in front. `num_steps` is
-      the number of computed steps, `nature` has the distributions of the first step. Concrete arrays
-      only; not differentiable.
+      the number of computed steps, `nature` has the distributions of the first step. Solved on the host,
+      inside ``jit`` too; not differentiable.
 
     Raises:
       ValueError: a shape, the objective, a negative number of steps, the policy, or `nature` of a
@@ -132,7 +132,7 @@ def cumulative_reward(
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite, of any sign.
 
     Returns:
-      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      :class:`Solution`, as of :func:`bounded_reachability`. Solved on the host, inside ``jit`` too; not
       differentiable.
 
     Raises:
@@ -171,7 +171,7 @@ def instantaneous_reward(
       num_step: n.
 
     Returns:
-      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      :class:`Solution`, as of :func:`bounded_reachability`. Solved on the host, inside ``jit`` too; not
       differentiable.
 
     Raises:
@@ -217,7 +217,7 @@ def reward_bounded_reachability(
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`; with `by_level`, row l of the policy has
       the choices with l units left, ``[L + 1]`` in front. `num_steps` is the number of levels, L + 1.
-      Games and models with intervals are unfolded over the levels. Concrete arrays only; not
+      Games and models with intervals are unfolded over the levels. Solved on the host, inside ``jit`` too; not
       differentiable.
 
     Raises:

@@ -46,7 +46,7 @@ def total_reward(
     policy; without a target, where reward is earned for ever.
 
     Args:
-      model: any model; inside ``jit`` an MDP, DenseMDP, ShardedMDP or product of one.
+      model: any model.
       reward: at least 0: ``float[S]`` or ``float[S, A]``, the reward of a step; of sparse models
         also as of :func:`~jaxltl.core.models.sparse.choice_reward`, of a ShardedMDP the name of one.
         Rewards of transitions must not differ within a row of intervals.
@@ -59,11 +59,12 @@ def total_reward(
       :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph decides. An
       optimum's `policy` attains its bound on the safe side: actions ``int32[S]``. Inside ``jit`` bad
       rewards give the status ``NONFINITE``, a bad policy ``INVALID``. Inside ``jit`` and over a mesh
-      differentiable in the reward, the probabilities and the policy, where the value is finite.
+      differentiable in the reward, the probabilities and the policy of padded models, where the value is
+      finite; other models are solved on the host there too, without derivatives.
 
     Raises:
-      ValueError: a shape, the objective or a policy is wrong, a reward is negative, or inside
-        ``jit`` the model is sparse or there is no target.
+      ValueError: a shape, the objective or a policy is wrong, a reward is negative, or there is
+        no target where one is required.
 
     Example:
       >>> from jaxltl import make_sparse
