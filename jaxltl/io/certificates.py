@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import jaxltl
 from jaxltl import checker
 from jaxltl.core.logic.bounded import Earned
-from jaxltl.core.logic.labels import is_boolean
+from jaxltl.core.logic.labels import is_boolean, satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.construct.convert import to_sparse
@@ -87,9 +87,9 @@ def write_certificate(
       >>> path = tempfile.mkdtemp() + "/coin.umb"
       >>> write_certificate(path, coin, found, 'Pmax=? [ F "heads" ]')
       >>> jl.checker.main([path])
-      claimed: Pmax=? [ F ("heads") ] is >= 0.499999999999 in every initial state
+      claimed: Pmax=? [ F "heads" ] is >= 0.499999999999 in every initial state
       checked: 3 nodes of the claim's graph
-      claimed: Pmax=? [ F ("heads") ] is <= 0.500000000001 in every initial state
+      claimed: Pmax=? [ F "heads" ] is <= 0.500000000001 in every initial state
       checked: 3 nodes of the claim's graph
       on trust: that the model is the one meant; nothing else
       ACCEPTED
@@ -200,10 +200,10 @@ def _problem(
     goal = until[-1] if until and all(map(is_boolean, until)) else None
     operator = prop.path.operator if isinstance(prop.path, Formula) else ""
     if prop.operator == "P" and goal is not None and operator in ("F", "U"):
-        path = {"kind": "until", "target": _quoted(goal)}
-        path |= {"stay": _quoted(until[0])} if operator == "U" else {}
+        path = {"kind": "until", "target": _nested(goal)}
+        path |= {"stay": _nested(until[0])} if operator == "U" else {}
     elif prop.operator == "R" and goal is not None and operator == "F":
-        path = {"kind": "reward", "reward": name, "target": _quoted(goal)}
+        path = {"kind": "reward", "reward": name, "target": _nested(goal)}
     elif prop.operator == "R" and isinstance(prop.path, Earned) and prop.path == Earned("total"):
         path = {"kind": "total", "reward": name}
     if not path or prop.definitions or (discount is not None and path["kind"] != "total"):
@@ -212,7 +212,7 @@ def _problem(
             "C, also with a discount; not for other formulas, bounded steps and averages."
         )
     if discount is not None:
-        path = {"kind": "discounted", "reward": name, "discount": str(Fraction(float(discount)))}
+        path |= {"discount": str(Fraction(float(discount)))}
     question: dict[str, object] = {"path": path, "objective": direction}
     environment: str = direction
     nature: str = direction
@@ -235,6 +235,13 @@ def _problem(
         for part, place in (*parts, (structure.transition, slice(None))):
             gain += 0 if part is None else np.asarray(part, np.float64)[place]
     everywhere = np.ones(host.num_states, bool)
+
+    def mask(formula: Formula | None) -> Booleans:
+        names = formula.propositions if formula else ()
+        columns = [np.asarray(sparse.states_with_label(x), bool) for x in names]
+        label = np.stack([everywhere, *columns], axis=1)[:, 1:]
+        return satisfying(label, names, formula or "true", prop.text)
+
     return _Certified(
         model=written,
         sparse=sparse,
@@ -244,30 +251,23 @@ def _problem(
         directions=(environment, nature),
         question=question,
         path=path,
-        target=_mask(sparse, str(path.get("target", "false"))),
-        stay=_mask(sparse, str(path.get("stay", "true"))),
+        target=mask(goal) if "target" in path else ~everywhere,
+        stay=mask(until[0]) if "stay" in path else everywhere,
         gain=gain,
         discount=1.0 if discount is None else float(discount),
     )
 
 
-def _quoted(formula: Formula) -> str:
-    """A formula over labels, with the labels in quotes as PRISM has them."""
+def _nested(formula: Formula) -> str | list[object]:
+    """A formula as the checker reads it: a label, or a list of an operator and its operands."""
     if formula.operator == "ap":
-        return '"' + formula.proposition.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    parts = [_quoted(x) for x in formula.operands]
-    if len(parts) < 2:
-        return formula.operator + "".join(parts)
-    return f"({f' {formula.operator} '.join(parts)})"
-
-
-def _mask(sparse: SparseMDP, text: str) -> Booleans:
-    """The states that satisfy a formula over labels."""
-    formulas = checker.Formulas()
-    f = formulas.parse(text)[0]
-    columns = {name: np.asarray(sparse.states_with_label(name)) for name in formulas.names}
-    letters = (frozenset(x for x in columns if columns[x][s]) for s in range(sparse.num_states))
-    return np.array([formulas.holds(f, letter) for letter in letters])
+        return formula.proposition
+    operands = [_nested(x) for x in formula.operands]
+    if formula.operator == "xor":
+        return ["!", ["<->", *operands]]
+    if formula.operator == "M":
+        return ["U", operands[1], ["&", *operands]]
+    return [formula.operator, *operands]
 
 
 def _offsets(model: Model, solution: Solution, problem: _Certified) -> Integers:
@@ -340,7 +340,7 @@ def _candidates(
     problem: _Certified, side: str, bound: Floats, value: Floats, rows: Integers
 ) -> Iterator[Values]:
     """Bounds as they are, widened, and solved in fractions, in the order of their cost."""
-    signed = problem.path["kind"] == "discounted"
+    signed = "discount" in problem.path
     x = np.where(problem.target, float(problem.is_probability), bound)
     x = np.where(problem.target | problem.stay, x, 0.0)
     if problem.is_probability:
@@ -367,7 +367,7 @@ def _widened(problem: _Certified, sign: int, x: Floats, rows: Integers) -> Itera
     host, d = problem.host, problem.discount
     top = 1.0 if problem.is_probability else np.inf
     inside = ~problem.target & problem.stay
-    if problem.path["kind"] != "discounted":
+    if "discount" not in problem.path:
         inside &= (x > 0) & (x < top)
     ours = "max" if sign < 0 else "min"
     owner = np.where(problem.system, problem.objective, problem.directions[0])
@@ -375,7 +375,7 @@ def _widened(problem: _Certified, sign: int, x: Floats, rows: Integers) -> Itera
     used[rows] = True
     used &= inside[host.state]
     label = np.arange(host.num_states)
-    if problem.path["kind"] in ("until", "total") and sign > 0:
+    if problem.path["kind"] != "reward" and "discount" not in problem.path and sign > 0:
         components = end_components(host, inside, used)
         label, used = np.asarray(components.component), used & ~components.inside
         x = _extreme_by_label(x, label)
@@ -418,7 +418,7 @@ def _widened(problem: _Certified, sign: int, x: Floats, rows: Integers) -> Itera
         if factor * violation * shape.max() > _LARGEST_SHIFT * scale:
             return
         shifted = np.where(inside, x + sign * factor * violation * shape, x)
-        yield shifted if problem.path["kind"] == "discounted" else np.clip(shifted, 0, top)
+        yield shifted if "discount" in problem.path else np.clip(shifted, 0, top)
 
 
 def _extreme_by_label(x: Floats, label: Integers) -> Floats:
@@ -433,7 +433,7 @@ def _exact(problem: _Certified, value: Floats, rows: Integers) -> list[Fraction]
     host, d = problem.host, Fraction(problem.discount)
     result = [Fraction(int(t and problem.is_probability)) for t in problem.target]
     is_open = ~problem.target & problem.stay
-    if problem.path["kind"] != "discounted":
+    if "discount" not in problem.path:
         if not np.isfinite(value).all():
             return None
         is_open &= value > 0
