@@ -442,7 +442,7 @@ def test_a_fingerprint_changes_with_the_function(write, tmp_path):
 def test_the_library_s_worlds_have_pictures(tmp_path):
     path = tmp_path / "letters.toml"
     path.write_text(
-        '[world]\nenvironment = "letter_world"\narguments = { size = 3, letters = 2, copies = 1, '
+        '[world]\nenvironment = "letter_world"\narguments = { size = 3, letters = 2, num_copies = 1, '
         'horizon = 6, connected = false }\n[task]\nformula = "F a"\n[learner]\nmethod = "cce"\n'
         "steps = 1\n[cce]\npopulation = 5\nepisodes = 1\n[evaluation]\nepisodes = 20\n"
     )

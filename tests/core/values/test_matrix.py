@@ -336,7 +336,7 @@ until min, helped                  .....++ .....++ .....++ .....++
 reward min, helped                 .....++ .....++ .....++ .....++
 discounted min, helped             .....++ .....++ .....++ .....++
 average min, helped                .....++ .....++ .....++ .....++
-prepared reach max                 +++++++ ....... +++++.. .......
+prepared reach max                 +++++++ ....... +++++++ .......
 within 3 max                       +++++++ +++++++ +++++++ +++++++
 next max                           +++++++ +++++++ +++++++ +++++++
 reward of 3 steps max              +++++++ +++++++ +++++++ +++++++
@@ -347,7 +347,7 @@ next max, helped                   .....++ .....++ .....++ .....++
 reward of 3 steps max, helped      .....++ .....++ .....++ .....++
 reward after 3 steps max, helped   .....++ .....++ .....++ .....++
 within a budget max, helped        .....++ .....++ .....++ .....++
-prepared reach min                 +++++++ ....... +++++.. .......
+prepared reach min                 +++++++ ....... +++++++ .......
 within 3 min                       +++++++ +++++++ +++++++ +++++++
 next min                           +++++++ +++++++ +++++++ +++++++
 reward of 3 steps min              +++++++ +++++++ +++++++ +++++++

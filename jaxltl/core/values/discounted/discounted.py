@@ -66,6 +66,7 @@ def optimal_value(
       ValueError: the reward has the wrong shape, or an unknown method.
 
     Example:
+      >>> import jax.numpy as jnp
       >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> best = optimal_value(mdp, jnp.array([[0.0, 0.0], [1.0, 1.0]]), 0.5)
@@ -117,6 +118,7 @@ def policy_value(
         over available actions (under ``jit``: the status INVALID).
 
     Example:
+      >>> import jax.numpy as jnp
       >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0]]])
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)

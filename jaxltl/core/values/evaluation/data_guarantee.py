@@ -241,7 +241,7 @@ def _gain(
 
     product, value = satisfaction.product, satisfaction.value
     host = product.host
-    policy = np.asarray(satisfaction.solution.policy)
+    policy = np.asarray(satisfaction.row)
     taken = product.base_row == policy[host.state]
     entry = taken[host.row]
     nature = np.asarray(satisfaction.solution.nature)

@@ -145,13 +145,14 @@ def prepare(
             "prepare reads its model, so it works on concrete arrays only; call it "
             "before jit, and solve_prepared inside."
         )
-    if isinstance(model, IntervalMDP):
+    form = row_form(model)
+    if form.interval is not None:
         return prepare_interval(
-            model,
-            target,
-            stay=stay,
-            reward=reward,
-            policy=policy,
+            form.interval,
+            form.states("target", target),
+            stay=None if stay is None else form.states("stay", stay),
+            reward=None if reward is None else form.reward(reward),
+            policy=None if policy is None else np.ravel(policy) if form.shape[1:] else policy,
             objective=objective,
             nature=nature,
         )
@@ -162,7 +163,6 @@ def prepare(
             "policy to solve_prepared."
         )
     validation.choice("objective", objective, ("max", "min", "policy"))
-    form = row_form(model)
     sparse, host, target = form.sparse, form.host, form.states("target", target)
     if stay is not None:
         stay = form.states("stay", stay)

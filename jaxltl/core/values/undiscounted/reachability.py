@@ -74,6 +74,7 @@ def reachability_probability(
         has it, or an option is of another kind of model.
 
     Example:
+      >>> import numpy as np
       >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]])
       >>> round(reachability_probability(mdp, np.array([False, True, False])).value[0].item(), 3)

@@ -65,6 +65,7 @@ def satisfaction_probability(
         model without intervals, or the method is unknown.
 
     Example:
+      >>> import numpy as np
       >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
@@ -164,6 +165,7 @@ def optimal_satisfaction(
         is not for this model, or a product of a sparse world with restricted actions.
 
     Example:
+      >>> import numpy as np
       >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 0.5, 0.5], [0, 0.75, 0.25]], [[0, 1, 0]] * 2, [[0, 0, 1]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])

@@ -43,7 +43,8 @@ class Satisfaction(NamedTuple):
     """Optimal satisfaction probability, with a finite-memory policy.
 
     Attributes:
-      solution: value, lower and upper are ``float64[I]``, one for each requested state.
+      solution: value, lower and upper are ``float64[I]``, one for each requested state, and the policy
+        ``int32[N]``, an action in each state of the product.
       automaton: of the formula, over the letters that occur.
       letter: ``int[S]``, the letter of each state.
       product: the reachable product of the model and the automaton, N states.
@@ -95,8 +96,9 @@ def sparse_satisfaction(
     if not product.host.is_chain and product.host.num_states <= QUICK_LIMIT:
         problem = _problem(product, reader, objective)
         chosen = Deferred(lambda: product.base_row[_fastest(product, problem, row)])
+    actions: Array = row_actions(model)[product.base_row[row]].astype(np.int32)
     return Satisfaction(
-        at_states(solution, product.start),
+        replace(at_states(solution, product.start), policy=actions),
         automaton,
         letter,
         product,

@@ -77,7 +77,7 @@ def under(model, found):
     whole = optimal_satisfaction(points, found.satisfaction.automaton, nature="cooperative")
     np.testing.assert_array_equal(whole.product.base_state, product.base_state)
     host = whole.product.host
-    taken = whole.product.base_row == np.asarray(found.satisfaction.solution.policy)[host.state]
+    taken = whole.product.base_row == np.asarray(found.satisfaction.row)[host.state]
     rows = np.flatnonzero(taken)
     entries = np.isin(host.row, rows)
     state, memory = product.base_state, product.memory
