@@ -29,8 +29,8 @@ def status_between(
     """
     finite = np.isfinite(high)
     width = np.where(finite, high, 0) - np.where(finite, low, 0)
-    scale = np.where((low < 0) & (high > 0), 0, np.minimum(np.abs(low), np.abs(high)))
-    scale = np.where(finite, scale, 1) if relative else 1
+    share = np.where((low < 0) & (high > 0), 0, np.minimum(np.abs(low), np.abs(high)))
+    scale = np.where(finite, share, 1) if relative else 1
     narrow = (width <= tolerance * scale) & (finite | (low == high))
     return Status.CONVERGED if narrow.all() else Status.PRECISION
 

@@ -79,7 +79,8 @@ def robust_satisfaction(
     values = _solved(sides_of(host, system, aims), host, verdicts, requested)
     row: Array = product.base_row[values.row].astype(np.int32)
     solution = _solution_at(values, product.start, product.start.shape, requested)
-    solution = replace(solution, policy=row_actions(world.nominal)[row].astype(np.int32))
+    actions: Array = row_actions(world.nominal)[row].astype(np.int32)
+    solution = replace(solution, policy=actions)
     return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")
 
 
