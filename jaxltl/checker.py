@@ -1,14 +1,11 @@
 """Checks a certificate by exact arithmetic, without jaxltl: ``python checker.py FILE``.
 
-A certificate is a model in the UMB format with further members: ``certificate/index.json`` (the
-question, the claims, the shapes of arrays) and arrays (bounds, policies, an automaton). This file
-shares no code with the solvers. It prints ACCEPTED (exit status 0), REFUSED and why (1), or why the
-file is no certificate (2). docs/certificates.md derives every condition.
+It shares no code with the solvers and prints ACCEPTED (exit status 0), REFUSED and why (1), or why
+the file is no certificate (2). docs/certificates.md has the format and derives every condition.
 
-S states, R rows (choices), Q automaton states, M memory states. A node is a state with an automaton
-state and a memory state, numbered (s Q + q) M + m; `width` is Q M. An option of a node is a tuple:
-successors, numerators of their (least) probabilities, the denominator, greatest numerators if the
-probabilities are intervals (or None), and rewards of the successors (or none).
+A node is a state s with an automaton state q and a memory state m, numbered (s Q + q) M + m. An
+option of it is a tuple: successors, numerators of their (least) probabilities, the denominator,
+greatest numerators if the probabilities are intervals (or None), and rewards (or none).
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ from array import array
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from itertools import compress, groupby
-from operator import add, itemgetter, le, mul, or_
+from operator import add, itemgetter, le, mul, or_, sub
 from typing import Any
 
 LARGEST_TABLEAU = 20_000  # states of the product that compares automaton and formula
@@ -75,8 +72,7 @@ def read_archive(path: str, limit: int) -> dict[str, bytes]:
     """Contents of the regular files of a tar archive, plain or gzipped, by name."""
     data, contents = bytearray(), {}
     with open(path, "rb") as plain:
-        is_gzip = plain.peek(2)[:2] == b"\x1f\x8b"
-        file: Any = gzip.GzipFile(fileobj=plain) if is_gzip else plain
+        file: Any = gzip.GzipFile(fileobj=plain) if plain.peek(2)[:2] == b"\x1f\x8b" else plain
         while piece := file.read(2**20):
             data += piece
             need(len(data) <= limit, f"the archive has more than {limit} bytes; see --limit")
@@ -116,9 +112,11 @@ def record(table: Any, spec: str) -> dict:
     return table
 
 
-def read_numbers(contents: dict, name: str, dtype: str, count: int) -> Sequence:
+def read_numbers(contents: dict, name: str, dtype: str, count: int, default: Any = ()) -> Sequence:
     """The little-endian numbers of a member; doubles are read and never computed with."""
-    data, bits = contents.get(name, b""), int(re.sub(r"\D", "", dtype)[:5] or 0)
+    if default and f"{name}.bin" not in contents:
+        return default
+    data, bits = contents.get(f"{name}.bin", b""), int(re.sub(r"\D", "", dtype)[:5] or 0)
     is_known = dtype in CODES or (dtype == f"rational{bits}" and bits % 128 == 0 < bits)
     fits = is_known and len(data) == bits // 8 * count
     need(fits, f"{name:.80} has {len(data)} bytes; expected {count} numbers {dtype:.40}")
@@ -172,48 +170,43 @@ class UmbModel:
         version = index["format-version"], system.get("time", "discrete")
         is_known = version == (1, "discrete") and not system.get("#observations")
         need(is_known, f"version and time {version!s:.40}, or observations, are not covered")
-        sizes = [system[f"#{x}"] for x in ("states", "choices", "branches", "players")]
-        self.num_states, rows, branches, self.num_players = sizes
-        target = read_numbers(contents, "branch-to-target.bin", "uint64", branches)
-        fits = 0 < self.num_states <= rows <= branches and max(target) < self.num_states
+        counts = (system[f"#{x}"] for x in ("states", "choices", "branches", "players"))
+        self.num_states, rows, branches, players = counts
+        states = self.num_states
+        target = read_numbers(contents, "branch-to-target", "uint64", branches)
+        fits = 0 < states <= rows <= branches and max(target) < states
         need(fits, "a state or choice has no successor")
-        self.row_start = self._starts("state-to-choices", self.num_states, rows)
+        self.row_start = self._starts("state-to-choices", states, rows)
         self.branch_start = self._starts("choice-to-branches", rows, branches)
-        ends = self._reals("branch-to-probability.bin", system["branch-probability-type"], branches)
+        ends = self._reals("branch-to-probability", system["branch-probability-type"], branches)
         hold(min(ends[0]) >= 0, f"a probability is {min(ends[0])}")
-        self.is_interval, starts = len(ends) > 1, self.branch_start
-        self.rows = [
-            (target[a:b], *distribution(*[tuple(x[a:b]) for x in ends]))
-            for a, b in zip(starts, starts[1:])
-        ]
-        self.is_choice = [b - a > 1 for a, b in zip(self.row_start, self.row_start[1:])]
-        self.owner = self._read("state-to-player", 32, self.num_states, [0] * self.num_states)
-        self.action = self._read("actions/choices/values", 32, rows, [0] * rows)
-        owners = {x for x, is_choice in zip(self.owner, self.is_choice) if is_choice}
-        need(owners <= {*range(min(self.num_players, 2))}, "a state has choices, but no player")
-        self.initial = self._bits("state-is-initial", [2**64 - 1] * self.num_states)
+        pairs = zip(self.branch_start, self.branch_start[1:])
+        self.rows = [(target[a:b], *distribution(*[tuple(x[a:b]) for x in ends])) for a, b in pairs]
+        # The player that chooses: 0 the system, 1 the environment, 2 nobody.
+        owner = read_numbers(contents, "state-to-player", "uint32", states, [0] * states)
+        sizes = map(sub, self.row_start[1:], self.row_start)
+        self.owner = [x if size > 1 else 2 for x, size in zip(owner, sizes)]
+        need({*self.owner} <= {2, *range(min(players, 2))}, "a state has choices, but no player")
+        self.opponents = {"nature": len(ends) > 1, "environment": players > 1}
+        self.initial = self._bits("state-is-initial", [2**64 - 1] * states)
         need(True in self.initial, "no state is initial")
 
-    def _read(self, name: str, bits: int, count: int, default: Sequence | None = None) -> Sequence:
-        if default and f"{name}.bin" not in self.contents:
-            return default
-        return read_numbers(self.contents, f"{name}.bin", f"uint{bits}", count)
-
     def _starts(self, name: str, count: int, total: int) -> Sequence:
-        starts = self._read(name, 64, count + 1, range(count + 1) if count == total else None)
+        default = range(count + 1) if count == total else ()
+        starts = read_numbers(self.contents, name, "uint64", count + 1, default)
         increases = not any(map(le, starts[1:], starts))
         need(increases and (starts[0], starts[-1]) == (0, total), f"{name} does not increase")
         return starts
 
-    def _bits(self, name: str, default: Sequence | None = None) -> list[bool]:
-        words = self._read(name, 64, -(-self.num_states // 64), default)
+    def _bits(self, name: str, default: Sequence = ()) -> list[bool]:
+        count = -(-self.num_states // 64)
+        words = read_numbers(self.contents, name, "uint64", count, default)
         return [bool(words[s >> 6] >> (s & 63) & 1) for s in range(self.num_states)]
 
     def _reals(self, name: str, table: dict, count: int) -> list[Sequence]:
         """Numbers, or lower and upper ends of intervals."""
-        kind = table["type"]
-        word = kind.replace("-interval", "")
-        ends = 1 + (word != kind)
+        word = table["type"].replace("-interval", "")
+        ends = 1 if word == table["type"] else 2
         bits = table.get("size", (128 if word == "rational" else 64) * ends) // ends
         values = read_numbers(self.contents, name, f"{word}{bits}", count * ends)
         return [values[i::ends] for i in range(ends)]
@@ -237,7 +230,7 @@ class UmbModel:
         parts = []
         for part in {*table["applies-to"]}:
             begin, end = starts[part], starts[part][1:]
-            values, *high = self._reals(f"{folder}/{part}/values.bin", table["type"], len(end))
+            values, *high = self._reals(f"{folder}/{part}/values", table["type"], len(end))
             need(high in ([], [values]), f"the reward {name!r:.80} has intervals")
             parts.append([x for x, a, b in zip(values, begin, end) for _ in range(b - a)])
         return parts
@@ -271,16 +264,13 @@ def sources(graph: dict) -> dict:
 def staying(graph: dict) -> dict:
     """The largest set of nodes that each have an option which stays in the set; with these options.
 
-    Nature can stay in a set that has all successors with a positive least probability, and in
-    which the greatest ones add up to 1.
+    Nature can stay where all least probabilities are, and the greatest ones add up to 1.
     """
     inside = {*graph}
 
     def stays(option: tuple) -> bool:
         targets, low, total, high, _ = option
         is_inner = [t in inside for t in targets]
-        if all(is_inner):
-            return True
         can_stay = not high or sum(compress(high, is_inner)) >= total
         return can_stay and sum(compress(low, is_inner)) == sum(low)
 
@@ -294,10 +284,9 @@ def staying(graph: dict) -> dict:
 
 
 def recurring(graph: dict, marks: Sequence[set]) -> dict:
-    """The nodes from which some choices of options visit each marked set forever, almost surely.
+    """The largest set of nodes from each of which each marked set can be reached, without leaving.
 
-    The largest set of nodes that can be stayed in, and from each of which each of the marked sets
-    can be reached by options that stay.
+    Then some choices of options visit each marked set again and again almost surely.
     """
     kept, size = staying(graph), -1
     while len(kept) != size:
@@ -330,18 +319,14 @@ def formula_text(formula: Any) -> str:
 
 
 class Tableau:
-    """A formula of linear temporal logic and its negation, in negation normal form.
-
-    Each subformula is stored once, by a number. A letter is the set of propositions that hold.
-    """
+    """A formula of linear temporal logic and its negation, in negation normal form, by numbers."""
 
     def __init__(self, formula: Any) -> None:
         self.number: dict[tuple, int] = {}
         self.names: set[str] = set()
         self.size = 0
         self.root, self.negation = self._build(formula, True), self._build(formula, False)
-        self.nodes = [*self.number]
-        self.expand = functools.lru_cache(2**20)(self._expand)
+        self.nodes, self.expand = [*self.number], functools.lru_cache(2**20)(self._expand)
 
     def _build(self, formula: Any, positive: bool) -> int:
         self.size += 1
@@ -356,15 +341,11 @@ class Tableau:
             return self._build(DERIVED[op](*parts), positive)
         fits = op in ("&", "|") or (op in DUAL and len(parts) == 1 + (op != "X"))
         need(fits, f"{op!r:.40} is no operator of {len(parts)} formulas")
-        numbers = [self._build(x, positive) for x in parts]
-        node = op if positive else DUAL[op], *numbers
+        node = op if positive else DUAL[op], *(self._build(x, positive) for x in parts)
         return self.number.setdefault(node, len(self.number))
 
     def _expand(self, f: int, letter: frozenset[str]) -> list[tuple[frozenset[int], int]]:
-        """Ways to satisfy a formula: the formulas for the next step, and bits of postponed untils.
-
-        Without temporal operators there is one way if the formula holds, and none if it does not.
-        """
+        """Ways to satisfy a formula: the formulas for the next step, and bits of postponed untils."""
         op, *parts = self.nodes[f]
         if op == "ap":
             return [(frozenset(), 0)] * ((parts[0] in letter) == parts[1])
@@ -391,26 +372,21 @@ class Tableau:
 
 
 class HoaAutomaton:
-    """A deterministic automaton in the HOA format, on the letters that occur in a model.
-
-    It accepts a word if the least priority that occurs infinitely often is even.
-    """
+    """A deterministic parity automaton in HOA: the least priority that recurs is even, or odd."""
 
     LINE = re.compile(r"(?m)^(Start|States|AP|Acceptance):(.*)$")
     STATE = rf"State:\s*(\d{{1,6}})\s*(?:{QUOTED})?"
-    ITEM = re.compile(rf"\s*(?:{STATE}|\[([^\]]*)\]\s*(\d{{1,6}}))\s*(\{{[\d\s]*\}})?\s*")
+    ITEM = re.compile(rf"(?:{STATE}|\[([^\[\]]*)\]\s*(\d{{1,6}}))\s*(\{{[\d\s]*\}})?")
 
     def __init__(self, text: str, names: set[str], letters: Callable) -> None:
         head, _, rest = text.partition("--BODY--")
         body, end, tail = rest.partition("--END--")
-        pairs = self.LINE.findall(head)
-        lines = {key: value.strip() for key, value in pairs}
+        lines = {key: value.strip() for key, value in self.LINE.findall(head)}
         is_whole = text.startswith("HOA: v1") and end and not tail.strip() and len(head) < 2**16
-        is_whole = is_whole and len(lines) == len(pairs) == 4
+        is_whole = is_whole and len(lines) == len(self.LINE.findall(head)) == 4
         need(is_whole, "no automaton in HOA with one line of Start, States, AP and Acceptance each")
         self.initial, states = int(lines["Start"]), range(int(lines["States"]))
         self.num_states = len(states)
-        need(self.initial in states, "the automaton has no initial state")
         quoted = re.findall(QUOTED, lines["AP"])
         columns = [re.sub(r"\\(.)", r"\1", x[1:-1]) for x in quoted]
         self.letters, self.letter_of = letters(names | {*columns})
@@ -422,23 +398,21 @@ class HoaAutomaton:
             chain = f"{kind}({number})" + (rest and ("|" if kind == "Inf" else "&") + rest)
         need(condition in (chain, "t", "f"), f"{condition!r:.80} is no parity acceptance")
         priority_of = {x: 2 * i + (k == "Fin") for i, (k, x) in [*enumerate(atoms)][::-1]}
-        accepts = atoms[-1][0] == "Fin" if atoms else condition == "t"
-        self.default = 2 * len(atoms) + (not accepts)
+        last = atoms[-1][0] if atoms else condition
+        self.default = 2 * len(atoms) + (last in ("Inf", "f"))
         # The successor and the priority of each state, by letters.
         self.edges: list[dict[int, tuple[int, int]]] = [{} for _ in self.letters]
-        position, q, marks = 0, "", ""
-        while position < len(body.rstrip()):
-            match = self.ITEM.match(body, position)
-            if match is None or not (match[1] or q):
-                raise ValueError(f"the automaton is wrong at {body[position:][:40]!r}")
-            position, (state, label, successor, sets) = match.end(), match.groups()
+        need(not self.ITEM.sub("", body).strip(), "the automaton has more than states and edges")
+        q = marks = ""
+        for state, label, successor, sets in self.ITEM.findall(body):
             if state:
-                q, marks = state, sets or ""
+                q, marks = state, sets
                 continue
-            recurring = re.findall(r"\d+", marks + (sets or ""))
+            recurring = re.findall(r"\d+", marks + sets)
             priorities = [priority_of.get(x, self.default) for x in recurring]
             edge = int(successor), min([self.default, *priorities])
-            need(int(q) in states and edge[0] in states, f"the edge of {q} is not between states")
+            fits = self.initial in states and int(q) in states and edge[0] in states
+            need(fits, f"the automaton has no initial state, or a wrong edge in state {q}")
             for term in re.sub(r"\s", "", label).split("|"):
                 literals = [] if term == "t" else term.split("&")
                 is_plain = all(re.fullmatch(r"!?\d{1,6}", x) for x in literals)
@@ -451,11 +425,10 @@ class HoaAutomaton:
         hold(is_complete, "an automaton state has no edge for a letter of the model")
 
     def meets(self, parity: int, tableau: Tableau, f: int) -> bool:
-        """True if some word satisfies a formula and has a run whose least priority has the parity.
+        """True if some word satisfies a formula, and its run has a least priority of the parity.
 
         Emptiness of the product with the tableau, a generalised Buchi automaton: no until is
-        postponed forever. A node has an automaton state, formulas, and priority and postponed
-        untils of the edge that leads to it. OverflowError if the product is too large.
+        postponed forever. A node has the priority and the postponed untils of the edge to it.
         """
         size = 0
 
@@ -473,7 +446,7 @@ class HoaAutomaton:
 
         graph = explore([(self.initial, frozenset([f]), self.default, 0)], expand, lambda v: (v,))
         postponed = functools.reduce(or_, (v[3] for v in graph))
-        untils = [i for i in range(postponed.bit_length()) if postponed >> i & 1]
+        untils = [i for i in range(len(tableau.nodes)) if postponed >> i & 1]
         marks = [{v for v in graph if not v[3] >> i & 1} for i in untils]
         edges = {v: [((w,), (1,), 1, None, ()) for w in out] for v, out in graph.items()}
         return bool(accepting(edges, {v: v[2] for v in graph}, parity, marks))
@@ -514,16 +487,14 @@ class CertificateFile:
         record(self.path, PATHS[self.kind])
         need(objective in OTHER, f"the objective {objective!r:.40} is neither max nor min")
         self.direction = {"system": objective}
-        players = ("nature", self.model.is_interval), ("environment", self.model.num_players > 1)
-        for player, exists in players:
+        for player, exists in self.model.opponents.items():
             word = self.question.get(player)
             known = ("adversarial", "cooperative") if exists else (None,)
             need(word in known, f"{player} is {word!r:.40}, which does not fit the model")
             self.direction[player] = OTHER[objective] if word == "adversarial" else objective
         text = question_text(self.question)
         hold(self.question["text"] == text, f"the text of the question is not {text!r}")
-        self.automaton: HoaAutomaton | None = None
-        self.trusted = ""
+        self.automaton, self.trusted = None, ""
         if self.kind == "formula":
             tableau = Tableau(self.path["formula"])
             text = contents[f"certificate/{self.path['automaton']}.hoa"].decode()
@@ -558,16 +529,12 @@ class CertificateFile:
         dtype = "double64" if entry["dtype"] == "double" else entry["dtype"]
         fits = entry["shape"] == shape and dtype.startswith(kinds)
         need(fits, f"{name:.80} is {entry!s:.80}; expected {kinds} of shape {shape}")
-        return read_numbers(self.contents, f"certificate/{name}.bin", dtype, math.prod(shape))
+        return read_numbers(self.contents, f"certificate/{name}", dtype, math.prod(shape))
 
 
 # --- the conditions -------------------------------------------------------------------------------
 class ClaimChecker:
-    """The conditions of one claim: a bound in every initial state.
-
-    Players that minimise for a lower bound, or maximise for an upper one, are universal: each of
-    their rows has to satisfy the conditions. The others are existential: their policy is fixed, or
-    some row satisfies the inequality. So is the best distribution of an existential nature.
+    """The conditions of one claim, for all rows of the universal players and a fixed one of others.
 
     All inequalities have the form y >= r + p y: with y = x for upper bounds; y = -x for lower ones,
     with negative rewards; y = 1 - x for lower ones of formulas, as upper ones of the complement.
@@ -591,12 +558,20 @@ class ClaimChecker:
         self.policy = file.array(claim["policy"], shape, "uint") if "policy" in claim else ()
         self.next = file.array(claim["next"], shape, "uint") if has_memory else ()
         need(max(self.next, default=0) < self.memory, "a memory state is out of range")
-        directions = file.direction["system"], file.direction["environment"]
-        pairs = zip(self.model.is_choice, self.model.owner)
-        self.is_ours = [is_choice and directions[owner] == ours for is_choice, owner in pairs]
+        directions = file.direction["system"], file.direction["environment"], ""
+        self.is_ours = [directions[owner] == ours for owner in self.model.owner]
         self.is_our_nature = file.direction["nature"] == ours
         if "observations" in file.question and directions[0] == ours:
-            self._check_observations(file.array(file.question["observations"], [states], "uint"))
+            seen, choices = file.array(file.question["observations"], [states], "uint"), {}
+            hold(self.policy, "a policy that sees observations is missing")
+            starts, zeros = self.model.row_start, [0] * len(self.model.rows)
+            name = "actions/choices/values"
+            action = read_numbers(file.contents, name, "uint32", len(zeros), zeros)
+            for v, k in enumerate(self.policy):
+                s = v // self.width
+                choice = k, [*action[starts[s] : starts[s + 1]]], self.next[v] if self.next else 0
+                is_same = choices.setdefault((seen[s], v % self.memory), choice) == choice
+                hold(is_same, f"state {s}: the policy depends on more than observations")
         # Values and rewards of branches as integers over one denominator.
         parts = self.model.reward(path["reward"]) if "reward" in path else []
         discount = to_fraction(path.get("discount", "1"))
@@ -618,17 +593,6 @@ class ClaimChecker:
         for v in self.infinite:
             self.y[v] = sign * self.infinity
 
-    def _check_observations(self, seen: Sequence) -> None:
-        """The policy and its memory depend on observations alone."""
-        hold(self.policy, "a policy that sees observations is missing")
-        choices: dict[tuple, tuple] = {}
-        for v, k in enumerate(self.policy):
-            s = v // self.width
-            actions = self.model.action[self.model.row_start[s] : self.model.row_start[s + 1]]
-            choice = k, tuple(actions), self.next[v] if self.next else 0
-            is_same = choices.setdefault((seen[s], v % self.memory), choice) == choice
-            hold(is_same, f"state {s}: the policy depends on more than observations")
-
     def place(self, v: int) -> str:
         s, k = divmod(v, self.width)
         more = f", automaton and memory state {divmod(k, self.memory)}" if self.width > 1 else ""
@@ -641,16 +605,14 @@ class ClaimChecker:
         if self.policy and self.is_ours[s]:
             hold(self.policy[v] < len(numbers), f"state {s}: the policy has no such choice")
             numbers = (numbers[self.policy[v]],)
-        options, offset = [], 0
+        options, offset, automaton = [], 0, self.file.automaton
         if width > 1:
             q, m = divmod(k, self.memory)
-            if automaton := self.file.automaton:
-                q = automaton.edges[automaton.letter_of[s]][q][0]
+            q = automaton.edges[automaton.letter_of[s]][q][0] if automaton else q
             offset = q * self.memory + (m - 1 if self.counts else self.next[v] if self.next else m)
         for r in numbers:
             targets, low, total, high = model.rows[r]
-            if width > 1:
-                targets = [t * width + offset for t in targets]
+            targets = [t * width + offset for t in targets] if width > 1 else targets
             rewards = self.rewards[model.branch_start[r] : model.branch_start[r + 1]]
             option = targets, low, total, high, rewards
             if high and self.is_our_nature:
@@ -659,11 +621,9 @@ class ClaimChecker:
         return options
 
     def extreme(self, option: tuple) -> tuple[list, list]:
-        """Values of successors with rewards, and numerators of their probabilities.
+        """Values of successors with rewards, and numerators of the worst (or our best) distribution.
 
-        The worst distribution within intervals, or the best of an existential nature, is greedy:
-        what is missing to 1 goes to the successors in the order of their values, and is shared by
-        those of equal values.
+        What is missing to 1 goes to successors in the order of values, and equal values share it.
         """
         targets, low, total, high, rewards = option
         values = [self.following[t] for t in targets]
@@ -714,14 +674,15 @@ class ClaimChecker:
             priority = {v: edges[v // width][v % width // self.memory][1] for v in graph}
             accepted = accepting(graph, priority, self.is_negated, [])
         # The inequality is needed below `top`, and values are not below `floor`.
-        one, top, floor = self.one if self.is_upper else -self.one, self.infinity, -self.infinity
-        if not self.is_signed:
-            top = 0 if not self.is_upper else self.infinity if "reward" in path else self.one
-            floor = 0 if self.is_upper else floor
+        sign, is_reward = 1 if self.is_upper else -1, "reward" in path
+        top = self.infinity if is_reward else self.one
+        top, floor = (top, 0) if self.is_upper else (0, -self.infinity)
+        if self.is_signed:
+            top, floor = self.infinity, -self.infinity
         for v, options in graph.items():
             if not options or v in accepted:
-                is_one = v in accepted or (target[v // width] and "reward" not in path)
-                holds = y[v] >= one * is_one
+                is_one = v in accepted or (target[v // width] and not is_reward)
+                holds = y[v] >= sign * self.one * is_one
             else:
                 holds = y[v] >= top or v in self.infinite
                 holds = holds or (y[v] >= floor and self.is_inductive(v, options))
