@@ -24,7 +24,7 @@ from array import array
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from itertools import compress, groupby
-from operator import add, itemgetter, le, mul, or_, sub
+from operator import add, ge, itemgetter, le, mul, or_, sub
 from typing import Any
 
 LARGEST_TABLEAU = 20_000  # states of the product that compares automaton and formula
@@ -152,11 +152,10 @@ def to_integers(*lists: Iterable) -> tuple[list[list], int]:
 def distribution(*ends: tuple) -> tuple[list, int, list | None]:
     """Numerators of probabilities n_t / sum(n), or of the ends of intervals; and a denominator."""
     (low, *high), common = to_integers(*ends)
-    total = sum(low)
     if not high:
-        hold(total, "all probabilities of a row are 0")
-        return low, total, None
-    fits = total <= common <= sum(high[0]) and all(map(le, low, high[0]))
+        hold(sum(low), "all probabilities of a row are 0")
+        return low, sum(low), None
+    fits = sum(low) <= common <= sum(high[0]) and all(map(le, low, high[0]))
     hold(fits, "no distribution lies within the intervals of a row")
     return low, common, high[0]
 
@@ -171,8 +170,7 @@ class UmbModel:
         is_known = version == (1, "discrete") and not system.get("#observations")
         need(is_known, f"version and time {version!s:.40}, or observations, are not covered")
         counts = (system[f"#{x}"] for x in ("states", "choices", "branches", "players"))
-        self.num_states, rows, branches, players = counts
-        states = self.num_states
+        states, rows, branches, players = counts
         target = read_numbers(contents, "branch-to-target", "uint64", branches)
         fits = 0 < states <= rows <= branches and max(target) < states
         need(fits, "a state or choice has no successor")
@@ -188,6 +186,7 @@ class UmbModel:
         self.owner = [x if size > 1 else 2 for x, size in zip(owner, sizes)]
         need({*self.owner} <= {2, *range(min(players, 2))}, "a state has choices, but no player")
         self.opponents = {"nature": len(ends) > 1, "environment": players > 1}
+        self.num_states = states
         self.initial = self._bits("state-is-initial", [2**64 - 1] * states)
         need(True in self.initial, "no state is initial")
 
@@ -464,9 +463,8 @@ def question_text(question: dict) -> str:
     head = f"R{{{json.dumps(path['reward'])}}}" if "reward" in path else "P"
     nature = {"adversarial": OTHER[objective], "cooperative": objective}
     head += objective + nature.get(question.get("nature", ""), "")
-    if "environment" in question:
-        others = ",environment" if question["environment"] == "cooperative" else ""
-        head = f"<<system{others}>> {head}"
+    players = {"adversarial": "<<system>> ", "cooperative": "<<system,environment>> "}
+    head = players.get(question.get("environment", ""), "") + head
     notes = [f"discount {path['discount']}"] if "discount" in path else []
     notes += ["policies see observations"] if "observations" in question else []
     return f"{head}=? [ {formula_text(inner)} ]" + (f" // {', '.join(notes)}" if notes else "")
@@ -562,7 +560,8 @@ class ClaimChecker:
         self.is_ours = [directions[owner] == ours for owner in self.model.owner]
         self.is_our_nature = file.direction["nature"] == ours
         if "observations" in file.question and directions[0] == ours:
-            seen, choices = file.array(file.question["observations"], [states], "uint"), {}
+            seen = file.array(file.question["observations"], [states], "uint")
+            choices: dict[tuple, tuple] = {}
             hold(self.policy, "a policy that sees observations is missing")
             starts, zeros = self.model.row_start, [0] * len(self.model.rows)
             name = "actions/choices/values"
@@ -709,12 +708,12 @@ class ClaimChecker:
         # The bound in the initial states.
         text, is_lower = self.claim["bound"], self.claim["side"] == "lower"
         bound = math.inf if text == "inf" else to_fraction(text)
-        worst = (min if is_lower else max)(initial, key=self.values.__getitem__)
-        value: Any = self.values[worst]
-        holds = value >= bound if is_lower else value <= bound
-        hold(holds, f"{self.place(worst)}: {value!s:.40} is beyond {text:.40}")
-        sign = ">=" if is_lower else "<="
-        return len(graph), f"{self.file.question['text']} is {sign} {text} in every initial state"
+        relation, worst = (ge, min) if is_lower else (le, max)
+        v = worst(initial, key=self.values.__getitem__)
+        why = f"{self.place(v)}: {self.values[v]!s:.40} is beyond {text:.40}"
+        hold(relation(self.values[v], bound), why)
+        claimed = f"{self.file.question['text']} is {'>=' if is_lower else '<='} {text}"
+        return len(graph), f"{claimed} in every initial state"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
