@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 import jaxltl
 from jaxltl import checker
-from jaxltl.core.logic.bounded import Earned
+from jaxltl.core.logic.bounded import Bounded, Earned
 from jaxltl.core.logic.labels import is_boolean, satisfying
-from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
@@ -69,8 +69,9 @@ def write_certificate(
       solution: of the question, such as of :func:`~jaxltl.reachability_probability`, with bounds
         and a deterministic policy.
       question: in PRISM's syntax, over labels of the model: ``Pmax=? [ F "goal" ]``,
-        ``Pmin=? [ "safe" U "goal" ]``, ``R{"time"}min=? [ F "goal" ]``, ``R{"time"}max=? [ C ]``. For
-        an interval model with both directions, as in ``Pmaxmin=?``.
+        ``Pmin=? [ "safe" U "goal" ]``, ``Pmax=? [ F<=9 "goal" ]``, ``R{"time"}min=? [ F "goal" ]``,
+        ``R{"time"}max=? [ C ]``, ``R{"time"}max=? [ C<=9 ]``. For an interval model with both
+        directions, as in ``Pmaxmin=?``. With bounded steps the policy is not used.
       reward: ``float[S]``, ``float[R]`` or ``float[S, A]``: replaces the reward that the question
         names.
       discount: in [0, 1), of a question ``R{"name"}max=? [ C ]``: discounted instead of total reward.
@@ -97,15 +98,18 @@ def write_certificate(
     """
     with errors_in("write_certificate: "):
         problem = _problem(model, parse_property(question), reward, discount)
-        policy = _offsets(model, solution, problem)
+        steps = problem.path.get("steps")
+        policy = None if isinstance(steps, int) else _offsets(model, solution, problem)
         contents = problem.contents(policy)
         file = checker.CertificateFile(contents)
         claims = []
         for side in ("lower", "upper"):
             bound = np.array(getattr(solution, side), np.float64).ravel()
-            if bound.shape != policy.shape or np.isnan(bound).any():
+            if bound.shape != (problem.host.num_states,) or np.isnan(bound).any():
                 raise ValueError(f"solution.{side} has shape {bound.shape}, or NaN; expected [S].")
-            if side == "lower" or problem.is_bounded(bound):
+            if policy is None and isinstance(steps, int):
+                claims.append(_step_claim(problem, file, side, bound, steps))
+            elif policy is not None and (side == "lower" or problem.is_bounded(bound)):
                 claims.append(_claim(problem, file, side, solution, bound, policy))
     index = json.loads(contents["certificate/index.json"])
     index |= {"claims": claims, "members": file.members}
@@ -147,19 +151,21 @@ class _Certified:
     def row_of_entry(self) -> Integers:
         return np.repeat(np.arange(self.host.num_rows), np.diff(self.host.entry_start))
 
-    def contents(self, policy: Integers) -> dict[str, bytes]:
-        """Members of the archive, with a policy and without claims."""
+    def contents(self, policy: Integers | None) -> dict[str, bytes]:
+        """Members of the archive, with a policy, if there is one, and without claims."""
         index = {
             "version": 1,
             "producer": f"jaxltl {jaxltl.__version__}",
             "numbers": checker.NUMBERS,
             "question": self.question,
             "claims": [{}],
-            "members": {"policy": {"dtype": "uint32", "shape": [policy.size]}},
+            "members": {},
         }
         members = {name: bytes(content) for name, content in umb_contents(self.model)}
+        if policy is not None:
+            index["members"] = {"policy": {"dtype": "uint32", "shape": [policy.size]}}
+            members["certificate/policy.bin"] = policy.astype("<u4").tobytes()
         members["certificate/index.json"] = json.dumps(index).encode()
-        members["certificate/policy.bin"] = policy.astype("<u4").tobytes()
         return members
 
     def means(self, x: Floats) -> tuple[Floats, Floats]:
@@ -197,19 +203,28 @@ def _problem(
         name = name or next(iter(sparse.rewards), None)
     path: dict[str, object] = {}
     until = prop.path.operands if isinstance(prop.path, Formula) else ()
-    goal = until[-1] if until and all(map(is_boolean, until)) else None
     operator = prop.path.operator if isinstance(prop.path, Formula) else ""
+    if isinstance(prop.path, Bounded) and prop.path.lower == 0 and prop.path.upper is not None:
+        operator = "F" if prop.path.left == TRUE else prop.path.operator
+        until = (prop.path.left, prop.path.right)
+        path["steps"] = prop.path.upper
+    goal = until[-1] if until and all(map(is_boolean, until)) else None
+    earned = prop.path if isinstance(prop.path, Earned) else Earned("average")
     if prop.operator == "P" and goal is not None and operator in ("F", "U"):
-        path = {"kind": "until", "target": _nested(goal)}
+        path |= {"kind": "until", "target": _nested(goal)}
         path |= {"stay": _nested(until[0])} if operator == "U" else {}
     elif prop.operator == "R" and goal is not None and operator == "F":
         path = {"kind": "reward", "reward": name, "target": _nested(goal)}
-    elif prop.operator == "R" and isinstance(prop.path, Earned) and prop.path == Earned("total"):
+    elif prop.operator == "R" and earned == Earned("total"):
         path = {"kind": "total", "reward": name}
-    if not path or prop.definitions or (discount is not None and path["kind"] != "total"):
+    elif prop.operator == "R" and earned.kind == "cumulative" and earned.steps is not None:
+        path = {"kind": "total", "reward": name, "steps": earned.steps}
+    is_wrong = "kind" not in path or prop.definitions
+    if is_wrong or (discount is not None and (path["kind"] != "total" or "steps" in path)):
         raise ValueError(
-            f"{prop.text}: certificates are written for P of F and U over labels, R of F, and R of "
-            "C, also with a discount; not for other formulas, bounded steps and averages."
+            f"{prop.text}: certificates are written for P of F and U over labels, also with a "
+            "largest number of steps, R of F, and R of C, also with steps or a discount; not for "
+            "other formulas and averages."
         )
     if discount is not None:
         path |= {"discount": str(Fraction(float(discount)))}
@@ -305,10 +320,48 @@ def _claim(
     raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
 
 
+def _step_claim(
+    problem: _Certified, file: checker.CertificateFile, side: str, bound: Floats, steps: int
+) -> dict[str, str]:
+    """A claim of values of all numbers of steps, by backward induction with rounding outwards."""
+    host, sign = problem.host, 1 if side == "upper" else -1
+    first, inside = host.row_start[:-1], ~problem.target & problem.stay
+    is_max = np.where(problem.system, problem.objective, problem.directions[0]) == "max"
+    ends = np.where(problem.target, float(problem.is_probability), 0.0)
+    initial = np.flatnonzero(np.asarray(problem.sparse.initial) > 0)
+    claim, reason = {"side": side, "values": side, "bound": ""}, "none"
+    for factor in _SHIFTS:
+        layers = [ends]
+        for _ in range(steps):
+            mean, _ = problem.means(layers[-1])
+            scale = max(1.0, float(np.abs(mean).max()), float(np.abs(problem.gain).max()))
+            best = np.where(
+                is_max, np.maximum.reduceat(mean, first), np.minimum.reduceat(mean, first)
+            )
+            best = best + sign * 4 * factor * host.backup_unit * scale
+            best = np.clip(best, 0, 1) if problem.is_probability else best
+            layers.append(np.where(inside, best, ends))
+        beyond = sign * (layers[-1] - bound)[initial]  # a proven bound may be wider by rounding
+        if beyond.max(initial=0) > _TIGHT * max(1.0, float(np.abs(bound[initial]).max())):
+            reason = "they are beyond the values"
+            break
+        _store(file, side, np.stack(layers, axis=1))
+        worst = layers[-1][initial]
+        claim["bound"] = _as_text(float(worst.min() if side == "lower" else worst.max()), side)
+        try:
+            checker.ClaimChecker(file, claim).check()
+        except checker.Refusal as error:
+            reason = str(error)
+            continue
+        return claim
+    raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
+
+
 def _store(file: checker.CertificateFile, name: str, values: Values) -> None:
     """Adds an array of doubles or fractions."""
-    dtype = "double"
+    dtype, shape = "double", [len(values)]
     if isinstance(values, np.ndarray):
+        shape = list(values.shape)
         content = values.astype("<f8").tobytes()
     else:
         ratios = [x.as_integer_ratio() for x in values]
@@ -318,7 +371,7 @@ def _store(file: checker.CertificateFile, name: str, values: Values) -> None:
             n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
         )
     file.contents[f"certificate/{name}.bin"] = content
-    file.members[name] = {"dtype": dtype, "shape": [len(values)]}
+    file.members[name] = {"dtype": dtype, "shape": shape}
 
 
 def _as_text(value: float | Fraction, side: str) -> str:

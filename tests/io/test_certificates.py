@@ -103,6 +103,40 @@ def test_intervals(seed, directions, tmp_path, capsys):
     verified(path, capsys)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("objective", ["max", "min"])
+def test_bounded_steps(objective, seed, tmp_path, capsys):
+    model, path = random_model(seed, reward=True), tmp_path / "file.umb"
+    goal, safe = (np.asarray(model.states_with_label(x)) for x in ("goal", "safe"))
+    for steps in (0, 1, 7):
+        found = jl.values.bounded_reachability(model, goal, steps, stay=safe, objective=objective)
+        write_certificate(path, model, found, f'P{objective}=? [ "safe" U<={steps} "goal" ]')
+        assert width(verified(path, capsys)) < 1e-11
+        found = jl.values.cumulative_reward(model, "cost", steps, objective=objective)
+        write_certificate(path, model, found, f'R{{"cost"}}{objective}=? [ C<={steps} ]')
+        assert width(verified(path, capsys)) < 1e-11
+    wrong = replace(found, lower=np.asarray(found.lower) + 1e-3)
+    with pytest.raises(ValueError, match="no lower bounds"):
+        write_certificate(path, model, wrong, f'R{{"cost"}}{objective}=? [ C<=7 ]')
+
+
+@pytest.mark.parametrize("directions", ["maxmin", "minmin"])
+def test_bounded_steps_of_interval_models_and_games(directions, tmp_path, capsys):
+    model, path = random_model(1), tmp_path / "file.umb"
+    p, goal = np.asarray(model.probability), np.asarray(model.states_with_label("goal"))
+    rough = jl.make_interval(model, 0.5 * p, np.minimum(1.5 * p, 1))
+    objective = directions[:3]
+    nature = "cooperative" if directions[3:] == objective else "adversarial"
+    found = jl.values.bounded_reachability(rough, goal, 5, objective=objective, nature=nature)
+    write_certificate(path, rough, found, f'P{directions}=? [ F<=5 "goal" ]')
+    assert width(verified(path, capsys)) < 1e-11
+    game = jl.make_game(model, np.random.default_rng(2).random(SIZE) < 0.5)
+    found = jl.values.bounded_reachability(game, goal, 5, objective=objective)
+    write_certificate(path, game, found, f'P{objective}=? [ F<=5 "goal" ]')
+    text = verified(path, capsys)
+    assert "<<system>>" in text and width(text) < 1e-11
+
+
 def test_padded_models_and_chains(tmp_path, capsys):
     path = tmp_path / "file.umb"
     dense = jl.from_dense(
@@ -171,7 +205,8 @@ def test_false_bounds_are_not_written(tmp_path):
     ("question", "why"),
     [
         ('Pmax=? [ G F "goal" ]', "certificates are written for"),
-        ('Pmax=? [ F<=3 "goal" ]', "certificates are written for"),
+        ('Pmax=? [ F[1,3] "goal" ]', "certificates are written for"),
+        ('Pmax=? [ G<=3 "goal" ]', "certificates are written for"),
         ('LRAmax=? [ "goal" ]', "certificates are written for"),
         ('P=? [ F "goal" ]', "give the objective"),
         ('Pmax>=0.5 [ F "goal" ]', "give the objective"),
