@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
-from functools import cached_property
 
 import chex
 import numpy as np
-from numpy.typing import NDArray
 
-import jaxltl
 from jaxltl import checker
+from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.bounded import Bounded, Earned
 from jaxltl.core.logic.labels import is_boolean, satisfying
 from jaxltl.core.logic.ltl import TRUE, Formula
@@ -25,32 +21,34 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure
-from jaxltl.core.sparse.graph.qualitative import end_components
-from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.models.sparse import Rewards, reward_structure
 from jaxltl.core.types import Solution
+from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.validation import errors_in
 from jaxltl.io.files import write_bytes
+from jaxltl.io.formula_claims import formula_claims
+from jaxltl.io.hoa.hoa import write_hoa
+from jaxltl.io.inductive_bounds import (
+    SHIFTS,
+    TIGHT,
+    Booleans,
+    Certified,
+    Floats,
+    Integers,
+    as_text,
+    candidates,
+    store,
+)
 from jaxltl.io.umb.members import tar_pieces, write_gzip
-from jaxltl.io.umb.umb import umb_contents
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
-Values = Floats | list[Fraction]
 _OPPOSITE = {"max": "min", "min": "max"}
-_SHIFTS = (1, 8, 64, 4096)  # multiples of the largest violation by which bounds are widened
-_LARGEST_SHIFT = 1e-3  # relative; a larger violation means that the bounds are wrong
-_LARGEST_EXACT = 60  # states that are solved in fractions
-_TIGHT = 1e-6  # relative slack up to which rows count when bounds are widened
 
 
 def write_certificate(
     path: str | os.PathLike[str],
     model: Model,
-    solution: Solution,
+    solution: Solution | Satisfaction,
     question: str,
     *,
     reward: Rewards | chex.Array | None = None,
@@ -65,13 +63,14 @@ def write_certificate(
     Args:
       path: the file, a UMB archive.
       model: a SparseMDP, MDP or DenseMDP, an IntervalMDP without L1 balls, or a Game of one of them,
-        whose environment is adversarial.
+        whose environment is adversarial. For a formula also a Product of a model without players.
       solution: of the question, such as of :func:`~jaxltl.reachability_probability`, with bounds
-        and a deterministic policy.
+        and a deterministic policy; of a formula that of :func:`~jaxltl.optimal_satisfaction`.
       question: in PRISM's syntax, over labels of the model: ``Pmax=? [ F "goal" ]``,
         ``Pmin=? [ "safe" U "goal" ]``, ``Pmax=? [ F<=9 "goal" ]``, ``R{"time"}min=? [ F "goal" ]``,
-        ``R{"time"}max=? [ C ]``, ``R{"time"}max=? [ C<=9 ]``. For an interval model with both
-        directions, as in ``Pmaxmin=?``. With bounded steps the policy is not used.
+        ``R{"time"}max=? [ C ]``, ``R{"time"}max=? [ C<=9 ]``, ``Pmax=? [ G F "goal" ]``.
+        For an interval model with both directions, as in ``Pmaxmin=?``. Formulas and bounded steps
+        have values and policies of their own, and the bounds of the solution may not contradict.
       reward: ``float[S]``, ``float[R]`` or ``float[S, A]``: replaces the reward that the question
         names.
       discount: in [0, 1), of a question ``R{"name"}max=? [ C ]``: discounted instead of total reward.
@@ -97,20 +96,32 @@ def write_certificate(
       0
     """
     with errors_in("write_certificate: "):
-        problem = _problem(model, parse_property(question), reward, discount)
-        steps = problem.path.get("steps")
-        policy = None if isinstance(steps, int) else _offsets(model, solution, problem)
+        product = model if isinstance(model, Product) else None
+        world: Model = model if product is None else product.mdp
+        problem = _problem(world, parse_property(question), reward, discount)
+        steps, is_formula = problem.path.get("steps"), problem.path["kind"] == "formula"
+        if not is_formula and (product is not None or isinstance(solution, Satisfaction)):
+            raise ValueError(
+                f"{question}: products are for formulas; give to_sparse(product) and its Solution."
+            )
+        policy = None
+        if not is_formula and steps is None and isinstance(solution, Solution):
+            policy = _offsets(model, solution, problem)
         contents = problem.contents(policy)
         file = checker.CertificateFile(contents)
         claims = []
-        for side in ("lower", "upper"):
+        if is_formula:
+            claims = formula_claims(problem, file)
+            _check_initial(product, solution, claims)
+        for side in () if is_formula else ("lower", "upper"):
             bound = np.array(getattr(solution, side), np.float64).ravel()
             if bound.shape != (problem.host.num_states,) or np.isnan(bound).any():
                 raise ValueError(f"solution.{side} has shape {bound.shape}, or NaN; expected [S].")
-            if policy is None and isinstance(steps, int):
+            if isinstance(steps, int):
                 claims.append(_step_claim(problem, file, side, bound, steps))
             elif policy is not None and (side == "lower" or problem.is_bounded(bound)):
-                claims.append(_claim(problem, file, side, solution, bound, policy))
+                value = np.array(solution.value).ravel()
+                claims.append(_claim(problem, file, side, (value, bound), policy))
     index = json.loads(contents["certificate/index.json"])
     index |= {"claims": claims, "members": file.members}
     contents["certificate/index.json"] = json.dumps(index, indent=1).encode()
@@ -118,76 +129,11 @@ def write_certificate(
         write_gzip(target, tar_pieces(list(contents.items())))
 
 
-@dataclass(frozen=True)
-class _Certified:
-    """The model and the question of a certificate, as arrays."""
-
-    model: Model  # as it is written
-    sparse: SparseMDP
-    uncertain: UncertainMDP | None  # the intervals
-    system: Booleans  # bool[S], the states of the system
-    objective: str
-    directions: tuple[str, str]  # of the environment, of nature
-    question: dict[str, object]
-    path: dict[str, object]
-    target: Booleans
-    stay: Booleans
-    gain: Floats  # float[T], the reward of a transition with that of its row and state
-    discount: float
-
-    @property
-    def host(self) -> HostMDP:
-        return self.sparse.host
-
-    @property
-    def is_probability(self) -> bool:
-        return self.path["kind"] == "until"
-
-    def is_bounded(self, bound: Floats) -> bool:
-        """True if some initial state has a finite bound."""
-        return bool(np.isfinite(bound[np.asarray(self.sparse.initial) > 0]).any())
-
-    @cached_property
-    def row_of_entry(self) -> Integers:
-        return np.repeat(np.arange(self.host.num_rows), np.diff(self.host.entry_start))
-
-    def contents(self, policy: Integers | None) -> dict[str, bytes]:
-        """Members of the archive, with a policy, if there is one, and without claims."""
-        index = {
-            "version": 1,
-            "producer": f"jaxltl {jaxltl.__version__}",
-            "numbers": checker.NUMBERS,
-            "question": self.question,
-            "claims": [{}],
-            "members": {},
-        }
-        members = {name: bytes(content) for name, content in umb_contents(self.model)}
-        if policy is not None:
-            index["members"] = {"policy": {"dtype": "uint32", "shape": [policy.size]}}
-            members["certificate/policy.bin"] = policy.astype("<u4").tobytes()
-        members["certificate/index.json"] = json.dumps(index).encode()
-        return members
-
-    def means(self, x: Floats) -> tuple[Floats, Floats]:
-        """Expected reward and value of each row, and nature's distribution, for finite values."""
-        host = self.host
-        value = self.gain + self.discount * x[host.successor]
-        if self.uncertain is None:
-            p = host.probability
-        else:
-            largest = self.directions[1] == "max"
-            p = self.uncertain.extreme_distributions(value, maximize=largest)
-        p = p / np.add.reduceat(p, host.entry_start[:-1])[self.row_of_entry]
-        return np.add.reduceat(p * value, host.entry_start[:-1]), p
-
-
 def _problem(
     model: Model, prop: Property, reward: Rewards | chex.Array | None, discount: float | None
-) -> _Certified:
+) -> Certified:
     """Validates the model and the question."""
     inner = model.mdp if isinstance(model, Game) else model
-    if isinstance(inner, Product):
-        raise ValueError("certificates of products are not written; give to_sparse(product).")
     if isinstance(inner, IntervalMDP):
         refuse_ball(inner, "a certificate holds intervals")
     sparse = inner.nominal if isinstance(inner, IntervalMDP) else to_sparse(inner)
@@ -219,12 +165,17 @@ def _problem(
         path = {"kind": "total", "reward": name}
     elif prop.operator == "R" and earned.kind == "cumulative" and earned.steps is not None:
         path = {"kind": "total", "reward": name, "steps": earned.steps}
+    elif prop.operator == "P" and isinstance(prop.path, Formula):
+        path = {"kind": "formula", "formula": _nested(prop.path), "automaton": "automaton"}
+        if system is not None or isinstance(inner, IntervalMDP):
+            raise ValueError(
+                f"{prop.text}: of games and interval models, only F and U are written."
+            )
     is_wrong = "kind" not in path or prop.definitions
     if is_wrong or (discount is not None and (path["kind"] != "total" or "steps" in path)):
         raise ValueError(
-            f"{prop.text}: certificates are written for P of F and U over labels, also with a "
-            "largest number of steps, R of F, and R of C, also with steps or a discount; not for "
-            "other formulas and averages."
+            f"{prop.text}: certificates are written for P of formulas without bounds, of F<=k and "
+            "U<=k over labels, for R of F, and R of C, also with steps or a discount."
         )
     if discount is not None:
         path |= {"discount": str(Fraction(float(discount)))}
@@ -250,6 +201,9 @@ def _problem(
         for part, place in (*parts, (structure.transition, slice(None))):
             gain += 0 if part is None else np.asarray(part, np.float64)[place]
     everywhere = np.ones(host.num_states, bool)
+    hoa = ""
+    if path["kind"] == "formula" and isinstance(prop.path, Formula):
+        hoa = write_hoa(to_automaton(prop.path))
 
     def mask(formula: Formula | None) -> Booleans:
         names = formula.propositions if formula else ()
@@ -257,7 +211,7 @@ def _problem(
         label = np.stack([everywhere, *columns], axis=1)[:, 1:]
         return satisfying(label, names, formula or "true", prop.text)
 
-    return _Certified(
+    return Certified(
         model=written,
         sparse=sparse,
         uncertain=inner.host if isinstance(inner, IntervalMDP) else None,
@@ -270,6 +224,7 @@ def _problem(
         stay=mask(until[0]) if "stay" in path else everywhere,
         gain=gain,
         discount=1.0 if discount is None else float(discount),
+        automaton=hoa,
     )
 
 
@@ -285,7 +240,7 @@ def _nested(formula: Formula) -> str | list[object]:
     return [formula.operator, *operands]
 
 
-def _offsets(model: Model, solution: Solution, problem: _Certified) -> Integers:
+def _offsets(model: Model, solution: Solution, problem: Certified) -> Integers:
     """The policy as numbers of rows within their states."""
     policy = np.asarray(solution.policy)
     if policy.ndim != len(model.state_shape) or not np.issubdtype(policy.dtype, np.integer):
@@ -296,21 +251,21 @@ def _offsets(model: Model, solution: Solution, problem: _Certified) -> Integers:
 
 
 def _claim(
-    problem: _Certified,
+    problem: Certified,
     file: checker.CertificateFile,
     side: str,
-    solution: Solution,
-    bound: Floats,
+    value_and_bound: tuple[Floats, Floats],
     policy: Integers,
 ) -> dict[str, str]:
     """A claim that the checker accepts, whose arrays are added to the file."""
     claim = {"side": side, "values": side, "policy": "policy", "bound": ""}
     rows = problem.host.row_start[:-1] + policy
     reason = "no bound"
-    for values in _candidates(problem, side, bound, np.array(solution.value).ravel(), rows):
-        _store(file, side, values)
+    value, bound = value_and_bound
+    for values in candidates(problem, side, bound, value, rows):
+        store(file, side, values)
         worst = [values[s] for s in np.flatnonzero(np.asarray(problem.sparse.initial) > 0)]
-        claim["bound"] = _as_text((min if side == "lower" else max)(worst), side)
+        claim["bound"] = as_text((min if side == "lower" else max)(worst), side)
         try:
             checker.ClaimChecker(file, claim).check()
         except checker.Refusal as error:
@@ -320,8 +275,29 @@ def _claim(
     raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
 
 
+def _check_initial(
+    product: Product | None, solution: Solution | Satisfaction, claims: list[dict[str, str]]
+) -> None:
+    """Raises a ValueError if bounds of a solution contradict the claims in the initial states."""
+    if isinstance(solution, Satisfaction):
+        bounds = [
+            np.asarray(x, np.float64) for x in (solution.solution.lower, solution.solution.upper)
+        ]
+    elif product is not None:
+        initial = np.asarray(product.initial) > 0
+        bounds = [np.asarray(x, np.float64)[initial] for x in (solution.lower, solution.upper)]
+    else:
+        raise ValueError(
+            "solution: give that of optimal_satisfaction(model, formula), or the product."
+        )
+    proven = {claim["side"]: Fraction(claim["bound"]) for claim in claims}
+    low, high = float(bounds[0].min()), float(bounds[1].max())
+    if not (low <= proven["upper"] + TIGHT and high >= proven["lower"] - TIGHT):
+        raise ValueError(f"solution has the bounds {low} and {high}, which {claims} contradict.")
+
+
 def _step_claim(
-    problem: _Certified, file: checker.CertificateFile, side: str, bound: Floats, steps: int
+    problem: Certified, file: checker.CertificateFile, side: str, bound: Floats, steps: int
 ) -> dict[str, str]:
     """A claim of values of all numbers of steps, by backward induction with rounding outwards."""
     host, sign = problem.host, 1 if side == "upper" else -1
@@ -330,7 +306,7 @@ def _step_claim(
     ends = np.where(problem.target, float(problem.is_probability), 0.0)
     initial = np.flatnonzero(np.asarray(problem.sparse.initial) > 0)
     claim, reason = {"side": side, "values": side, "bound": ""}, "none"
-    for factor in _SHIFTS:
+    for factor in SHIFTS:
         layers = [ends]
         for _ in range(steps):
             mean, _ = problem.means(layers[-1])
@@ -342,12 +318,12 @@ def _step_claim(
             best = np.clip(best, 0, 1) if problem.is_probability else best
             layers.append(np.where(inside, best, ends))
         beyond = sign * (layers[-1] - bound)[initial]  # a proven bound may be wider by rounding
-        if beyond.max(initial=0) > _TIGHT * max(1.0, float(np.abs(bound[initial]).max())):
+        if beyond.max(initial=0) > TIGHT * max(1.0, float(np.abs(bound[initial]).max())):
             reason = "they are beyond the values"
             break
-        _store(file, side, np.stack(layers, axis=1))
+        store(file, side, np.stack(layers, axis=1), [host.num_states, steps + 1])
         worst = layers[-1][initial]
-        claim["bound"] = _as_text(float(worst.min() if side == "lower" else worst.max()), side)
+        claim["bound"] = as_text(float(worst.min() if side == "lower" else worst.max()), side)
         try:
             checker.ClaimChecker(file, claim).check()
         except checker.Refusal as error:
@@ -355,167 +331,3 @@ def _step_claim(
             continue
         return claim
     raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
-
-
-def _store(file: checker.CertificateFile, name: str, values: Values) -> None:
-    """Adds an array of doubles or fractions."""
-    dtype, shape = "double", [len(values)]
-    if isinstance(values, np.ndarray):
-        shape = list(values.shape)
-        content = values.astype("<f8").tobytes()
-    else:
-        ratios = [x.as_integer_ratio() for x in values]
-        words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
-        dtype, size = f"rational{128 * words}", 8 * words
-        content = b"".join(
-            n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
-        )
-    file.contents[f"certificate/{name}.bin"] = content
-    file.members[name] = {"dtype": dtype, "shape": shape}
-
-
-def _as_text(value: float | Fraction, side: str) -> str:
-    """A bound as text: twelve digits, rounded outwards, or the exact ratio of a tiny number."""
-    if value == np.inf:
-        return "inf"
-    exact = Fraction(value)
-    scaled = exact * 10**12
-    if abs(exact) < 1e-3 or scaled.denominator == 1:
-        return str(exact)
-    rounded = scaled.__floor__() if side == "lower" else scaled.__ceil__()
-    return f"{'-' * (rounded < 0)}{abs(rounded) // 10**12}.{abs(rounded) % 10**12:012}"
-
-
-# --- inductive bounds -------------------------------------------------------------------------
-
-
-def _candidates(
-    problem: _Certified, side: str, bound: Floats, value: Floats, rows: Integers
-) -> Iterator[Values]:
-    """Bounds as they are, widened, and solved in fractions, in the order of their cost."""
-    signed = "discount" in problem.path
-    x = np.where(problem.target, float(problem.is_probability), bound)
-    x = np.where(problem.target | problem.stay, x, 0.0)
-    if problem.is_probability:
-        x = np.clip(x, 0, 1)
-    elif not signed:
-        x = np.maximum(x, 0)
-    yield x
-    yield from _widened(problem, 1 if side == "upper" else -1, x, rows)
-    if problem.host.num_states <= _LARGEST_EXACT and problem.uncertain is None:
-        exact = _exact(problem, value, rows)
-        if exact is not None:
-            yield exact
-
-
-def _widened(problem: _Certified, sign: int, x: Floats, rows: Integers) -> Iterator[Floats]:
-    """``x + sign e w`` with ``w >= 1 + P w`` in all rows that may violate the inequality.
-
-    Then ``e`` times 1 is gained in each row, more than rounding and the violation cost. End
-    components in which paths may stay have one value, of which the mean is exact.
-    """
-    from scipy.sparse import csr_array, eye_array
-    from scipy.sparse.linalg import spsolve
-
-    host, d = problem.host, problem.discount
-    top = 1.0 if problem.is_probability else np.inf
-    inside = ~problem.target & problem.stay
-    if "discount" not in problem.path:
-        inside &= (x > 0) & (x < top)
-    ours = "max" if sign < 0 else "min"
-    owner = np.where(problem.system, problem.objective, problem.directions[0])
-    used = (owner != ours)[host.state]
-    used[rows] = True
-    used &= inside[host.state]
-    label = np.arange(host.num_states)
-    if problem.path["kind"] != "reward" and "discount" not in problem.path and sign > 0:
-        components = end_components(host, inside, used)
-        label, used = np.asarray(components.component), used & ~components.inside
-        x = _extreme_by_label(x, label)
-    mean, p = problem.means(np.where(np.isfinite(x), x, 0.0))
-    infinite = np.add.reduceat(p * ~np.isfinite(x[host.successor]), host.entry_start[:-1]) > 0
-    slack = np.where(infinite, np.inf, sign * (x[host.state] - mean))
-    scale = max(1.0, float(np.max(np.abs(x[np.isfinite(x)]), initial=0)))
-    tight = np.flatnonzero(used & (slack < _TIGHT * scale))
-    place = np.full(host.num_states, -1)
-    parts = np.unique(label[host.state[tight]])
-    place[parts] = np.arange(parts.size)
-    if not parts.size:
-        return
-    source, goal = place[label[host.state]], place[label[host.successor]]
-    entries = np.flatnonzero((goal >= 0) & np.isin(problem.row_of_entry, tight))
-    number = np.full(host.num_rows, -1)
-    number[tight] = np.arange(tight.size)
-    index = number[problem.row_of_entry[entries]], goal[entries]
-    step = csr_array((d * p[entries], index), shape=(tight.size, parts.size))
-    home = source[tight]
-    chosen = np.full(parts.size, -1)
-    chosen[home] = np.arange(tight.size)
-    w = np.zeros(parts.size)
-    for _ in range(30):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            w = np.atleast_1d(
-                spsolve((eye_array(parts.size) - step[chosen]).tocsc(), np.ones(parts.size))
-            )
-        if not np.isfinite(w).all() or w.min() < 0.5:
-            return
-        growth = 1 + step @ w
-        better = growth > w[home] * (1 + 1e-9)
-        if not better.any():
-            break
-        chosen[home[better]] = np.flatnonzero(better)
-    violation = max(0.0, float(-slack[tight].min())) + 8 * host.backup_unit * scale
-    shape = np.where(place[label] >= 0, w[place[label]], 0.0)
-    for factor in _SHIFTS:
-        if factor * violation * shape.max() > _LARGEST_SHIFT * scale:
-            return
-        shifted = np.where(inside, x + sign * factor * violation * shape, x)
-        yield shifted if "discount" in problem.path else np.clip(shifted, 0, top)
-
-
-def _extreme_by_label(x: Floats, label: Integers) -> Floats:
-    """The largest value of each label."""
-    largest = np.full(x.size, -np.inf)
-    np.maximum.at(largest, label, x)
-    return largest[label]
-
-
-def _exact(problem: _Certified, value: Floats, rows: Integers) -> list[Fraction] | None:
-    """Exact values of the chain of a policy; None if its system is singular."""
-    host, d = problem.host, Fraction(problem.discount)
-    result = [Fraction(int(t and problem.is_probability)) for t in problem.target]
-    is_open = ~problem.target & problem.stay
-    if "discount" not in problem.path:
-        if not np.isfinite(value).all():
-            return None
-        is_open &= value > 0
-    states = np.flatnonzero(is_open).tolist()
-    place = {s: i for i, s in enumerate(states)}
-    table: list[dict[int, Fraction]] = []
-    for s in states:
-        begin, end = host.entry_start[rows[s]], host.entry_start[rows[s] + 1]
-        weights = [Fraction(float(n)) for n in host.probability[begin:end]]
-        line = {place[s]: Fraction(1), -1: Fraction(0)}
-        for i, n in zip(range(begin, end), weights, strict=True):
-            t, p = int(host.successor[i]), n / sum(weights)
-            line[-1] += p * (
-                Fraction(float(problem.gain[i])) + d * (0 if t in place else result[t])
-            )
-            if t in place:
-                line[place[t]] = line.get(place[t], Fraction(0)) - d * p
-        table.append(line)
-    for i in range(
-        len(states)
-    ):  # elimination without a choice of pivots, as rows are diagonally dominant
-        if not table[i].get(i):
-            return None
-        table[i] = {j: v / table[i][i] for j, v in table[i].items()}
-        for k, line in enumerate(table):
-            if k != i and line.get(i):
-                factor = line[i]
-                for j, v in table[i].items():
-                    line[j] = line.get(j, Fraction(0)) - factor * v
-    for s, line in zip(states, table, strict=True):
-        result[s] = line[-1]
-    return result

@@ -1,6 +1,7 @@
 """Certificates of the solvers' bounds: the checker accepts them, or they are not written."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import jax
 import numpy as np
@@ -137,6 +138,60 @@ def test_bounded_steps_of_interval_models_and_games(directions, tmp_path, capsys
     assert "<<system>>" in text and width(text) < 1e-11
 
 
+FORMULAS = [
+    'G F "a"',
+    'F G "a"',
+    '(G F "a") & (F G !"b")',
+    '(G F "a") => (G F "b")',
+    'X ("a" U "b")',
+]
+
+
+@pytest.mark.parametrize("objective", ["max", "min"])
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_formulas(formula, objective, tmp_path, capsys):
+    for seed in range(3):
+        model, path = random_model(seed), tmp_path / "file.umb"
+        label = np.random.default_rng(seed).random((SIZE, 2)) < 0.5
+        labels = {name: np.flatnonzero(column) for name, column in zip("ab", label.T, strict=True)}
+        model = jl.make_sparse(
+            model.row_start,
+            model.entry_start,
+            model.successor,
+            model.probability,
+            initial=np.eye(SIZE)[0],
+            label=labels,
+        )
+        found = jl.optimal_satisfaction(model, formula.replace("=>", "->"), objective=objective)
+        write_certificate(path, model, found, f"P{objective}=? [ {formula} ]")
+        text = verified(path, capsys)
+        low, high = (
+            float(Fraction(line.split(" is ")[1].split()[1]))
+            for line in text.splitlines()
+            if "claimed" in line
+        )
+        assert high - low < 1e-5
+        assert low <= float(found.solution.value[0]) + 1e-9
+        assert float(found.solution.value[0]) <= high + 1e-9
+        if 0.01 < found.solution.value[0] < 0.99:
+            wrong = replace(found.solution, lower=found.solution.lower + 0.01)
+            with pytest.raises(ValueError, match="contradict"):
+                write_certificate(
+                    path, model, found._replace(solution=wrong), f"P{objective}=? [ {formula} ]"
+                )
+
+
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_products_with_formulas(label_on, tmp_path, capsys):
+    world = jl.gridworld("s . t\n. . g", slip=0.2, initial="s")
+    product = jl.product(world, 'G F "g" & G !"t"', label_on=label_on)
+    found, path = jl.optimal_satisfaction(product), tmp_path / "file.umb"
+    write_certificate(path, product, found, 'Pmax=? [ (G F "g") & (G !"t") ]')
+    assert width(verified(path, capsys)) < 1e-5
+    with pytest.raises(ValueError, match="products are for formulas"):
+        write_certificate(path, product, found, 'Pmax=? [ F "g" ]')
+
+
 def test_padded_models_and_chains(tmp_path, capsys):
     path = tmp_path / "file.umb"
     dense = jl.from_dense(
@@ -204,7 +259,6 @@ def test_false_bounds_are_not_written(tmp_path):
 @pytest.mark.parametrize(
     ("question", "why"),
     [
-        ('Pmax=? [ G F "goal" ]', "certificates are written for"),
         ('Pmax=? [ F[1,3] "goal" ]', "certificates are written for"),
         ('Pmax=? [ G<=3 "goal" ]', "certificates are written for"),
         ('LRAmax=? [ "goal" ]', "certificates are written for"),

@@ -1,0 +1,259 @@
+"""Inductive bounds of a question, for certificates: widened by expected steps, or solved exactly."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+import jaxltl
+from jaxltl import checker
+from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.graph.qualitative import end_components
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.io.umb.umb import umb_contents
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+Values = Floats | list[Fraction]
+SHIFTS = (1, 8, 64, 4096)  # multiples of the largest violation by which bounds are widened
+_LARGEST_SHIFT = 1e-3  # relative; a larger violation means that the bounds are wrong
+_LARGEST_EXACT = 60  # states that are solved in fractions
+TIGHT = 1e-6  # relative slack up to which rows count when bounds are widened
+
+
+@dataclass(frozen=True)
+class Certified:
+    """The model and the question of a certificate, as arrays."""
+
+    model: Model  # as it is written
+    sparse: SparseMDP
+    uncertain: UncertainMDP | None  # the intervals
+    system: Booleans  # bool[S], the states of the system
+    objective: str
+    directions: tuple[str, str]  # of the environment, of nature
+    question: dict[str, object]
+    path: dict[str, object]
+    target: Booleans
+    stay: Booleans
+    gain: Floats  # float[T], the reward of a transition with that of its row and state
+    discount: float
+    automaton: str = ""  # of a formula, in HOA
+
+    @property
+    def host(self) -> HostMDP:
+        return self.sparse.host
+
+    @property
+    def is_probability(self) -> bool:
+        return self.path["kind"] == "until"
+
+    def is_bounded(self, bound: Floats) -> bool:
+        """True if some initial state has a finite bound."""
+        return bool(np.isfinite(bound[np.asarray(self.sparse.initial) > 0]).any())
+
+    @cached_property
+    def row_of_entry(self) -> Integers:
+        return np.repeat(np.arange(self.host.num_rows), np.diff(self.host.entry_start))
+
+    def contents(self, policy: Integers | None) -> dict[str, bytes]:
+        """Members of the archive, with a policy, if there is one, and without claims."""
+        index = {
+            "version": 1,
+            "producer": f"jaxltl {jaxltl.__version__}",
+            "numbers": checker.NUMBERS,
+            "question": self.question,
+            "claims": [{}],
+            "members": {},
+        }
+        members = {name: bytes(content) for name, content in umb_contents(self.model)}
+        if policy is not None:
+            index["members"] = {"policy": {"dtype": "uint32", "shape": [policy.size]}}
+            members["certificate/policy.bin"] = policy.astype("<u4").tobytes()
+        if self.automaton:
+            members["certificate/automaton.hoa"] = self.automaton.encode()
+        members["certificate/index.json"] = json.dumps(index).encode()
+        return members
+
+    def means(self, x: Floats) -> tuple[Floats, Floats]:
+        """Expected reward and value of each row, and nature's distribution, for finite values."""
+        host = self.host
+        value = self.gain + self.discount * x[host.successor]
+        if self.uncertain is None:
+            p = host.probability
+        else:
+            largest = self.directions[1] == "max"
+            p = self.uncertain.extreme_distributions(value, maximize=largest)
+        p = p / np.add.reduceat(p, host.entry_start[:-1])[self.row_of_entry]
+        return np.add.reduceat(p * value, host.entry_start[:-1]), p
+
+
+def store(
+    file: checker.CertificateFile, name: str, values: Values, shape: list[int] | None = None
+) -> None:
+    """Adds an array of doubles or fractions."""
+    dtype, shape = "double", shape or [len(values)]
+    if isinstance(values, np.ndarray):
+        content = values.astype("<f8").tobytes()
+    else:
+        ratios = [x.as_integer_ratio() for x in values]
+        words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
+        dtype, size = f"rational{128 * words}", 8 * words
+        content = b"".join(
+            n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
+        )
+    file.contents[f"certificate/{name}.bin"] = content
+    file.members[name] = {"dtype": dtype, "shape": shape}
+
+
+def as_text(value: float | Fraction, side: str) -> str:
+    """A bound as text: twelve digits, rounded outwards, or the exact ratio of a tiny number."""
+    if value == np.inf:
+        return "inf"
+    exact = Fraction(value)
+    scaled = exact * 10**12
+    if abs(exact) < 1e-3 or scaled.denominator == 1:
+        return str(exact)
+    rounded = scaled.__floor__() if side == "lower" else scaled.__ceil__()
+    return f"{'-' * (rounded < 0)}{abs(rounded) // 10**12}.{abs(rounded) % 10**12:012}"
+
+
+def candidates(
+    problem: Certified, side: str, bound: Floats, value: Floats, rows: Integers
+) -> Iterator[Values]:
+    """Bounds as they are, widened, and solved in fractions, in the order of their cost."""
+    signed = "discount" in problem.path
+    x = np.where(problem.target, float(problem.is_probability), bound)
+    x = np.where(problem.target | problem.stay, x, 0.0)
+    if problem.is_probability:
+        x = np.clip(x, 0, 1)
+    elif not signed:
+        x = np.maximum(x, 0)
+    yield x
+    yield from _widened(problem, 1 if side == "upper" else -1, x, rows)
+    if problem.host.num_states <= _LARGEST_EXACT and problem.uncertain is None:
+        exact = _exact(problem, value, rows)
+        if exact is not None:
+            yield exact
+
+
+def _widened(problem: Certified, sign: int, x: Floats, rows: Integers) -> Iterator[Floats]:
+    """``x + sign e w`` with ``w >= 1 + P w`` in all rows that may violate the inequality.
+
+    Then ``e`` times 1 is gained in each row, more than rounding and the violation cost. End
+    components in which paths may stay have one value, of which the mean is exact.
+    """
+    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    host, d = problem.host, problem.discount
+    top = 1.0 if problem.is_probability else np.inf
+    inside = ~problem.target & problem.stay
+    if "discount" not in problem.path:
+        inside &= (x > 0) & (x < top)
+    ours = "max" if sign < 0 else "min"
+    owner = np.where(problem.system, problem.objective, problem.directions[0])
+    used = (owner != ours)[host.state]
+    used[rows] = True
+    used &= inside[host.state]
+    label = np.arange(host.num_states)
+    if problem.path["kind"] != "reward" and "discount" not in problem.path and sign > 0:
+        components = end_components(host, inside, used)
+        label, used = np.asarray(components.component), used & ~components.inside
+        x = _extreme_by_label(x, label)
+    mean, p = problem.means(np.where(np.isfinite(x), x, 0.0))
+    infinite = np.add.reduceat(p * ~np.isfinite(x[host.successor]), host.entry_start[:-1]) > 0
+    slack = np.where(infinite, np.inf, sign * (x[host.state] - mean))
+    scale = max(1.0, float(np.max(np.abs(x[np.isfinite(x)]), initial=0)))
+    tight = np.flatnonzero(used & (slack < TIGHT * scale))
+    place = np.full(host.num_states, -1)
+    parts = np.unique(label[host.state[tight]])
+    place[parts] = np.arange(parts.size)
+    if not parts.size:
+        return
+    source, goal = place[label[host.state]], place[label[host.successor]]
+    entries = np.flatnonzero((goal >= 0) & np.isin(problem.row_of_entry, tight))
+    number = np.full(host.num_rows, -1)
+    number[tight] = np.arange(tight.size)
+    index = number[problem.row_of_entry[entries]], goal[entries]
+    step = csr_array((d * p[entries], index), shape=(tight.size, parts.size))
+    home = source[tight]
+    chosen = np.full(parts.size, -1)
+    chosen[home] = np.arange(tight.size)
+    w = np.zeros(parts.size)
+    for _ in range(30):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            w = np.atleast_1d(
+                spsolve((eye_array(parts.size) - step[chosen]).tocsc(), np.ones(parts.size))
+            )
+        if not np.isfinite(w).all() or w.min() < 0.5:
+            return
+        growth = 1 + step @ w
+        better = growth > w[home] * (1 + 1e-9)
+        if not better.any():
+            break
+        chosen[home[better]] = np.flatnonzero(better)
+    violation = max(0.0, float(-slack[tight].min())) + 8 * host.backup_unit * scale
+    shape = np.where(place[label] >= 0, w[place[label]], 0.0)
+    for factor in SHIFTS:
+        if factor * violation * shape.max() > _LARGEST_SHIFT * scale:
+            return
+        shifted = np.where(inside, x + sign * factor * violation * shape, x)
+        yield shifted if "discount" in problem.path else np.clip(shifted, 0, top)
+
+
+def _extreme_by_label(x: Floats, label: Integers) -> Floats:
+    """The largest value of each label."""
+    largest = np.full(x.size, -np.inf)
+    np.maximum.at(largest, label, x)
+    return largest[label]
+
+
+def _exact(problem: Certified, value: Floats, rows: Integers) -> list[Fraction] | None:
+    """Exact values of the chain of a policy; None if its system is singular."""
+    host, d = problem.host, Fraction(problem.discount)
+    result = [Fraction(int(t and problem.is_probability)) for t in problem.target]
+    is_open = ~problem.target & problem.stay
+    if "discount" not in problem.path:
+        if not np.isfinite(value).all():
+            return None
+        is_open &= value > 0
+    states = np.flatnonzero(is_open).tolist()
+    place = {s: i for i, s in enumerate(states)}
+    table: list[dict[int, Fraction]] = []
+    for s in states:
+        begin, end = host.entry_start[rows[s]], host.entry_start[rows[s] + 1]
+        weights = [Fraction(float(n)) for n in host.probability[begin:end]]
+        line = {place[s]: Fraction(1), -1: Fraction(0)}
+        for i, n in zip(range(begin, end), weights, strict=True):
+            t, p = int(host.successor[i]), n / sum(weights)
+            line[-1] += p * (
+                Fraction(float(problem.gain[i])) + d * (0 if t in place else result[t])
+            )
+            if t in place:
+                line[place[t]] = line.get(place[t], Fraction(0)) - d * p
+        table.append(line)
+    for i in range(
+        len(states)
+    ):  # elimination without a choice of pivots, as rows are diagonally dominant
+        if not table[i].get(i):
+            return None
+        table[i] = {j: v / table[i][i] for j, v in table[i].items()}
+        for k, line in enumerate(table):
+            if k != i and line.get(i):
+                factor = line[i]
+                for j, v in table[i].items():
+                    line[j] = line.get(j, Fraction(0)) - factor * v
+    for s, line in zip(states, table, strict=True):
+        result[s] = line[-1]
+    return result
