@@ -24,9 +24,11 @@ def test_policies_attain_the_optimum(kind, seed):
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     case = reference.random_case(rng, 4)
     subject = Subject(kind, case)
+    # With cooperative nature, policies of games need not attain values that the graph decides.
+    natures = (None, "cooperative") if subject.has_intervals and not kind[1] else (None,)
     for name, ask in ASKS.items():
         for objective in ("max", "min"):
-            for nature in (None, "cooperative") if subject.has_intervals else (None,):
+            for nature in natures:
                 aims = {"objective": objective, "nature": nature}
                 best = ask(subject, **aims)
                 again = ask(subject, policy=best.policy, **aims)
