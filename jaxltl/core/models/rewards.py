@@ -61,4 +61,5 @@ def default_reward(rewards: Mapping[str, object]) -> str:
 
 
 def listed_names(names: Mapping[str, object]) -> str:
+    """Names for an error message, in quotes, or "none"."""
     return ", ".join(map(repr, names)) or "none"

@@ -1,4 +1,4 @@
-"""The kind of a model: who chooses, how probabilities are known, and where its arrays are."""
+"""The kind of a model: its players, its container, and the place of its arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxltl.core.models.sparse import SparseMDP
 
 
 class ModelKind(NamedTuple):
-    """What of a model decides which engine answers."""
+    """The features of a model by which its engine is chosen."""
 
     is_game: bool  # whether there is a second player
     container: str  # "padded", "rows", "intervals", or "other" for models of users

@@ -99,10 +99,10 @@ Path = (
 
 
 class Question(NamedTuple):
-    """What is asked: a quantity of paths, and who chooses to what end."""
+    """A quantity of paths, with the directions of the players or a policy."""
 
     path: Path
-    objective: str = "max"  # or "min": of the system, that is, of whoever asks
+    objective: str = "max"  # or "min": of the system
     nature: str | None = None  # "adversarial" or "cooperative", where probabilities are intervals
     environment: str | None = None  # the same of a second player
     policy: Array | None = None  # of the system, to evaluate; None: optimise
@@ -115,6 +115,6 @@ class Accuracy(NamedTuple):
     relative: bool = False  # whether it is a share of the value
 
     def width(self, default: float) -> float:
-        """The width for engines on the host; relative ones are of their own type."""
+        """The width for engines on the host; relative ones are a :class:`RelativeTolerance`."""
         wanted = default if self.tolerance is None else as_width(self.tolerance)
         return RelativeTolerance(wanted) if self.relative else wanted

@@ -73,7 +73,7 @@ def _require_reward(model: Model, reward: Reward) -> None:
     if isinstance(reward, str | Rewards | None):
         if world is None:
             kind = type(base_model(model)).__name__
-            raise ValueError(f"reward={reward!r}; a {kind} has no named rewards: give an array.")
+            raise ValueError(f"reward={reward!r}; {kind} has no named rewards; give an array.")
         if not isinstance(reward, Rewards):
             reward_structure(world, reward)
         return

@@ -42,7 +42,7 @@ from jaxltl.core.values.undiscounted import (
 
 
 class Engine(NamedTuple):
-    """What answers a question of one kind of model."""
+    """A solver of one question for one kind of model, with the options that it takes."""
 
     solve: Callable[..., Solution]  # of a model, a question, an accuracy and options
     options: tuple[str, ...] = ()  # of the call that it takes

@@ -93,7 +93,7 @@ def _numbers(name: str, arguments: Mapping[str, PyTree]) -> PyTree:
         model = base_model(arguments.get("model", arguments.get("game")))
         if model is not None and not hasattr(getattr(model, "nominal", model), "rewards"):
             raise ValueError(
-                f"reward={validation.shorten(value)}; a {type(model).__name__} has no named rewards: "
+                f"reward={validation.shorten(value)}; {type(model).__name__} has no named rewards: "
                 "give an array."
             )
         return value

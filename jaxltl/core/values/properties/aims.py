@@ -65,6 +65,7 @@ class PropertyAim(NamedTuple):
 
 
 def aim_of(model: CheckableModel, prop: Property) -> PropertyAim:
+    """Directions of the system, nature and the environment; ValueError if the text lacks one of them."""
     sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
     if isinstance(model, Game):
         return _game_aim(model, prop, sign)

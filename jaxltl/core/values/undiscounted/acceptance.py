@@ -211,6 +211,7 @@ def require_product(model: Model) -> Model:
 
 
 def as_product(model: object) -> Product:
+    """The product itself; ValueError for a model of another kind."""
     if not isinstance(model, Product):
         raise ValueError(
             f"{type(model).__name__} is no product of a world and a task; give "
