@@ -7,7 +7,7 @@ import numpy as np
 from jaxltl.core.logic.bounded import Bounded, Conditional, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property
+from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import SparseMDP, choice_reward

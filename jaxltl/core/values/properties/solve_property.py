@@ -16,7 +16,8 @@ from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula, TRUE
-from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
+from jaxltl.core.logic.properties import Property, parse_property
+from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS
 from jaxltl.core.models.action_numbers import rows_of_policy
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.protocols import Array, Model
