@@ -194,7 +194,7 @@ def entry(
         "confidence": guarantee.confidence,
         "assumption": guarantee.assumption,
         "method": query.method,
-        "status": Status(int(guarantee.satisfaction.solution.status)).name,
+        "status": Status(int(guarantee.satisfaction.status)).name,
         "samples": int(evidence.counts.sum()),
         "claims": guarantee.sets.num_claims,
         "states": evidence.model.num_states,
@@ -281,7 +281,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
     worst = satisfaction_probability(against, weights, nature="adversarial")
     share = np.asarray(evidence.model.initial)
     lower = from_starts(against, worst.lower)[share > 0]
-    codes = int(worst.status), int(best.satisfaction.solution.status)
+    codes = int(worst.status), int(best.satisfaction.status)
     status = next((c for c in codes if c != Status.CONVERGED), int(Status.CONVERGED))
     return {
         "confidence": logged.confidence,

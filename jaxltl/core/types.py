@@ -81,6 +81,8 @@ class Solution:
         cooperative nature attain the value together.
       initial: the initial distribution of the model, in the shape of the value; None where the
         solver does not know it.
+      product_policy: of a model and a formula, its
+        :class:`~jaxltl.core.models.product_policy.ProductPolicy`, else None; static.
 
     Example:
       >>> import jaxltl as jl
@@ -105,6 +107,7 @@ class Solution:
     method: str = struct.field(pytree_node=False, default="")
     nature: jax.Array | None = None
     initial: jax.Array | None = struct.field(default=None, repr=False)
+    product_policy: Any = struct.field(pytree_node=False, default=None, repr=False)
 
     @property
     def at_initial(self) -> AtInitial:

@@ -23,7 +23,6 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import Rewards, reward_structure
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.validation import errors_in
 from jaxltl.io.files import write_bytes
@@ -48,7 +47,7 @@ _OPPOSITE = {"max": "min", "min": "max"}
 def write_certificate(
     path: str | os.PathLike[str],
     model: Model,
-    solution: Solution | Satisfaction,
+    solution: Solution,
     question: str,
     *,
     reward: Rewards | chex.Array | None = None,
@@ -100,12 +99,12 @@ def write_certificate(
         world: Model = model if product is None else product.mdp
         problem = _problem(world, parse_property(question), reward, discount)
         steps, is_formula = problem.path.get("steps"), problem.path["kind"] == "formula"
-        if not is_formula and (product is not None or isinstance(solution, Satisfaction)):
+        if not is_formula and (product is not None or solution.product_policy is not None):
             raise ValueError(
                 f"{question}: products are for formulas; give to_sparse(product) and its Solution."
             )
         policy = None
-        if not is_formula and steps is None and isinstance(solution, Solution):
+        if not is_formula and steps is None:
             policy = _offsets(model, solution, problem)
         contents = problem.contents(policy)
         file = checker.CertificateFile(contents)
@@ -276,13 +275,11 @@ def _claim(
 
 
 def _check_initial(
-    product: Product | None, solution: Solution | Satisfaction, claims: list[dict[str, str]]
+    product: Product | None, solution: Solution, claims: list[dict[str, str]]
 ) -> None:
     """Raises a ValueError if bounds of a solution contradict the claims in the initial states."""
-    if isinstance(solution, Satisfaction):
-        bounds = [
-            np.asarray(x, np.float64) for x in (solution.solution.lower, solution.solution.upper)
-        ]
+    if solution.product_policy is not None:
+        bounds = [np.asarray(x, np.float64) for x in (solution.lower, solution.upper)]
     elif product is not None:
         initial = np.asarray(product.initial) > 0
         bounds = [np.asarray(x, np.float64)[initial] for x in (solution.lower, solution.upper)]

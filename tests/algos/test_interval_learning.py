@@ -292,7 +292,7 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
                 )
                 np.testing.assert_allclose(
                     np.asarray(value)[:, int(model.automaton.initial)],
-                    exact.solution.value,
+                    exact.value,
                     atol=2e-3,
                 )
 

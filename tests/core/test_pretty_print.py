@@ -126,7 +126,7 @@ def made():
         evaluation,
         box,
         environment,
-        satisfaction,
+        satisfaction.product_policy,
         sure,
         jl.environments.make_monitor(automaton),
         jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),

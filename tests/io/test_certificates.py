@@ -171,14 +171,12 @@ def test_formulas(formula, objective, tmp_path, capsys):
             if "claimed" in line
         )
         assert high - low < 1e-5
-        assert low <= float(found.solution.value[0]) + 1e-9
-        assert float(found.solution.value[0]) <= high + 1e-9
-        if 0.01 < found.solution.value[0] < 0.99:
-            wrong = replace(found.solution, lower=found.solution.lower + 0.01)
+        assert low <= float(found.value[0]) + 1e-9
+        assert float(found.value[0]) <= high + 1e-9
+        if 0.01 < found.value[0] < 0.99:
+            wrong = replace(found, lower=found.lower + 0.01)
             with pytest.raises(ValueError, match="contradict"):
-                write_certificate(
-                    path, model, found._replace(solution=wrong), f"P{objective}=? [ {formula} ]"
-                )
+                write_certificate(path, model, wrong, f"P{objective}=? [ {formula} ]")
 
 
 @pytest.mark.parametrize("label_on", ["entry", "exit"])

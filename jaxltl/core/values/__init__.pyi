@@ -79,7 +79,6 @@ from .undiscounted.satisfaction_steps import (
     satisfaction_steps as satisfaction_steps,
     steps_front as steps_front,
 )
-from .undiscounted.sparse_satisfaction import Satisfaction as Satisfaction
 from .undiscounted.step_bounded import (
     bounded_reachability as bounded_reachability,
     cumulative_reward as cumulative_reward,

@@ -145,11 +145,14 @@ def test_products_policies_and_games():
         world = make_interval(model, ball.lower, ball.upper, center=ball.center, radius=ball.radius)
         for nature in ("min", "max"):
             found = optimal_satisfaction(world, task, nature=nature_word("max", nature))
-            assert found.solution.status == 0
-            both = product(world, found.automaton)
+            assert found.status == 0
+            both = product(world, found.product_policy.automaton)
             whole = optimal_satisfaction(both, nature=nature_word("max", nature))
-            start = found.product.start[0]
-            place = found.product.base_state[start], found.product.memory[start]
+            start = found.product_policy.product.start[0]
+            place = (
+                found.product_policy.product.base_state[start],
+                found.product_policy.product.memory[start],
+            )
             assert whole.value[place] == pytest.approx(found.value[start], abs=2e-6)
             assert whole.nature.shape == (world.num_transitions * both.num_memory,)
             own = satisfaction_probability(both, whole.policy, nature=nature_word("max", nature))
@@ -281,7 +284,7 @@ def test_the_ball_guarantees_more_than_its_box():
             method="weissman",
         )
         assert found.model.radius is not None
-        box = optimal_satisfaction(found.model.box, task, nature="adversarial").solution
-        assert box.lower[0] <= found.satisfaction.solution.upper[0] + 1e-9
+        box = optimal_satisfaction(found.model.box, task, nature="adversarial")
+        assert box.lower[0] <= found.satisfaction.upper[0] + 1e-9
         more += found.bound - box.lower[0]
     assert more > 0.1

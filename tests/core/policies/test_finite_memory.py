@@ -144,7 +144,7 @@ def test_policies_of_all_containers_are_the_same():
         model = jl.product(WORLD, policy.automaton, label_on=label_on)
         value = jl.satisfaction_probability(model, np.asarray(policy.action)).value
         start = value[1, int(policy.initial_memory[1])]
-        assert abs(float(start) - float(reachable.solution.value[0])) < 1e-6
+        assert abs(float(start) - float(reachable.value[0])) < 1e-6
 
 
 def test_action_numbers_of_sparse_rows_are_those_of_the_model():

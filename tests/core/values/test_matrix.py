@@ -223,8 +223,7 @@ def satisfaction(s: Subject, m, formula: str, objective: str, nature=None):
     if s.is_product:
         return jl.optimal_satisfaction(m, objective=objective, nature=nature)
     states = np.arange(s.case.num_states)
-    found = jl.optimal_satisfaction(m, formula, objective=objective, nature=nature, states=states)
-    return found.solution
+    return jl.optimal_satisfaction(m, formula, objective=objective, nature=nature, states=states)
 
 
 FORMULAS = ("F b", "G a", "a U b", "G F b", "F G a")

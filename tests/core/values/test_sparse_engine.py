@@ -77,7 +77,7 @@ def test_until_is_the_formula():
             formula = optimal_satisfaction(
                 sparse, "a U b", objective=objective, states=np.arange(sparse.num_states)
             )
-            overlap(until, formula.solution, 1e-12)
+            overlap(until, formula, 1e-12)
             again = reachability_probability(padded, goal, stay=stay, objective=objective)
             overlap(until, again)
 
@@ -110,7 +110,7 @@ def test_formulas(formula):
                     for name in ("lower", "upper", "value")
                 }
             )
-            overlap(ours.solution, start)
+            overlap(ours, start)
 
 
 def test_rewards_are_those_of_every_kind_of_model():

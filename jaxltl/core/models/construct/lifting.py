@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.validation import first_true
-from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
@@ -26,7 +24,8 @@ from jaxltl.core.policies.finite_memory import (
     Policy as Policy,
     Progress as Progress,
 )
-from jaxltl.core.sparse.product import SparseProduct
+from jaxltl.core.models.product_policy import ProductPolicy
+from jaxltl.core.types import Solution
 
 
 def _product_of(model: Model) -> Product:
@@ -160,26 +159,17 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
     return jnp.repeat(policy[:, None], _product_of(model).num_memory, axis=1)
 
 
-@runtime_checkable
-class MemoryRows(Protocol):
-    # Such as a Satisfaction, of a layer above.
-    automaton: Automaton
-    letter: np.ndarray
-    product: SparseProduct
-    row: np.ndarray
-    label_on: str
-
-
 def project_policy(
     model: Model, policy: PyTree, *, actions: Sequence[str] = (), states: Sequence[str] = ()
 ) -> FiniteMemoryPolicy:
     """Policy of a product as a finite-memory policy of the base model, to run and to save.
 
     Args:
-      model: a product, a model without memory, or a game on one of these; or the model of a
-        ``Satisfaction``.
+      model: a product, a model without memory, or a game on one of these; or the model that a
+        formula was solved on.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``, or with an axis of T steps in front; for a sparse
-        world also weights ``float[R, Q]`` of rows; or the ``Satisfaction``.
+        world also weights ``float[R, Q]`` of rows; or the :class:`Solution` of the model, of a
+        formula with its `product_policy`.
       actions, states: names of the actions and of the base model's states.
 
     Returns:
@@ -196,11 +186,13 @@ def project_policy(
       ((2, 2), [0, 1], [[0, 1], [1, 1]])
     """
     model = model.mdp if isinstance(model, Game) else model
+    if isinstance(policy, Solution):
+        policy = policy.policy if policy.product_policy is None else policy.product_policy
     world, table = base_model(model), policy
     rows = getattr(world, "nominal", world)
     rows = rows if isinstance(rows, SparseMDP) else None
     named = tuple(actions) or tuple(getattr(rows, "action_names", ())), tuple(states)
-    if isinstance(policy, MemoryRows) and rows is not None:
+    if isinstance(policy, ProductPolicy) and rows is not None:
         memory = Product(rows, policy.automaton, policy.letter, policy.label_on)
         count = len(policy.automaton.delta)
         number = row_actions(rows)

@@ -28,7 +28,7 @@ from jaxltl.core.models.protocols import RowModel
 from jaxltl.core.values.interval.sides import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.engine.state_quantities import safe_mean
-from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
+from jaxltl.core.types import Solution
 
 
 @brief
@@ -62,7 +62,7 @@ class DataGuarantee:
     bound: float
     confidence: float
     optimistic: float
-    satisfaction: Satisfaction
+    satisfaction: Solution
     model: IntervalMDP
     sets: ConfidenceSets
     gain: np.ndarray
@@ -156,12 +156,10 @@ def learn_guarantee(
     center = np.asarray(sets.center, np.float64)[aligned]
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
-        bound=safe_mean(share, getattr(worst.solution, sure), up=objective != "max", highest=1),
+        bound=safe_mean(share, getattr(worst, sure), up=objective != "max", highest=1),
         confidence=float(confidence),
         satisfaction=worst,
-        optimistic=safe_mean(
-            share, getattr(best.solution, optimistic), up=objective == "max", highest=1
-        ),
+        optimistic=safe_mean(share, getattr(best, optimistic), up=objective == "max", highest=1),
         model=interval,
         sets=sets,
         gain=sign * _gain(interval, worst, center, share),
@@ -233,18 +231,19 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
 
 
 def _gain(
-    model: IntervalMDP, satisfaction: Satisfaction, center: np.ndarray, share: np.ndarray
+    model: IntervalMDP, satisfaction: Solution, center: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
     """Expected visits of each row times the loss to nature there: ``float64[R]``."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import spsolve
 
-    product, value = satisfaction.product, satisfaction.value
+    on_product = satisfaction.product_policy
+    assert on_product is not None
+    product, value, policy = on_product.product, on_product.value, on_product.row
     host = product.host
-    policy = np.asarray(satisfaction.row)
     taken = product.base_row == policy[host.state]
     entry = taken[host.row]
-    nature = np.asarray(satisfaction.solution.nature)
+    nature = np.asarray(satisfaction.nature)
     open_ = (value > 0) & (value < 1)
     # Under this nature every undecided state is left almost surely.
     inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)

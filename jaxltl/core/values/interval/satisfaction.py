@@ -24,6 +24,7 @@ from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.models.product_policy import ProductPolicy
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.types import Solution
 from jaxltl.core.values.door.question import Accuracy, Question
@@ -37,9 +38,8 @@ from jaxltl.core.values.interval.sides import (
     sides_of,
 )
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    Satisfaction,
     automaton_and_letters,
-    starting_states,
+    weights_of_starts,
 )
 
 
@@ -65,13 +65,13 @@ def robust_satisfaction(
     environment: str | None = None,
     states: ArrayLike | None = None,
     tolerance: jax.Array | float | None = None,
-) -> Satisfaction:
+) -> Solution:
     """Satisfaction probability of a formula in an interval MDP or a game; labels are read on exit."""
     form, aims = row_form(model), directions(objective, nature, environment)
     world, requested = form.uncertain, requested_width(tolerance)
     automaton, letter = automaton_and_letters(world.nominal, formula)
-    states = starting_states(world, states)
-    start = states, np.broadcast_to(automaton.initial, states.shape)
+    first, initial = weights_of_starts(world, states)
+    start = first, np.broadcast_to(automaton.initial, first.shape)
     product, host, verdicts = _product(
         world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
@@ -80,8 +80,8 @@ def robust_satisfaction(
     row: Array = product.base_row[values.row].astype(np.int32)
     solution = _solution_at(values, product.start, product.start.shape, requested)
     actions: Array = row_actions(world.nominal)[row].astype(np.int32)
-    solution = replace(solution, policy=actions)
-    return Satisfaction(solution, automaton, letter, product, row, values.value, "exit")
+    on_product = ProductPolicy(automaton, letter, product, row, values.value, "exit")
+    return replace(solution, policy=actions, product_policy=on_product, initial=initial)
 
 
 def accept_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:

@@ -20,7 +20,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Status
-from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
+from jaxltl.core.models.product_policy import ProductPolicy
 
 
 @brief
@@ -44,7 +44,7 @@ class PropertyStrategy(NamedTuple):
 
     row: np.ndarray
     by: str = ""
-    memory: Satisfaction | None = None
+    memory: ProductPolicy | None = None
     nature: Array | None = None
 
 

@@ -21,9 +21,9 @@ from jaxltl.core.sparse.exact.average import average
 from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP, TooLarge, Values, Work, flags
 from jaxltl.core.sparse.exact.total import least_total, reachability, until_end
 from jaxltl.core.sparse.bounded.reward_bounded import in_units
+from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.values.engine.state_quantities import transition_reward
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    Satisfaction,
     reachability_problem,
     sparse_satisfaction,
 )
@@ -171,12 +171,14 @@ class _ExactQuery:
         result = sparse_satisfaction(
             self.model, path, states=self.states, objective=objective, tolerance=_WIDTH
         )
-        if result.product.host.num_transitions > MAX_TRANSITIONS:
+        policy = result.product_policy
+        assert policy is not None
+        if policy.product.host.num_transitions > MAX_TRANSITIONS:
             raise TooLarge
-        problem = reachability_problem(result, objective)
-        mdp = _product(result, self.mdp)
+        problem = reachability_problem(policy, objective)
+        mdp = _product(policy.product, self.mdp)
         value = reachability(mdp, problem.goal, None, problem.maximize, self.work)
-        at_start = [value[s] for s in result.product.start.tolist()]
+        at_start = [value[s] for s in policy.product.start.tolist()]
         return [1 - x for x in at_start] if problem.complement else at_start
 
 
@@ -186,9 +188,8 @@ def reward_limit(path: Bounded) -> float:
     return float(path.limit - Fraction(1, 10**9) * path.strict)
 
 
-def _product(result: Satisfaction, mdp: ExactMDP) -> ExactMDP:
+def _product(product: SparseProduct, mdp: ExactMDP) -> ExactMDP:
     """The product with the rational probabilities of the model."""
-    product = result.product
     host, state = product.host, product.base_state.tolist()
     rows: list[dict[int, Fraction]] = []
     entry, successor = host.entry_start.tolist(), host.successor.tolist()

@@ -493,12 +493,13 @@ class _ModelQuery(NamedTuple):
         result = optimal_satisfaction(
             self.model, path, states=self.states, tolerance=tolerance, **aim.directions
         )
-        size = f"product of {result.product.host.num_states} states"
-        method = ", ".join(filter(None, (size, result.solution.method)))
-        strategy = PropertyStrategy(
-            result[4], memory=result, nature=result.solution.nature
-        )  # the row may be deferred
-        return _Result(replace(result.solution, method=method), strategy)
+        policy = result.product_policy
+        assert policy is not None
+        size = f"product of {policy.product.host.num_states} states"
+        method = ", ".join(filter(None, (size, result.method)))
+        # The row may be deferred.
+        strategy = PropertyStrategy(policy[3], memory=policy, nature=result.nature)
+        return _Result(replace(result, method=method), strategy)
 
     def within(self, path: Bounded, aim: PropertyAim, tolerance: float) -> _Result:
         complement, asked = path.operator == "R", aim

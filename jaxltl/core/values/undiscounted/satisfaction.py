@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import overload
-
 import jax
 from numpy.typing import ArrayLike
 
@@ -24,7 +22,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
 from jaxltl.core.values.undiscounted.acceptance import require_product
-from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction, sparse_satisfaction
+from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 
 
 @validated(games=True, method=("auto", "direct", "iterative"))
@@ -79,38 +77,6 @@ def satisfaction_probability(
     return solve(require_product(model), question, Accuracy(tolerance), throw=throw, method=named)
 
 
-@overload
-def optimal_satisfaction(
-    model: Product | Game,
-    formula: None = None,
-    *,
-    objective: str = "max",
-    nature: str | None = None,
-    environment: str | None = None,
-    tolerance: jax.Array | float | None = None,
-    relative: bool = False,
-    max_steps: jax.Array | int | None = None,
-    start: tuple[jax.Array, jax.Array] | None = None,
-    throw: bool = False,
-) -> Solution: ...
-
-
-@overload
-def optimal_satisfaction(
-    model: Model | IntervalMDP | Game,
-    formula: FormulaLike,
-    *,
-    objective: str = "max",
-    nature: str | None = None,
-    states: ArrayLike | None = None,
-    label_on: str | None = None,
-    environment: str | None = None,
-    tolerance: float | None = None,
-    relative: bool = False,
-    throw: bool = False,
-) -> Satisfaction: ...
-
-
 @validated(games=True)
 def optimal_satisfaction(
     model: Product | Model | IntervalMDP | Game,
@@ -126,7 +92,7 @@ def optimal_satisfaction(
     max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
     throw: bool = False,
-) -> Solution | Satisfaction:
+) -> Solution:
     """Maximal or minimal satisfaction probability of a product, or of a model and a formula.
 
     For Buchi and parity tasks, the probability of reaching an accepting end component, in which the
@@ -155,8 +121,10 @@ def optimal_satisfaction(
       max_steps, start: as there; of a product.
 
     Returns:
-      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` actions ``int32[S, Q]``.
-      With a formula, a :class:`Satisfaction`, a finite-memory policy of rows.
+      :class:`Solution`. Of a product, `value` is ``float[S, Q]`` and `policy` actions ``int32[S, Q]``.
+      With a formula, `value`, `lower` and `upper` are ``float64[I]``, one for each requested state;
+      `policy` is ``int32[N]``, the action in each of the N states of the reachable product, which
+      `product_policy` holds (see :func:`~jaxltl.project_policy`, which runs and saves it).
       Differentiable in a product's transition probabilities, with the optimal
       policy held fixed; not for sparse and interval models, which are solved on the host.
 
@@ -222,6 +190,4 @@ def optimal_satisfaction(
             label_on="entry" if label_on is None else label_on,
             tolerance=tolerance,
         )
-    if throw:
-        check(answer.solution)
-    return answer
+    return check(answer) if throw else answer

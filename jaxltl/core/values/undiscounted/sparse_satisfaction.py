@@ -8,20 +8,25 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core.automata.automaton import Automaton, letter_index, named_propositions
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import FormulaLike, to_automaton
-from jaxltl.core.deferred import Deferred, deferred_field
+from jaxltl.core.deferred import Deferred
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
 from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.accepting import AcceptingRegion, accepting_region
-from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
+from jaxltl.core.models.product_policy import ProductPolicy
+from jaxltl.core.sparse.product import (
+    SparseProduct,
+    product_without_memory,
+    sparse_product,
+)
 from jaxltl.core.sparse.solvers.reachability import avoidance, reachability
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance, as_width
 from jaxltl.core.types import Solution
@@ -38,74 +43,42 @@ from jaxltl.core.values.engine.host_solution import (
 from jaxltl.core.values.engine.row_form import row_form
 
 
-@brief
-class Satisfaction(NamedTuple):
-    """Optimal satisfaction probability, with a finite-memory policy.
-
-    Attributes:
-      solution: value, lower and upper are ``float64[I]``, one for each requested state, and the policy
-        ``int32[N]``, an action in each state of the product.
-      automaton: of the formula, over the letters that occur.
-      letter: ``int[S]``, the letter of each state.
-      product: the reachable product of the model and the automaton, N states.
-      row: ``int32[N]``, the policy's row of the model in each of them. Of a sparse model with up to
-        10^5 states of the product it is the fastest optimal policy, computed when it is first read.
-      value: ``float64[N]``, the probability in each of them.
-      label_on: the label that a step of the policy reads, of the state entered or left.
-
-    Example:
-      >>> import jaxltl as jl
-      >>> two_ways = jl.make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                        initial=[1, 0, 0], label={"a": [1]})
-      >>> found = jl.optimal_satisfaction(two_ways, "F a")
-      >>> found.solution.value.tolist(), found.row[found.product.start].tolist()
-      ([1.0], [0])
-    """
-
-    solution: Solution
-    automaton: Automaton
-    letter: np.ndarray
-    product: SparseProduct
-    row: np.ndarray
-    value: np.ndarray
-    label_on: str = "entry"
-
-
-Satisfaction.row = deferred_field(4, "Rows of the policy in each state.")  # type: ignore[assignment]
-
-
 def sparse_satisfaction(
     model: SparseMDP,
     formula: FormulaLike,
     *,
     objective: str = "max",
-    states: Array | None = None,
+    states: ArrayLike | None = None,
     label_on: str = "entry",
     tolerance: jax.Array | float | None = None,
-) -> Satisfaction:
+) -> Solution:
     """Optimal satisfaction probability on the reachable product, up to states with a verdict."""
     reduction_for(objective)
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     automaton, letter = automaton_and_letters(model, formula)
-    states = starting_states(model, states)
+    start, initial = weights_of_starts(model, states)
     reader = _LetterReader(automaton, letter, label_on == "entry")
-    product = _product(model, reader, states)
+    product = _product(model, reader, start)
     solution, row = _best(product, reader, objective, tolerance)
     chosen: Array = product.base_row[row]
     if not product.host.is_chain and product.host.num_states <= QUICK_LIMIT:
         problem = _problem(product, reader, objective)
         chosen = Deferred(lambda: product.base_row[_fastest(product, problem, row)])
     actions: Array = row_actions(model)[product.base_row[row]].astype(np.int32)
-    return Satisfaction(
-        replace(at_states(solution, product.start), policy=actions),
-        automaton,
-        letter,
-        product,
-        chosen,
-        np.asarray(solution.value),
-        label_on,
+    value = np.asarray(solution.value)
+    return replace(
+        at_states(solution, product.start),
+        policy=actions,
+        product_policy=ProductPolicy(automaton, letter, product, chosen, value, label_on),
+        initial=initial,
     )
+
+
+def weights_of_starts(model: Model, states: ArrayLike | None) -> tuple[np.ndarray, Array | None]:
+    """The requested states ``int64[I]`` and, if they are the initial ones, their distribution."""
+    start = starting_states(model, states)
+    return start, None if states is not None else np.asarray(model.initial)[start]
 
 
 def starting_states(model: Model, states: Array) -> np.ndarray:
@@ -187,10 +160,10 @@ class ReachabilityProblem(NamedTuple):
     visiting: AcceptingRegion | None  # of a formula that is not decided by a prefix
 
 
-def reachability_problem(result: Satisfaction, objective: str) -> ReachabilityProblem:
+def reachability_problem(policy: ProductPolicy, objective: str) -> ReachabilityProblem:
     """The reachability problem that a satisfaction probability was solved by."""
-    reader = _LetterReader(result.automaton, result.letter, result.label_on == "entry")
-    return _problem(result.product, reader, objective)
+    reader = _LetterReader(policy.automaton, policy.letter, policy.label_on == "entry")
+    return _problem(policy.product, reader, objective)
 
 
 def _problem(product: SparseProduct, reader: _LetterReader, objective: str) -> ReachabilityProblem:

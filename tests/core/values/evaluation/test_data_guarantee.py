@@ -61,7 +61,7 @@ def test_guarantees_hold(method, count):
             graph="given",
             method=method,
         )
-        true = optimal_satisfaction(model, task).solution.value[0]
+        true = optimal_satisfaction(model, task).value[0]
         own = under(model, found)
         failed += found.bound > own + 1e-9 or found.optimistic < true - 1e-9
         assert own <= true + 1e-9
@@ -72,16 +72,21 @@ def test_guarantees_hold(method, count):
 
 def under(model, found):
     """The true probability under the policy, whose memory is the automaton's state."""
-    product = found.satisfaction.product
+    product = found.satisfaction.product_policy.product
     points = make_interval(model, model.probability, model.probability)
-    whole = optimal_satisfaction(points, found.satisfaction.automaton, nature="cooperative")
-    np.testing.assert_array_equal(whole.product.base_state, product.base_state)
-    host = whole.product.host
-    taken = whole.product.base_row == np.asarray(found.satisfaction.row)[host.state]
+    whole = optimal_satisfaction(
+        points, found.satisfaction.product_policy.automaton, nature="cooperative"
+    )
+    np.testing.assert_array_equal(whole.product_policy.product.base_state, product.base_state)
+    host = whole.product_policy.product.host
+    taken = (
+        whole.product_policy.product.base_row
+        == np.asarray(found.satisfaction.product_policy.row)[host.state]
+    )
     rows = np.flatnonzero(taken)
     entries = np.isin(host.row, rows)
     state, memory = product.base_state, product.memory
-    letter = found.satisfaction.letter[state]
+    letter = found.satisfaction.product_policy.letter[state]
     chain = make_sparse(
         None,
         np.concatenate([[0], np.diff(host.entry_start)[rows].cumsum()]),
@@ -89,7 +94,7 @@ def under(model, found):
         host.probability[entries],
         initial=np.eye(state.size)[product.start[0]],
     )
-    automaton = found.satisfaction.automaton
+    automaton = found.satisfaction.product_policy.automaton
     if automaton.acceptance in ("buchi", "parity"):
         # Labels name the priorities that are read.
         level = np.asarray(automaton.priority)[memory, letter]
@@ -113,19 +118,19 @@ def under(model, found):
         label=label,
         propositions=names,
     )
-    return optimal_satisfaction(chain, task).solution.value[0]
+    return optimal_satisfaction(chain, task).value[0]
 
 
 def test_more_data_guarantee_more():
     rng = np.random.default_rng(5)
     model = labelled(np.random.default_rng(12))
-    true = optimal_satisfaction(model, "!b U a").solution.value[0]
+    true = optimal_satisfaction(model, "!b U a").value[0]
     counts = drawn(rng, model, 10**6)
     for method in METHODS:
         found = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", method=method)
         assert true - 0.02 < found.bound <= true <= found.optimistic < true + 0.02
     worst = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", objective="min")
-    least = optimal_satisfaction(model, "!b U a", objective="min").solution.value[0]
+    least = optimal_satisfaction(model, "!b U a", objective="min").value[0]
     assert worst.optimistic <= least + 1e-9
     assert least <= worst.bound < least + 0.02
 
@@ -154,7 +159,7 @@ def test_where_more_samples_help():
     for row, of in ((0, slice(0, 2)), (1, slice(2, 4))):
         lower, upper = sets.lower.copy(), sets.upper.copy()
         lower[of] = upper[of] = sets.center[of]
-        known = optimal_satisfaction(make_interval(model, lower, upper), "F a").solution.value[0]
+        known = optimal_satisfaction(make_interval(model, lower, upper), "F a").value[0]
         assert known - found.bound == pytest.approx(found.gain[row], rel=0.05)
 
 

@@ -74,10 +74,10 @@ def test_points_are_the_exact_model():
         np.testing.assert_array_equal(model.nominal.probability, given.probability)
         task = TASKS[i % len(TASKS)]
         for objective, nature in DIRECTIONS:
-            exact = optimal_satisfaction(given, task, objective=objective).solution
+            exact = optimal_satisfaction(given, task, objective=objective)
             found = optimal_satisfaction(
                 model, task, objective=objective, nature=nature_word(objective, nature)
-            ).solution
+            )
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value, exact.value, atol=2e-6)
 
@@ -90,14 +90,14 @@ def test_wider_intervals_give_nature_more():
         given = labelled(rng).nominal
         task = TASKS[i % len(TASKS)]
         for objective in ("max", "min"):
-            exact = optimal_satisfaction(given, task, objective=objective).solution
+            exact = optimal_satisfaction(given, task, objective=objective)
             low = high = exact.value
             for width in (0.05, 0.2, 1.0):
                 model = around(given, width)
                 least, most = (
                     optimal_satisfaction(
                         model, task, objective=objective, nature=nature_word(objective, nature)
-                    ).solution
+                    )
                     for nature in ("min", "max")
                 )
                 assert int(least.status) == int(most.status) == Status.CONVERGED
@@ -127,7 +127,7 @@ def test_products(label_on):
                 objective=objective,
                 nature=nature_word(objective, nature),
                 states=np.arange(4),
-            ).solution
+            )
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value[np.arange(4), start], alone.value, atol=2e-6)
 
@@ -323,7 +323,7 @@ def test_exact_games_have_values():
     for system, best in ((True, 0.5), (False, 0.25)):
         game = Game(coins, np.array([system] * 3))
         assert reachability_probability(game, "a").value[0] == pytest.approx(best)
-        found = optimal_satisfaction(game, "F G a", states=[0]).solution
+        found = optimal_satisfaction(game, "F G a", states=[0])
         assert found.value[0] == pytest.approx(best)
 
 

@@ -157,11 +157,11 @@ def test_one_objective_is_what_its_own_solver_finds(seed):
     for formula in ("G F a", "F G b", "a U b", "G (a -> F b)"):
         for direction in ("max", "min"):
             alone = multi_objective(model, [Objective(formula=formula, direction=direction)])
-            expected = optimal_satisfaction(model, formula, objective=direction).solution
+            expected = optimal_satisfaction(model, formula, objective=direction)
             assert alone.lower - 1e-6 <= expected.value[0] <= alone.upper + 1e-6
             assert alone.status == Status.CONVERGED
     both = achievable(model, [Objective(formula="G F a"), Objective(formula="G F !b")], [1.0, 1.0])
-    most = optimal_satisfaction(model, "G F a & G F !b").solution
+    most = optimal_satisfaction(model, "G F a & G F !b")
     assert both.holds == (most.lower[0] == 1)
     # How often both can be had is at least the sum less one, and one alone is no more.
     share = 0.5 * float(most.lower[0])

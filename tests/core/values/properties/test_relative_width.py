@@ -178,7 +178,7 @@ def answers(model, formula, objective):
     """The same probability by each solver, at each state of the model."""
     states = np.arange(model.num_states)
     options = {"objective": objective, "tolerance": TOLERANCE, "relative": True}
-    yield jl.optimal_satisfaction(model, formula, states=states, **options).solution
+    yield jl.optimal_satisfaction(model, formula, states=states, **options)
     product = jl.product(model, formula)
     found = jl.optimal_satisfaction(product, **options)
     at = states, np.asarray(product.initial_memory)

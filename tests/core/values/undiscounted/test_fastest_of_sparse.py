@@ -63,19 +63,20 @@ def test_policies_of_sparse_models_take_the_least_steps():
     with jax.enable_x64(True):
         for seed in range(8):
             sparse = to_sparse(random_world(seed))
-            require_fastest(jl.optimal_satisfaction(sparse, "!o U b"))
+            require_fastest(jl.optimal_satisfaction(sparse, "!o U b").product_policy)
             answer = solve_property(sparse, 'Pmax=? [ (F "b") & (!"o" U "b") ]')
             require_fastest(answer.strategy.memory)
             assert (answer.strategy.row == answer.strategy.memory.row).all()
             plain = solve_property(sparse, 'Pmax=? [ !"o" U "b" ]').strategy.row
-            found = jl.optimal_satisfaction(sparse, "!o U b", states=np.arange(sparse.num_states))
+            states = np.arange(sparse.num_states)
+            found = jl.optimal_satisfaction(sparse, "!o U b", states=states).product_policy
             live = found.value > 0
             steps = found.product.base_state
             assert (found.row == plain[steps])[live & (found.value < 1)].all()
 
 
 def test_deferred_rows_are_arrays_and_can_be_pickled():
-    found = jl.optimal_satisfaction(to_sparse(random_world(0)), "!o U b")
+    found = jl.optimal_satisfaction(to_sparse(random_world(0)), "!o U b").product_policy
     again = pickle.loads(pickle.dumps(found))
     assert isinstance(found.row, np.ndarray) and (again.row == found.row).all()
 

@@ -1,15 +1,15 @@
 """Formulas on sparse models: against the padded engine, and the chain of the strategy."""
 
+import jax
 import numpy as np
 import pytest
 
+from jaxltl.core.models.construct.lifting import project_policy
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.product import product
+from jaxltl.core.models.product_policy import ProductPolicy
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
-from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    Satisfaction,
-)
 
 FORMULAS = (
     "F (a & X F b)",
@@ -54,7 +54,7 @@ def random_sparse(seed: int, num_states: int = 6, most_rows: int = 3) -> SparseM
     )
 
 
-def chain_of(model: SparseMDP, found: Satisfaction) -> SparseMDP:
+def chain_of(model: SparseMDP, found: ProductPolicy) -> SparseMDP:
     """The Markov chain that the strategy makes, with the labels of the model's states."""
     mdp, n = found.product.host, found.product.base_state.size
     # The row that the product has for the model's row, by its rank among the state's choices.
@@ -86,10 +86,9 @@ def test_values_are_those_of_the_padded_product(formula):
             wanted = optimal_satisfaction(lazy, objective=objective)
             at = states, np.asarray(lazy.initial_memory)
             for label_on in ("entry", "exit"):
-                found = optimal_satisfaction(
+                solution = optimal_satisfaction(
                     model, formula, objective=objective, states=states, label_on=label_on
                 )
-                solution = found.solution
                 assert (solution.lower <= solution.value).all()
                 assert (solution.value <= solution.upper).all()
                 assert (solution.upper - solution.lower <= 1e-6).all()
@@ -103,9 +102,10 @@ def test_strategies_attain_what_they_are_said_to(formula):
         model = random_sparse(seed)
         for objective in ("max", "min"):
             found = optimal_satisfaction(model, formula, objective=objective)
-            chain = chain_of(model, found)
-            attained = optimal_satisfaction(chain, formula, states=found.product.start).solution
-            np.testing.assert_allclose(attained.value, found.solution.value, atol=1e-6)
+            chain = chain_of(model, found.product_policy)
+            start = found.product_policy.product.start
+            attained = optimal_satisfaction(chain, formula, states=start)
+            np.testing.assert_allclose(attained.value, found.value, atol=1e-6)
 
 
 def test_bad_arguments_are_named():
@@ -128,3 +128,20 @@ def test_options_of_other_models_are_refused():
             optimal_satisfaction(product(model, "F a"), **option)
     with pytest.raises(ValueError, match="is no product of a world and a task"):
         optimal_satisfaction(model)
+
+
+def test_answers_of_a_formula_are_solutions():
+    model = random_sparse(0)
+    start = np.flatnonzero(np.asarray(model.initial) > 0)
+    best = optimal_satisfaction(model, "F a & G !c")
+    padded = optimal_satisfaction(product(to_padded(model), "F a & G !c"))
+    np.testing.assert_allclose(best.at_initial.value, padded.at_initial.value, atol=1e-5)
+    assert best.at_initial.lower <= best.at_initial.value <= best.at_initial.upper
+    # The policy is a static field, which jit and tree functions keep.
+    again = jax.jit(lambda solution: jax.tree.map(lambda x: x + 0, solution))(best)
+    assert again.product_policy is best.product_policy
+    assert project_policy(model, best).action.shape[0] == model.num_states
+    chosen = optimal_satisfaction(model, "F a & G !c", states=start)
+    np.testing.assert_array_equal(chosen.value, best.value)
+    with pytest.raises(ValueError, match="initial"):
+        _ = chosen.at_initial
