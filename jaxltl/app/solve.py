@@ -21,7 +21,7 @@ from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
-from jaxltl.core.models import Game, IntervalMDP, SparseMDP
+from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
@@ -146,11 +146,11 @@ def _read_source(
 
 def load(
     path: Path, program: Program | None = None, max_states: int | None = None
-) -> SparseMDP | IntervalMDP:
-    """A Markov chain or decision process, or an interval one, from a model file or a program."""
+) -> SparseMDP | IntervalMDP | POMDP:
+    """A chain, a decision process, an interval model or a POMDP, from a model file or a program."""
     from jaxltl.io.model_files import read_model
 
-    model: Model
+    model: Model | POMDP
     if program is None:
         model = read_model(path, max_states=max_states)
     else:
@@ -168,7 +168,7 @@ def load(
             f"{str(path)!r} is a game; properties of chains and decision processes "
             "are solved, games by `jaxltl synthesize`."
         )
-    if not isinstance(model, SparseMDP | IntervalMDP):
+    if not isinstance(model, SparseMDP | IntervalMDP | POMDP):
         raise ValueError(
             f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
             "decision processes are solved."
@@ -191,7 +191,7 @@ class _ProgressPrinter:
 
 
 def solve(
-    model: SparseMDP | IntervalMDP | Program,
+    model: SparseMDP | IntervalMDP | POMDP | Program,
     queries: Sequence[PropertyQuery],
     tolerance: float,
     max_states: int | None = None,
@@ -245,9 +245,11 @@ def answers(
 # --- output -----------------------------------------------------------------------------------
 
 
-def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
+def model_entry(model: SparseMDP | IntervalMDP | POMDP, seconds: float) -> Record:
     """The model as its JSON object."""
     kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
+    if isinstance(model, POMDP):
+        model, kinds = model.fully_observable, ("pomdp", "pomdp")
     return {
         "kind": kinds[not model.is_chain],
         "states": model.num_states,
@@ -331,9 +333,13 @@ def text(result: PropertyResult) -> str:
 
 
 def strategies(
-    model: SparseMDP | IntervalMDP, results: Sequence[PropertyResult], source: Path
+    model: SparseMDP | IntervalMDP | POMDP, results: Sequence[PropertyResult], source: Path
 ) -> bytes:
     """The optimal strategies as JSON; see docs/solve.md."""
+    if isinstance(model, POMDP):
+        raise ValueError(
+            "--strategy is for models whose states are seen; save the policy of solve_property's answer."
+        )
     entries = [
         {"property": r.query.text, **_strategy(model, r.answer.strategy)}
         for r in results

@@ -248,6 +248,13 @@ def unsupported_model(model: object) -> str:
             "make_game(to_padded(game.mdp), game.system), or give game.mdp, whose actions are all "
             "one player's."
         )
+    if hasattr(model, "fully_observable"):
+        return (
+            "the model is a POMDP, and the answer would be for policies that see its states; ask for "
+            "reachability_probability, total_reward, optimal_satisfaction or solve_property of the "
+            "POMDP, or give its fully observable model, pomdp.fully_observable, whose maximum is an "
+            "upper bound and whose minimum is a lower bound."
+        )
     if hasattr(model, "nominal"):
         return (
             f"{name} has intervals for its probabilities, which are not supported here; use a "

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
+from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
 from jaxltl.io.files import decompressed, opened, suffix_of
 from jaxltl.io.drn.drn import read_drn, write_drn
@@ -43,7 +43,7 @@ def read_model(
     constants: Constants = None,
     max_states: int | None = None,
     coalition: Sequence[str] | None = None,
-) -> SparseMDP | IntervalMDP | Game:
+) -> SparseMDP | IntervalMDP | Game | POMDP:
     """Model of a file, with the format detected by suffix or contents.
 
     Formats: programs in the PRISM language (``.prism``, ``.pm``, ``.nm``, ``.sm``, ``.smg``), UMB
@@ -58,7 +58,7 @@ def read_model(
         two players.
 
     Returns:
-      A SparseMDP, a Game over one, or an IntervalMDP.
+      A SparseMDP, a Game or a POMDP over one, or an IntervalMDP.
 
     Raises:
       ValueError: with file and place, for unknown formats and missing or malformed files.

@@ -16,27 +16,28 @@ from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models import MDP, DenseMDP, Game, SparseMDP, sample_successor, to_padded
 from jaxltl.core.models.construct.padded import pad_rows
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.sparse import Rewards, choice_reward
 
 
 def model_environment(
-    model: MDP | DenseMDP | SparseMDP | Game,
+    model: MDP | DenseMDP | SparseMDP | Game | POMDP,
     *,
     reward: ArrayLike | Rewards | str | None = None,
     observe: PyTree = None,
     opponent: ArrayLike | None = None,
 ) -> Environment:
-    """The simulated environment of a finite MDP, or of a game against a given opponent.
+    """The simulated environment of a finite MDP or POMDP, or of a game against a given opponent.
 
     States ``int32[]``, labels and available actions are the model's. Episodes have no end. In a game
     each move is a step, and on the opponent's turn its policy replaces the action.
 
     Args:
-      model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
+      model: an MDP, a DenseMDP, a SparseMDP, which is padded, a Game on one of them, or a POMDP.
       reward: ``float[S, A]``, of the action, or ``float[S]``, of the state in which it is taken, as for
         all solvers; of a sparse model also what
         :func:`~jaxltl.core.models.sparse.choice_reward` takes or returns, ``float[R]``. Default: zero.
-      observe: ``state -> observation``; default: one-hot.
+      observe: ``state -> observation``; default: one-hot, of a POMDP the observation's number.
       opponent: ``float[S, A]``, the policy of the game's environment; default: uniform.
 
     Returns:
@@ -52,6 +53,13 @@ def model_environment(
     >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
     (1, (2,), [True])
     """
+    observations = None
+    if isinstance(model, POMDP):
+        seen = np.asarray(model.observation)
+        observations = None if observe is not None else make_box(0, 1, (model.num_observations,))
+        if observe is None:
+            observe = Partial(_one_hot_observation, jnp.zeros(model.num_observations), seen)
+        model = model.fully_observable
     owner = model.system if isinstance(model, Game) else None
     model = model.mdp if isinstance(model, Game) else model
     if isinstance(model, SparseMDP):
@@ -67,6 +75,8 @@ def model_environment(
             "give the task to task_environment."
         )
     size, num_actions = model.num_states, model.num_actions
+    if observe is None:
+        observations = make_box(0, 1, (size,))
     table = np.zeros(size) if reward is None else np.asarray(reward)
     if table.shape not in ((size,), (size, num_actions)) or table.dtype.kind not in "biuf":
         raise ValueError(
@@ -89,7 +99,7 @@ def model_environment(
         labels=Partial(_row, model.label),
         propositions=model.propositions,
         allowed=Partial(_row, model.available),
-        observations=make_box(0, 1, (size,)) if observe is None else None,
+        observations=observations,
         starts=Partial(_starts, model.initial),
         outcomes=outcomes,
     )
@@ -170,6 +180,10 @@ def _outcomes_of_two(
 
 def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:
     return jax.nn.one_hot(state, len(initial))
+
+
+def _one_hot_observation(like: jax.Array, seen: jax.Array, state: jax.Array) -> jax.Array:
+    return jax.nn.one_hot(jnp.asarray(seen)[state], len(like))
 
 
 def _row(table: jax.Array, state: jax.Array) -> jax.Array:

@@ -37,24 +37,24 @@ _MAX_NESTING = 60  # of parentheses and prefixes, at most 10 frames of Python ea
 _KINDS: dict[str, Kind] = {
     **dict.fromkeys(("dtmc", "probabilistic"), "dtmc"),
     **dict.fromkeys(("mdp", "nondeterministic"), "mdp"),
+    "pomdp": "pomdp",
     "smg": "smg",
 }
 _REFUSED = {
     **dict.fromkeys(("ctmc", "stochastic"), "continuous-time Markov chains"),
     "ma": "Markov automata",
     "pta": "probabilistic timed automata",
-    **dict.fromkeys(("pomdp", "popta"), "partially observable models"),
+    "popta": "partially observable timed automata",
     "csg": "concurrent games",
     **dict.fromkeys(("tptg", "tsg"), "timed games"),
     "system": "system ... endsystem blocks (modules are composed in parallel over all actions)",
-    **dict.fromkeys(("observables", "observable"), "observables of partially observable models"),
     "invariant": "invariants of timed automata",
 }
 _RESERVED = frozenset(_KINDS) | {
     *("bool", "clock", "const", "double", "endinit", "endinvariant", "endmodule", "endrewards"),
     *("endplayer", "endsystem", "false", "formula", "global", "init", "int", "label", "max", "min"),
     *("module", "player", "prob", "rate", "rewards", "true", "ctmc", "stochastic", "func"),
-    *("pta", "pomdp", "popta", "csg", "invariant", "observables", "observable", "system"),
+    *("pta", "popta", "csg", "invariant", "observables", "endobservables", "observable", "system"),
 }
 # Binary operators by precedence, the tightest last; operators of one level associate to the left.
 _LEVELS = {
@@ -281,7 +281,7 @@ def parse_program(text: str, name: str = "model") -> Syntax:
     """The syntax tree of a program in the PRISM language.
 
     Raises ValueError with file, line and column: a syntax error, or a feature that is not supported
-    (continuous time, clocks, partial observability, concurrent games, ``system`` blocks, unbounded
+    (continuous time, clocks, concurrent games, ``system`` blocks, unbounded
     integers).
 
     >>> parse_program("mdp module m x : [0..1]; [a] x=0 -> (x'=1); endmodule").kind
@@ -313,14 +313,16 @@ class _ProgramParser(ExpressionParser):
             "rewards": self.reward_structure,
             "init": self.initial_block,
             "player": self.player,
+            "observables": self.observable_variables,
+            "observable": self.observable,
         }
         while self.kinds[self.at] != "end":
             self.refuse(*_REFUSED)
             text = self.texts[self.at]
             if text not in readers:
                 self.fail(
-                    "the type of the model (dtmc, mdp, smg), const, formula, label, global, "
-                    "module, rewards, init or player"
+                    "the type of the model (dtmc, mdp, pomdp, smg), const, formula, label, global, "
+                    "module, rewards, init, player, observables or observable"
                 )
             if text not in ("rate", "prob"):
                 self.at += 1
@@ -385,6 +387,19 @@ class _ProgramParser(ExpressionParser):
         if name in ("init", "deadlock") or not name:
             raise LanguageError(place, f'the label "{name}" is built in; choose another name.')
         self.syntax.labels.append((name, self.defined("label")))
+
+    def observable_variables(self) -> None:
+        def named() -> tuple[str, Expression]:
+            name, place = self.name("the name of a variable")
+            return name, Expression("name", value=name, place=place)
+
+        if not self.accept("endobservables"):
+            self.syntax.observables += self.separated(named)
+            self.expect("endobservables", " or ','")
+
+    def observable(self) -> None:
+        name = self.quoted("the name of an observable in double quotes")
+        self.syntax.observables.append((name, self.defined("observable")))
 
     def global_variable(self) -> None:
         self.syntax.variables.append(self.declaration())

@@ -137,6 +137,9 @@ class _Resolver:
         variables = [self.variable(changed(d, both), None) for d in syntax.variables]
         variables += [self.variable(d, i) for i, m in enumerate(modules) for d in m.declarations]
         rewards = changed(_numbered(syntax.rewards), both)
+        _check_distinct(
+            [(name, e.place) for name, e in syntax.observables], "{} is observable twice."
+        )
         used: set[str] = set()
         for e in (
             *(e for m in modules for c in m.commands for e in c.expressions),
@@ -156,6 +159,7 @@ class _Resolver:
             rewards,
             None if syntax.initial is None else both(syntax.initial),
             tuple(syntax.players),
+            {name: both(e) for name, e in syntax.observables},
         )
         _Checker(program, undefined).check()
         return program
@@ -379,7 +383,21 @@ class _Checker:
             self.number(item.value, "a reward")
         if program.initial is not None:
             self.boolean(program.initial, "the init block")
+        self.observables()
         self.players(set(uses))
+
+    def observables(self) -> None:
+        program = self.program
+        if program.kind == "pomdp" and not program.observables:
+            raise LanguageError(
+                0, "the pomdp has no observables; give observables ... endobservables, or an mdp."
+            )
+        for name, e in program.observables.items():
+            if program.kind != "pomdp":
+                raise LanguageError(e.place, f"{name} is observable; only a pomdp has observables.")
+            self.type(e, self.types)
+        if program.kind == "pomdp" and program.has_intervals:
+            raise LanguageError(0, "a pomdp with intervals of probabilities is not supported.")
 
     def players(self, actions: set[str]) -> None:
         program = self.program

@@ -8,7 +8,7 @@ from typing import Literal
 
 from jaxltl.core.language.expressions import Expression, Source, Type, Value, names_in
 
-Kind = Literal["dtmc", "mdp", "smg"]
+Kind = Literal["dtmc", "mdp", "pomdp", "smg"]
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,7 @@ class Syntax:
     rewards: list[RewardStructure] = field(default_factory=list)
     initial: Expression | None = None
     players: list[Player] = field(default_factory=list)
+    observables: list[tuple[str, Expression]] = field(default_factory=list)
 
 
 # --- after resolution -------------------------------------------------------------------------
@@ -171,7 +172,7 @@ class Program:
 
     Attributes:
       source: the text, for errors: ``source.located(LanguageError(place, message))``.
-      kind: ``"dtmc"``, ``"mdp"`` or ``"smg"``.
+      kind: ``"dtmc"``, ``"mdp"``, ``"pomdp"`` or ``"smg"``.
       constants: the value of each constant that has one.
       parameters: constants of type double without a value.
       formulas: the substituted expression of each formula.
@@ -181,6 +182,7 @@ class Program:
       rewards: the reward structures.
       initial: the condition of the ``init`` block, or None.
       players: the players of an smg.
+      observables: the expression of each observable of a pomdp.
       syntax, arguments: the syntax tree, and the values that were given for its constants.
 
     Example:
@@ -202,6 +204,7 @@ class Program:
     rewards: tuple[RewardStructure, ...]
     initial: Expression | None
     players: tuple[Player, ...]
+    observables: dict[str, Expression] = field(default_factory=dict)
     syntax: Syntax | None = field(default=None, compare=False, repr=False)
     arguments: Mapping[str, object] = field(default_factory=dict, compare=False, repr=False)
 

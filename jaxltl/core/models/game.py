@@ -84,6 +84,8 @@ def make_game(model: Arena, system: Sequence[bool] | chex.Array) -> Game[Arena]:
       >>> make_game(from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False]).system.tolist()
       [True, False]
     """
+    if not hasattr(model, "state_shape"):
+        raise ValueError(validation.unsupported_model(model))
     owner = _owners(system, model.state_shape)
     if isinstance(base := base_model(model), MDP | DenseMDP) and not is_traced(base):
         support(base)  # refuses probabilities that underflow

@@ -198,6 +198,8 @@ def product(
       (2, 2)
     """
     validation.choice("label_on", label_on, ("entry", "exit"))
+    if hasattr(world, "fully_observable"):
+        raise ValueError(validation.unsupported_model(world))
     if isinstance(world, Game):
         model = product(world.mdp, formula, label_on=label_on)
         xp, system = namespace(world.system)

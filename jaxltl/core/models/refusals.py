@@ -8,6 +8,7 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
+from jaxltl.core import validation
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product
 
@@ -35,8 +36,10 @@ _OTHERWISE = (
 
 
 def refuse_game(function: str, arguments: Iterable[tuple[str, object]]) -> None:
-    """Raises ValueError if an argument is a game, with what to ask instead."""
+    """Raises ValueError if an argument is a game or a POMDP, with what to ask instead."""
     for name, value in arguments:
+        if hasattr(value, "fully_observable"):
+            raise ValueError(f"{function}: {validation.unsupported_model(value)}")
         if not isinstance(value, Game | Product):
             continue
         if isinstance(value, Game) or isinstance(value.mdp, Game):

@@ -189,6 +189,8 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
       >>> choice_reward(model, Rewards(state=[1, 0, 0], transition=[4, 0, 0, 0])).tolist()
       [3.0, 0.0, 0.0]
     """
+    if not isinstance(model, SparseMDP):
+        raise ValueError(validation.unsupported_model(model))
     reward = reward_structure(model, reward)
     if is_traced((model, reward)):
         return cast(np.ndarray, _traced_reward(model, reward))

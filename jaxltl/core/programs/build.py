@@ -18,6 +18,7 @@ from jaxltl.core.language.syntax import Program, RewardItem
 from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
+from jaxltl.core.models.pomdp import POMDP, make_pomdp, observation_numbers
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.exact import rational_numbers
 from jaxltl.core.programs.explore import Explored, Progress, RewardParts, BreadthFirstSearch
@@ -42,7 +43,7 @@ def build_model(
     coalition: Sequence[str] | None = None,
     max_states: int = MAX_STATES,
     progress: Progress | None = None,
-) -> SparseMDP | IntervalMDP | Game:
+) -> SparseMDP | IntervalMDP | Game | POMDP:
     """The model of a program, with all reachable states.
 
     The initial states come first. Deadlocks get a self-loop, with a warning. In a ``dtmc`` each of
@@ -56,12 +57,12 @@ def build_model(
       progress: is called with the numbers of states that are found and expanded.
 
     Returns:
-      A SparseMDP; an IntervalMDP if some probability is an interval; a Game of an smg.
+      A SparseMDP; an IntervalMDP if some probability is an interval; a Game of an smg; a POMDP of a pomdp.
 
     Raises:
       ValueError: too many states, parameters, an update that leaves the range of a variable or is
-        no distribution, a state of a game with choices of two players, or a game of three players
-        without a coalition.
+        no distribution, a state of a game with choices of two players, a game of three players
+        without a coalition, or states of equal observation with different actions.
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
@@ -87,7 +88,11 @@ def build_model(
         model: SparseMDP | IntervalMDP = make(*starts, *ends, rewards=rewards, **rows.annotations)
         if isinstance(model, SparseMDP) and rows.owner is None:
             source = NumberSource(partial(rational_numbers, program, build_rows))
-            return replace(model, numbers=source)
+            model = replace(model, numbers=source)
+            if rows.observables:
+                number, values = observation_numbers(rows.observables)
+                return make_pomdp(model, number, observables=values)
+            return model
         if rows.owner is None:
             return model
         return make_game(model, np.isin(rows.owner, _players(program, coalition)))
@@ -130,6 +135,7 @@ def _rows(program: Program, explored: Explored, weights: Numbers) -> ProgramRows
         _warn(program, f"several commands are enabled {several}; each has the same probability.")
         explored = as_chain(explored, weights)
     label = _label_columns(program, explored, deadlock)
+    observed = on_states(explored.layout, explored.words, list(program.observables.values()))
     annotations = {
         "initial": explored.initial,
         "label": np.stack(list(label.values()), 1) if label else np.zeros((size, 0), bool),
@@ -149,6 +155,7 @@ def _rows(program: Program, explored: Explored, weights: Numbers) -> ProgramRows
         explored.rewards,
         tuple(weights.expressions) if isinstance(weights, Functions) else (),
         owner,
+        dict(zip(program.observables, observed, strict=True)),
     )
 
 

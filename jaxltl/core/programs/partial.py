@@ -105,9 +105,9 @@ def solve_program(
     validation.choice("method", method, ("build", "partial"))
     tolerance = requested_width(tolerance)
     max_states = validation.integer("max_states", max_states, least=1, limit=2**31 - 2)
-    if program.kind == "smg" or program.has_intervals or program.parameters:
+    if program.kind in ("pomdp", "smg") or program.has_intervals or program.parameters:
         raise ValueError(
-            f"{program.source.name!r}: games and programs with intervals or parameters are not "
+            f"{program.source.name!r}: games, pomdps and programs with intervals or parameters are not "
             "explored in part; build the model."
         )
     try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.language.expressions import Expression
@@ -26,3 +28,4 @@ class ProgramRows:
     rewards: dict[str, RewardParts]
     functions: tuple[Expression, ...]  # of a program with parameters, expressions by number
     owner: Integers | None  # int32[S], the number of the player of each state of a game
+    observables: dict[str, NDArray[Any]] = field(default_factory=dict)  # [S] each, of a pomdp

@@ -249,8 +249,9 @@ def _require_name(program: Program, kind: str, name: str, known: Iterable[str]) 
 
 def _require_simulated(program: Program) -> None:
     """Raises ValueError for what has no simulation."""
-    if program.kind == "smg":
-        text = "an smg is not simulated; build the model, for model_environment."
+    if program.kind in ("pomdp", "smg"):
+        article = "an" if program.kind == "smg" else "a"
+        text = f"{article} {program.kind} is not simulated; build the model, for model_environment."
     elif program.has_intervals:
         text = "a program with intervals of probabilities is not simulated; give numbers."
     elif program.parameters:

@@ -199,8 +199,8 @@ def _of_program(
     name = repr(program.source.name)
     if not program.parameters:
         raise ValueError(f"{name}: every constant has a value, so there is no parameter.")
-    if program.kind == "smg" or program.has_intervals:
-        raise ValueError(f"{name}: games and intervals with parameters are not supported.")
+    if program.kind in ("pomdp", "smg") or program.has_intervals:
+        raise ValueError(f"{name}: games, pomdps and intervals with parameters are not supported.")
     rows = build_rows(program, max_states=MAX_STATES if max_states is None else max_states)
     reader = _RationalFunctions(program.parameters)
     functions = []

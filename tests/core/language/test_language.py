@@ -151,7 +151,7 @@ M = "module m x : [0..1]; [] true -> true; endmodule"
     [
         ("ctmc " + M, (1, 1), "continuous-time Markov chains"),
         ("pta\n" + M, (1, 1), "timed automata"),
-        ("pomdp " + M, (1, 1), "partially observable"),
+        ("popta " + M, (1, 1), "partially observable timed"),
         ("csg " + M, (1, 1), "concurrent games"),
         (M + "\n system m endsystem", (2, 2), "system"),
         ("mdp module m x : int; endmodule", (1, 18), "unbounded"),

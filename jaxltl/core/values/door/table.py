@@ -216,6 +216,11 @@ def engine_for(kind: ModelKind, question: Question, selected: dict[str, PyTree])
             if host and kind.arrays == "traced"
             else f"it answers {known or 'none of these questions'}"
         )
+        if kind.is_partial:
+            remedy += (
+                "; or ask of its fully observable model, pomdp.fully_observable, whose maximum is an upper "
+                "bound and whose minimum a lower bound"
+            )
         raise ValueError(f"{NAMES[path]} has no answer for {kind}; {remedy}.")
     engine = row[kind.column]
     word = selected.get("method")

@@ -9,6 +9,7 @@ from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.values.engine.row_form import row_form
@@ -18,10 +19,12 @@ CheckableModel = SparseMDP | IntervalMDP | Game
 _OTHER = {"max": "min", "min": "max"}
 
 
-def checkable(model: Model) -> CheckableModel:
+def checkable(model: Model | POMDP) -> CheckableModel:
     """Any concrete model with flat states, as sparse rows or intervals or a game on these."""
     if isinstance(model, SparseMDP | IntervalMDP):
         return model
+    if isinstance(model, POMDP):
+        raise ValueError(validation.unsupported_model(model))
     form = row_form(model)
     inner = form.sparse if form.interval is None else form.interval
     return inner if form.system is None else Game(inner, to_jax(form.system))

@@ -20,6 +20,7 @@ from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS
 from jaxltl.core.models.action_numbers import rows_of_policy
 from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, SparseMDP
 from jaxltl.core.sparse.exact.model import double_bounds
@@ -82,7 +83,7 @@ class _Result(NamedTuple):
 
 @validated(games=True, host=True)
 def solve_property(
-    model: Model,
+    model: Model | POMDP,
     prop: Property | str,
     *,
     states: ArrayLike | None = None,
