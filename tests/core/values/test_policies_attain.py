@@ -24,7 +24,7 @@ def test_policies_attain_the_optimum(kind, seed):
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     case = reference.random_case(rng, 4)
     subject = Subject(kind, case)
-    natures, missed = (None, "cooperative") if subject.has_intervals else (None,), []
+    natures = (None, "cooperative") if subject.has_intervals else (None,)
     for name, ask in ASKS.items():
         for objective in ("max", "min"):
             for nature in natures:
@@ -33,15 +33,8 @@ def test_policies_attain_the_optimum(kind, seed):
                 again = ask(subject, policy=best.policy, **aims)
                 low, high = np.asarray(again.lower), np.asarray(again.upper)
                 slack = 1e-8 * np.where(np.isfinite(best.upper), 1 + np.abs(best.upper), 1)
-                attained = (low <= best.upper + slack).all() and (high >= best.lower - slack).all()
-                if not attained and kind[1] and nature is not None:
-                    missed.append((name, objective))
-                    continue
-                assert attained, (name, aims)
-    if missed:
-        pytest.xfail(
-            f"a known gap of games with cooperative nature, decided by the graph: {missed}"
-        )
+                assert (low <= best.upper + slack).all(), (name, aims)
+                assert (high >= best.lower - slack).all(), (name, aims)
 
 
 def waiting(*, intervals: bool, system: bool | None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +40,13 @@ from jaxltl.core.values.engine.state_quantities import (
     nonnegative_reward,
     transition_reward,
 )
-from jaxltl.core.values.interval.sides import TOLERANCE, Sides, directions, sides_of
+from jaxltl.core.values.interval.sides import (
+    TOLERANCE,
+    Sides,
+    directions,
+    pure_rows,
+    sides_of,
+)
 
 # --- one player, known probabilities --------------------------------------------------------------
 
@@ -104,13 +111,14 @@ def reach_with_nature(model: Model, question: Question, accuracy: Accuracy) -> S
     """
     path, form = question.path, row_form(model)
     assert isinstance(path, Reach | Until)
-    requested, sides = accuracy.width(TOLERANCE), _sides(form, question)
-    target = sides.states(form.states("target", path.target))
-    stay = None
-    if isinstance(path, Until):
-        stay = sides.states(form.states("stay", path.stay)) | sides.added
-    values = reachability(sides.host, target, sides.query(requested), stay=stay)
-    return robust_solution(form, sides, values, question, requested)
+    requested, target = accuracy.width(TOLERANCE), form.states("target", path.target)
+    inside = form.states("stay", path.stay) if isinstance(path, Until) else None
+
+    def reach(sides: Sides) -> RobustValues:
+        stay = None if inside is None else sides.states(inside) | sides.added
+        return reachability(sides.host, sides.states(target), sides.query(requested), stay=stay)
+
+    return robust_solution(form, question, reach, requested)
 
 
 def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
@@ -119,12 +127,14 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
     assert isinstance(path, TotalReward)
     if path.target is None:
         raise ValueError("total rewards of games and interval models need a target; give one.")
-    requested, sides = accuracy.width(TOLERANCE), _sides(form, question)
-    target = sides.states(form.states("target", path.target))
+    requested, target = accuracy.width(TOLERANCE), form.states("target", path.target)
     reward = certain_reward(form, path.reward)
-    earned = np.where(sides.choosing, 0, reward[sides.encoded.row])
-    values = total_reward(sides.host, earned, target, sides.query(requested))
-    return robust_solution(form, sides, values, question, requested, relative=True)
+
+    def earn(sides: Sides) -> RobustValues:
+        earned = np.where(sides.choosing, 0, reward[sides.encoded.row])
+        return total_reward(sides.host, earned, sides.states(target), sides.query(requested))
+
+    return robust_solution(form, question, earn, requested, relative=True)
 
 
 def discount_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:
@@ -135,20 +145,19 @@ def discount_with_nature(model: Model, question: Question, accuracy: Accuracy) -
     """
     path, form = question.path, row_form(model)
     assert isinstance(path, DiscountedReward)
-    sides, structure, factor = (
-        _sides(form, question),
-        form.reward(path.reward),
-        float(path.discount),
-    )
-    entry = sides.encoded.entry
-    earned = np.where(entry < 0, 0, transition_reward(form.sparse, structure)[entry])
-    largest = float(np.abs(earned).max(initial=0)) / (1 - factor)
+    structure, factor = form.reward(path.reward), float(path.discount)
+    reward = transition_reward(form.sparse, structure)
+    largest = float(np.abs(reward).max(initial=0)) / (1 - factor)
     requested = accuracy.width(1e-8 * max(largest, 1e-300))
-    factors = np.where(sides.choosing, 1.0, factor)
-    values = interval_discounted.discounted_value(
-        interval_discounted.DiscountedModel(sides.host, earned, factors), sides.query(requested)
-    )
-    solution = robust_solution(form, sides, values, question, requested)
+
+    def discounted_by(sides: Sides) -> RobustValues:
+        entry = sides.encoded.entry
+        earned = np.where(entry < 0, 0, reward[entry])
+        factors = np.where(sides.choosing, 1.0, factor)
+        part = interval_discounted.DiscountedModel(sides.host, earned, factors)
+        return interval_discounted.discounted_value(part, sides.query(requested))
+
+    solution = robust_solution(form, question, discounted_by, requested)
     return _within(solution, discounted_span(structure, factor), requested)
 
 
@@ -158,12 +167,6 @@ def _within(solution: Solution, span: Span, requested: float) -> Solution:
     ends = np.asarray(solution.lower), np.asarray(solution.upper)
     status = status_between(*ends, float(requested), relative=False)
     return replace(solution, status=np.int32(status))  # type: ignore[arg-type]
-
-
-def _sides(form: RowForm, question: Question) -> Sides:
-    weights = None if question.policy is None else form.weights(question.policy)
-    aims = directions(question.objective, question.nature, question.environment)
-    return sides_of(form.uncertain.host, form.system, aims, weights)
 
 
 def certain_reward(form: RowForm, reward: Reward) -> Floats:
@@ -187,25 +190,32 @@ def certain_reward(form: RowForm, reward: Reward) -> Floats:
 
 def robust_solution(
     form: RowForm,
-    sides: Sides,
-    values: RobustValues,
     question: Question,
+    solve: Callable[[Sides], RobustValues],
     tolerance: float,
     *,
     relative: bool = False,
 ) -> Solution:
-    """The solution of certified values of policy and nature."""
-    encoded, size = sides.encoded, form.sparse.num_states
+    """The solution of certified values of policy and nature, of the sides of a question."""
+    weights = None if question.policy is None else form.weights(question.policy)
+    aims = directions(question.objective, question.nature, question.environment)
+    host, system = form.uncertain.host, form.system
+    sides = sides_of(host, system, aims, weights)
+    values, encoded, size = solve(sides), sides.encoded, form.sparse.num_states
+    probability = encoded.nature(values.probability, form.host.probability)
     ends = [x[:size] for x in (values.value, values.lower, values.upper)]
     parts: dict[str, Array] = dict(
         zip(("value", "lower", "upper"), (x.reshape(form.shape) for x in ends), strict=True)
     )
     if question.policy is None:
-        parts["policy"] = form.actions(encoded.policy(values.row, values.probability))
+        row = encoded.policy(values.row, values.probability)
+        if system is not None and aims.system == aims.nature and sides.is_mixed(values.probability):
+            row = pure_rows(host, system, aims, probability, solve)
+        parts["policy"] = form.actions(row)
     else:
         parts["policy"] = np.asarray(question.policy)
     if form.interval is not None:
-        parts["nature"] = encoded.nature(values.probability, form.host.probability)
+        parts["nature"] = probability
     status = status_between(ends[1], ends[2], float(tolerance), relative=relative)
     parts["residual"] = np.float64(values.residual)
     parts |= {"num_steps": np.int32(values.rounds), "status": np.int32(status)}

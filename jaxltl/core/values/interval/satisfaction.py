@@ -32,8 +32,10 @@ from jaxltl.core.values.engine.host_solution import status_between, with_given_p
 from jaxltl.core.values.engine.row_form import row_form
 from jaxltl.core.values.interval.sides import (
     TOLERANCE,
+    PlayerAims,
     Sides,
     directions,
+    pure_rows,
     requested_width,
     sides_of,
 )
@@ -76,7 +78,7 @@ def robust_satisfaction(
         world, automaton, letter, start, on_entry=False, is_absorbing=True
     )
     system = None if form.system is None else form.system[product.base_state]
-    values = _solved(sides_of(host, system, aims), host, verdicts, requested)
+    values = _solved(host, system, aims, verdicts, requested)
     row: Array = product.base_row[values.row].astype(np.int32)
     solution = _solution_at(values, product.start, product.start.shape, requested)
     actions: Array = row_actions(world.nominal)[row].astype(np.int32)
@@ -112,7 +114,7 @@ def accept_with_nature(model: Model, question: Question, accuracy: Accuracy) -> 
         system = np.append(system, np.ones(host.mdp.num_states - system.size, bool))
     if weights is not None:
         weights = np.append(weights, np.ones(host.mdp.num_rows - weights.size))
-    values = _solved(sides_of(host, system, aims, weights), host, verdicts, requested)
+    values = _solved(host, system, aims, verdicts, requested, weights)
     solution = _solution_at(values, product.start, shape, requested)
     parts: dict[str, Array] = {"nature": None}
     if policy is None:
@@ -224,18 +226,33 @@ def _solution_at(
 
 
 def _solved(
-    sides: Sides, host: UncertainMDP, verdicts: _Verdicts, tolerance: float
+    host: UncertainMDP,
+    system: Booleans | None,
+    aims: PlayerAims,
+    verdicts: _Verdicts,
+    tolerance: float,
+    weights: Floats | None = None,
 ) -> RobustValues:
     """Robust satisfaction probability from all states of the product."""
-    size, encoded = host.mdp.num_states, sides.encoded
-    values = _of_sides(sides.host, verdicts.of(encoded.source), sides.query(tolerance))
+
+    def solve(sides: Sides) -> RobustValues:
+        return _of_sides(sides.host, verdicts.of(sides.encoded.source), sides.query(tolerance))
+
+    sides = sides_of(host, system, aims, weights)
+    size, encoded, values = host.mdp.num_states, sides.encoded, solve(sides)
+    probability = encoded.nature(values.probability, host.mdp.probability)
+    row = encoded.policy(values.row, values.probability)
+    cooperates = system is not None and weights is None and aims.system == aims.nature
+    if cooperates and sides.is_mixed(values.probability):
+        assert system is not None
+        row = pure_rows(host, system, aims, probability, solve)
     return replace(
         values,
         value=values.value[:size],
         lower=values.lower[:size],
         upper=values.upper[:size],
-        row=encoded.policy(values.row, values.probability),
-        probability=encoded.nature(values.probability, host.mdp.probability),
+        row=row,
+        probability=probability,
     )
 
 

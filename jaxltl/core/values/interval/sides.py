@@ -7,6 +7,7 @@ one becomes nature (:func:`~jaxltl.core.sparse.interval.game_encoding.choices_as
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, choices_as_nature
-from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 
 TOLERANCE = 1e-6
@@ -92,6 +93,12 @@ class Sides(NamedTuple):
     def query(self, tolerance: float) -> Query:
         return Query(self.maximize, self.helpful, tolerance)
 
+    def is_mixed(self, probability: Floats) -> bool:
+        """True if nature, as one of the players, mixes rows."""
+        mdp, chosen = self.host.mdp, probability > 0
+        several = np.add.reduceat(chosen.astype(np.int64), mdp.entry_start[:-1]) > 1
+        return bool((several & self.choosing).any())
+
     @property
     def choosing(self) -> Booleans:
         """Rows ``bool[R']`` by which nature chooses among rows, without a step."""
@@ -107,6 +114,27 @@ class Sides(NamedTuple):
         """A set of states ``bool[S']``, without auxiliary ones."""
         result: Booleans = quantity[self.encoded.source] & ~self.added
         return result
+
+
+def pure_rows(
+    host: UncertainMDP,
+    system: Booleans,
+    aims: PlayerAims,
+    probability: Floats,
+    solve: Callable[[Sides], RobustValues],
+) -> Integers:
+    """The system's rows ``int[S]`` where it is part of nature, against the environment.
+
+    Nature's distribution over rows may mix them, where the graph decides a value, and the most likely
+    one alone need not attain it. With nature's distributions of successors fixed the system's rows are
+    a policy of their own, and a pure one attains what the mixed one does.
+    """
+    fixed = host.resolve(probability)
+    sets = UncertainMDP(fixed, fixed.probability, fixed.probability)
+    against = aims._replace(nature=aims.environment)
+    sides = sides_of(sets, system, against)
+    values = solve(sides)
+    return sides.encoded.policy(values.row, values.probability)
 
 
 def sides_of(

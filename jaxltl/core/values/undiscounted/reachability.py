@@ -63,8 +63,7 @@ def reachability_probability(
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph decides. An
       optimum's `policy` is ``int32[S]`` and attains its bound on the safe side (`lower` for a
-      maximum, `upper` for a minimum; in games on interval models with cooperative nature not where the
-      graph decides the value); on a concrete padded model it is the fastest such policy, see
+      maximum, `upper` for a minimum); on a concrete padded model it is the fastest such policy, see
       :func:`optimal_satisfaction`. Differentiable in the policy and in the probabilities, one-sided
       where one of them is 0 (see "Derivatives" in the documentation of solutions); inside ``jit`` not with
       `stay`, and not of sparse and interval models and games, which the host solves there too. Of interval models

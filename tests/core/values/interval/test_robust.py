@@ -14,7 +14,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.interval.robust import robust_expectation
 from jaxltl.core.values.interval.satisfaction import _solved, _Verdicts
-from jaxltl.core.values.interval.sides import directions, sides_of
+from jaxltl.core.values.interval.sides import directions
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
@@ -269,8 +269,8 @@ def test_games(count):
                     played(host, goal, system, worth[1], **of),
                 )
             yes = np.zeros(4, bool)
-            sides = sides_of(host, system, directions("max", nature_word("max", nature)))
-            found = _solved(sides, host, _Verdicts(yes, yes, priority), 1e-6)
+            aims = directions("max", nature_word("max", nature))
+            found = _solved(host, system, aims, _Verdicts(yes, yes, priority), 1e-6)
             held(
                 found,
                 played(host, yes, system, worth[2], objective="max", nature=nature),
