@@ -21,8 +21,7 @@ from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
-from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values import (
@@ -33,6 +32,7 @@ from jaxltl.core.values import (
     PropertyStrategy,
     solve_property,
 )
+from jaxltl.core.values.properties.aims import SourceModel, graph_of_model
 from jaxltl.io.templates import render
 
 AnyAnswer = Answer | Achievable | ConstrainedOptimum | Pareto
@@ -146,11 +146,10 @@ def _read_source(
 
 def load(
     path: Path, program: Program | None = None, max_states: int | None = None
-) -> SparseMDP | IntervalMDP | POMDP:
-    """A chain, a decision process, an interval model or a POMDP, from a model file or a program."""
+) -> SourceModel | POMDP:
+    """A chain, decision process, interval model, POMDP or game, from a model file or a program."""
     from jaxltl.io.model_files import read_model
 
-    model: Model | POMDP
     if program is None:
         model = read_model(path, max_states=max_states)
     else:
@@ -163,16 +162,6 @@ def load(
             )
         for warning in caught:
             print(f"warning: {warning.message}", file=sys.stderr, flush=True)
-    if isinstance(model, Game):
-        raise ValueError(
-            f"{str(path)!r} is a game; properties of chains and decision processes "
-            "are solved, games by `jaxltl synthesize`."
-        )
-    if not isinstance(model, SparseMDP | IntervalMDP | POMDP):
-        raise ValueError(
-            f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
-            "decision processes are solved."
-        )
     return model
 
 
@@ -191,7 +180,7 @@ class _ProgressPrinter:
 
 
 def solve(
-    model: SparseMDP | IntervalMDP | POMDP | Program,
+    model: SourceModel | POMDP | Program,
     queries: Sequence[PropertyQuery],
     tolerance: float,
     max_states: int | None = None,
@@ -245,16 +234,19 @@ def answers(
 # --- output -----------------------------------------------------------------------------------
 
 
-def model_entry(model: SparseMDP | IntervalMDP | POMDP, seconds: float) -> Record:
+def model_entry(model: SourceModel | POMDP, seconds: float) -> Record:
     """The model as its JSON object."""
     kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
     if isinstance(model, POMDP):
         model, kinds = model.fully_observable, ("pomdp", "pomdp")
+    elif isinstance(model, Game | MultiplayerGame):
+        kinds = "smg", "smg"
+    graph = graph_of_model(model)
     return {
-        "kind": kinds[not model.is_chain],
-        "states": model.num_states,
-        "choices": model.num_rows,
-        "transitions": model.num_transitions,
+        "kind": kinds[not graph.is_chain],
+        "states": graph.num_states,
+        "choices": graph.num_rows,
+        "transitions": graph.num_transitions,
         "seconds": seconds,
     }
 
@@ -333,7 +325,7 @@ def text(result: PropertyResult) -> str:
 
 
 def strategies(
-    model: SparseMDP | IntervalMDP | POMDP, results: Sequence[PropertyResult], source: Path
+    model: SourceModel | POMDP, results: Sequence[PropertyResult], source: Path
 ) -> bytes:
     """The optimal strategies as JSON; see docs/solve.md."""
     if isinstance(model, POMDP):
@@ -345,14 +337,14 @@ def strategies(
         for r in results
         if isinstance(r.answer, Answer)
         and r.answer.strategy is not None
-        and (isinstance(model, IntervalMDP) or not model.is_chain)
+        and (isinstance(model, IntervalMDP) or not graph_of_model(model).is_chain)
     ]
     table = {"model": source.name, "states": model.num_states, "strategies": entries}
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def _strategy(solved: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Record:
-    model = solved.nominal if isinstance(solved, IntervalMDP) else solved
+def _strategy(solved: SourceModel, strategy: PropertyStrategy) -> Record:
+    model = graph_of_model(solved)
     host = model.host
     row = np.asarray(strategy.row)
     choice = (row - host.row_start[host.state[row]]).tolist()

@@ -19,7 +19,8 @@ from jaxltl.app.run_job import make_directory
 from jaxltl.app.solve import PropertyQuery, PropertyResult, answers, load
 from jaxltl.core.logic import Formula, Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
-from jaxltl.core.models import POMDP, IntervalMDP, ShardedMDP, SparseMDP, on_host, shard, to_mesh
+from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, ShardedMDP, SparseMDP
+from jaxltl.core.models import on_host, shard, to_mesh
 from jaxltl.core.types import NotConverged
 from jaxltl.core.values.properties.solve_on_mesh import (
     Bounds,
@@ -66,6 +67,10 @@ def read(
             whole = load(path)
             if isinstance(whole, POMDP):
                 raise ValueError(f"{str(path)!r} holds a POMDP, which is solved on one device.")
+            if isinstance(whole, Game | MultiplayerGame):
+                raise ValueError(
+                    f"{str(path)!r} is a game; solve it on one device, without --mesh."
+                )
         with group.together():
             model = on_mesh(whole, group)
         mark = files.fingerprint(model=whole)

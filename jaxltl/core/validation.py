@@ -255,6 +255,11 @@ def unsupported_model(model: object) -> str:
             "POMDP, or give its fully observable model, pomdp.fully_observable, whose maximum is an "
             "upper bound and whose minimum is a lower bound."
         )
+    if hasattr(model, "players"):
+        return (
+            f"{name} has several players; solve_property answers for their coalitions. Elsewhere give "
+            "model.game([...]), the game of a coalition against the others."
+        )
     if hasattr(model, "nominal"):
         return (
             f"{name} has intervals for its probabilities, which are not supported here; use a "

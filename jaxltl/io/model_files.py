@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP, to_sparse
+from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
 from jaxltl.io.files import decompressed, opened, suffix_of
 from jaxltl.io.drn.drn import read_drn, write_drn
@@ -43,7 +43,7 @@ def read_model(
     constants: Constants = None,
     max_states: int | None = None,
     coalition: Sequence[str] | None = None,
-) -> SparseMDP | IntervalMDP | Game | POMDP:
+) -> SparseMDP | IntervalMDP | Game | MultiplayerGame | POMDP:
     """Model of a file, with the format detected by suffix or contents.
 
     Formats: programs in the PRISM language (``.prism``, ``.pm``, ``.nm``, ``.sm``, ``.smg``), UMB
@@ -54,11 +54,11 @@ def read_model(
       path: the file.
       constants: of a program, values in a dict or as a text such as ``"N=64,MAX=4"``.
       max_states: of a program, the largest number of states; default 10 million.
-      coalition: of a game, the names of the players that are its system; default: the first one of
-        two players.
+      coalition: of a program of a game, the players that are the system of a two-player game.
 
     Returns:
-      A SparseMDP, a Game or a POMDP over one, or an IntervalMDP.
+      A SparseMDP, a Game or a POMDP over one, or an IntervalMDP; of a program of a game without a
+      coalition a MultiplayerGame.
 
     Raises:
       ValueError: with file and place, for unknown formats and missing or malformed files.
@@ -104,6 +104,11 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
         raise ValueError(f"{str(path)!r}: programs are read, not written; write {_known()}.")
     if form is None:
         raise ValueError(f"{str(path)!r}: the suffix names no format; known are {_known()}.")
+    if isinstance(model, MultiplayerGame):
+        raise ValueError(
+            f"{str(path)!r}: files hold games of two players; write model.game([...]), the game of a "
+            "coalition."
+        )
     if isinstance(model, Game) and not form.holds_games:
         raise ValueError(
             f"{str(path)!r}: {form.name} holds no games; write "

@@ -290,13 +290,23 @@ def test_a_failure_of_ours_does_not_lose_the_other_answers(model_file, monkeypat
     assert found[0]["status"] != "CONVERGED" and found[1]["status"] == "CONVERGED"
 
 
-def test_games_are_sent_elsewhere(tmp_path):
+def test_games_are_solved_for_a_coalition(tmp_path):
     from jaxltl.core.models.game import make_game
 
     path = tmp_path / "game.umb"
     write_model(path, make_game(gambler(), system=np.array([1, 1, 0, 1, 1], bool)))
     done = run(path, 'Pmax=? [ F "rich" ]')
-    assert done.exit_code == 2 and "synthesize" in done.output
+    assert done.exit_code == 2 and "<<system>> Pmax=?" in done.output
+    found = results(path, '<<system>> Pmax=? [ F "rich" ]')["results"][0]
+    assert found["status"] == "CONVERGED" and 0 < found["value"] < 1
+    program = tmp_path / "game.prism"
+    program.write_text(
+        "smg player a m endplayer player b [x], [y] endplayer module m s : [0..3]; [] s=0 -> (s'=1);"
+        "[x] s=1 -> 1/4 : (s'=2) + 3/4 : (s'=3); [y] s=1 -> (s'=3); [] s>1 -> true; endmodule"
+    )
+    for coalition, value in {"a": 0, "b": 0.25, "1,2": 0.25, "": 0}.items():
+        found = results(program, f"<<{coalition}>> Pmax=? [ F s=2 ]")["results"][0]
+        assert found["value"] == value
 
 
 def test_nothing_is_compiled(model_file):

@@ -173,13 +173,11 @@ def test_players_are_merged_where_the_coalition_is_given(tmp_path, players):
     path = tmp_path / "game.smg"
     path.write_text(f"smg const int last = {players - 1}; global t : [0..last]; {modules}")
     names = [f"p{i}" for i in range(players)]
-    if players == 2:
-        np.testing.assert_array_equal(
-            jl.read_model(path).system, jl.read_model(path, coalition=["p0"]).system
-        )
-    else:
-        with pytest.raises(ValueError, match=rf"{players} players, {', '.join(names)}.*coalition"):
-            jl.read_model(path)
+    smg = jl.read_model(path)
+    assert smg.players == tuple(names)
+    assert smg.owner.tolist()[:players] == list(range(players))
+    with pytest.raises(ValueError, match=r"write model.game\("):
+        jl.io.write_model(tmp_path / "game.umb", smg)
     game = jl.read_model(path, coalition=names[1:])
     assert np.asarray(game.system)[:players].tolist() == [False] + [True] * (players - 1)
     for wrong in ("p0", ["p9"]):

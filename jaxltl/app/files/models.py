@@ -12,7 +12,7 @@ from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_bytes
 from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.construct.padded import to_padded
-from jaxltl.core.models import POMDP, MDP, Game, IntervalMDP, SparseMDP
+from jaxltl.core.models import POMDP, MDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
 
@@ -60,6 +60,13 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
             f"{name!r} holds a POMDP; jaxltl solve answers questions about it, and tasks are for models "
             "whose states are seen."
         )
+    if isinstance(model, MultiplayerGame):
+        if len(model.players) > 2:
+            raise ValueError(
+                f"{name!r} holds a game of {len(model.players)} players; synthesis is for two, of which "
+                "the first is the system."
+            )
+        model = model.game([1])
     if isinstance(model, Game):
         if "system" not in more:
             raise ValueError(

@@ -32,7 +32,8 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     first state forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
     second: `Pmaxmin=?`, `R{"time"}minmax=?`. In a game a coalition comes before that, whose players choose
-    for the objective: `<<system>> Pmax=? [ PATH ]`; a threshold is met by some of its strategies.
+    for the objective: `<<system>> Pmax=? [ PATH ]`, or, by names and numbers of a game of several
+    players, `<<p1, 3>>`, `<<>>` and `<<*>>`; a threshold is met by some of its strategies.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
     `&&` and `||`, which is for state formulas only. So temporal operators reach as far as they can,
@@ -153,18 +154,14 @@ class _Parser(PathParser):
     def property_(self, name: str | None = None) -> Property:
         start = self.token
         if self.accept("<<"):
-            players: list[str] = []
-            while self.token.text != ">>" and (not players or self.accept(",")):
-                self.require(self.token.kind == "word", "a player: system or environment")
-                players.append(self.take().text)
-            self.expect(">>", " or ','")
+            players = self.coalition()
             inner = self.property_(name)
             self.require(
                 inner.operator != "multi" and inner.aggregate is None and inner.coalition is None,
                 "P, R, T or LRA after a coalition",
                 start,
             )
-            return replace(inner, text=self.written(start), coalition=tuple(players))
+            return replace(inner, text=self.written(start), coalition=players)
         if self.accept("multi"):
             return self.multi(start, name)
         if self.accept("filter"):
@@ -186,6 +183,21 @@ class _Parser(PathParser):
         fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
         self.expect("]", " or an operator")
         return Property(self.written(start), **fields, name=name)
+
+    def coalition(self) -> tuple[str, ...]:
+        """The players of a coalition, and the sign after it."""
+        players: list[str] = []
+        while self.token.text != ">>" and (not players or self.accept(",")):
+            if self.accept("*"):
+                self.require(not players, "no other players with *, which is all", self.last)
+                players.append("*")
+                break
+            quoted = self.token.kind == "quoted"
+            known = quoted or self.token.kind in ("word", "number")
+            self.require(known, "a player, by its name or its number from 1")
+            players.append(self.quoted() if quoted else self.take().text)
+        self.expect(">>", " or ','")
+        return tuple(players)
 
     def multi(self, start: Token, name: str | None) -> Property:
         self.expect("(")

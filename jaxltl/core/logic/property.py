@@ -40,7 +40,7 @@ class Property:
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
-      coalition: of a game, the players who choose for the objective, as in `<<system>> Pmax=?`, or None.
+      coalition: of a game, the players that choose for the objective, as in `<<system>> Pmax=?`, or None.
       definitions: propositions of the formulas that are no labels: comparisons and nested properties.
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
 

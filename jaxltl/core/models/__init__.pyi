@@ -26,6 +26,10 @@ from .construct.restrict import (
     with_allowed as with_allowed,
 )
 from .game import Game as Game, make_game as make_game
+from .multiplayer import (
+    MultiplayerGame as MultiplayerGame,
+    make_multiplayer_game as make_multiplayer_game,
+)
 from .interval import (
     IntervalMDP as IntervalMDP,
     interval_rows as interval_rows,

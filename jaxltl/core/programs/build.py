@@ -16,8 +16,9 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.language.expressions import Expression, LanguageError, compile_expressions, literal
 from jaxltl.core.language.syntax import Program, RewardItem
 from jaxltl.core.models.number_source import NumberSource
-from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
+from jaxltl.core.models.multiplayer import MultiplayerGame, make_multiplayer_game
 from jaxltl.core.models.pomdp import POMDP, make_pomdp, observation_numbers
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.programs.exact import rational_numbers
@@ -43,7 +44,7 @@ def build_model(
     coalition: Sequence[str] | None = None,
     max_states: int = MAX_STATES,
     progress: Progress | None = None,
-) -> SparseMDP | IntervalMDP | Game | POMDP:
+) -> SparseMDP | IntervalMDP | Game | MultiplayerGame | POMDP:
     """The model of a program, with all reachable states.
 
     The initial states come first. Deadlocks get a self-loop, with a warning. In a ``dtmc`` each of
@@ -52,17 +53,18 @@ def build_model(
 
     Args:
       program: of :func:`~jaxltl.core.language.resolve.read_program`, without parameters.
-      coalition: players of an smg that are the system of the game; default: the first one of two.
+      coalition: players of an smg, names or numbers from 1, that are the system of a two-player game.
       max_states: the largest number of states, and a hundredth of that of transitions.
       progress: is called with the numbers of states that are found and expanded.
 
     Returns:
-      A SparseMDP; an IntervalMDP if some probability is an interval; a Game of an smg; a POMDP of a pomdp.
+      A SparseMDP; an IntervalMDP if some probability is an interval; a MultiplayerGame of an smg, or
+      the Game of a coalition; a POMDP of a pomdp.
 
     Raises:
       ValueError: too many states, parameters, an update that leaves the range of a variable or is
-        no distribution, a state of a game with choices of two players, a game of three players
-        without a coalition, or states of equal observation with different actions.
+        no distribution, a state of a game with choices of two players or of none, an unknown
+        player, or states of equal observation with different actions.
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
@@ -86,16 +88,16 @@ def build_model(
     make: Any = interval_rows if len(ends) == 2 else make_sparse
     with validation.errors_in(f"{program.source.name!r}: "):
         model: SparseMDP | IntervalMDP = make(*starts, *ends, rewards=rewards, **rows.annotations)
-        if isinstance(model, SparseMDP) and rows.owner is None:
+        if isinstance(model, SparseMDP):
             source = NumberSource(partial(rational_numbers, program, build_rows))
             model = replace(model, numbers=source)
             if rows.observables:
                 number, values = observation_numbers(rows.observables)
                 return make_pomdp(model, number, observables=values)
-            return model
         if rows.owner is None:
             return model
-        return make_game(model, np.isin(rows.owner, _players(program, coalition)))
+        smg = make_multiplayer_game(model, rows.owner, [p.name for p in program.players])
+        return smg if coalition is None else smg.game(coalition)
 
 
 def build_rows(
@@ -294,27 +296,12 @@ def as_chain(explored: Explored, weights: Numbers) -> Explored:
 # --- games ------------------------------------------------------------------------------------
 
 
-def _players(program: Program, coalition: Sequence[str] | None) -> list[int]:
-    """Numbers of the players of a coalition."""
-    names = [p.name for p in program.players]
-    if coalition is None:
-        if len(names) > 2:
-            raise ValueError(
-                f"the game has {len(names)} players, {', '.join(names)}, and a Game two: give "
-                "coalition=[...], the names of those that are its system; the others are its "
-                "environment."
-            )
-        return [0]
-    if isinstance(coalition, str):
-        raise ValueError(f"coalition={coalition!r}; give a list of names of players.")
-    for name in coalition:
-        if name not in names:
-            raise ValueError(f"there is no player {name!r}; the players are {', '.join(names)}.")
-    return [names.index(name) for name in coalition]
-
-
 def _owners(program: Program, explored: Explored) -> Integers:
-    """The player of each state; LanguageError for a state with choices of several players."""
+    """The player of each state, the first one in deadlocks.
+
+    Raises:
+      LanguageError: a state with choices of several players, or of none.
+    """
     modules = [m.name for m in program.modules]
     of_module = np.full(len(modules) + 1, -1)
     of_action = np.full(len(explored.actions), -1)
@@ -325,15 +312,23 @@ def _owners(program: Program, explored: Explored) -> Integers:
     state = np.repeat(np.arange(explored.row_count.size), explored.row_count)
     owner = np.zeros(explored.row_count.size, np.int64)
     owner[state] = of_row
-    several = (owner[state] != of_row) | ((of_row < 0) & (explored.row_count[state] > 1))
-    if several.any():
-        i = int(state[np.argmax(several)])
-        text = state_text(
-            StateReader(explored.layout, tuple(w[i : i + 1] for w in explored.words)), 0
-        )
+    wrong = of_row < 0
+    if not wrong.any():
+        wrong = owner[state] != of_row
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        i, action = int(state[row]), int(explored.action[row])
+        name = f"the action [{explored.actions[action]}]"
+        if not action:
+            name = f"the unlabelled command of module {modules[int(explored.owner[row])]}"
+        words = tuple(w[i : i + 1] for w in explored.words)
+        place = f"in the state {state_text(StateReader(explored.layout, words), 0)}"
+        if of_row[row] < 0:
+            raise LanguageError(
+                0, f"{name} {place} belongs to no player; list it in a player ... endplayer block."
+            )
         raise LanguageError(
             0,
-            f"the choices of the state {text} belong to several players or to none; in a "
-            "turn-based game one player has all of them.",
+            f"the choices {place} belong to several players; in a turn-based game one player has all.",
         )
-    return np.maximum(owner, 0)
+    return owner

@@ -17,7 +17,6 @@ from jaxltl.core.logic.comparisons import Comparison, program_definitions
 from jaxltl.core.logic.labels import is_boolean, require_known, satisfying
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property, parse_property
-from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
 from jaxltl.core.programs.explore import BreadthFirstSearch
@@ -97,10 +96,6 @@ def solve_program(
         prop = parse_property(prop, program_definitions(program))
     if method == "build":
         model = build_model(program, max_states=max_states)
-        if isinstance(model, Game):
-            raise ValueError(
-                f"{program.source.name!r} is a game; properties of games are not solved."
-            )
         return cast(Answer, solve_property(model, prop, tolerance=tolerance))
     validation.choice("method", method, ("build", "partial"))
     tolerance = requested_width(tolerance)

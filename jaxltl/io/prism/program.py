@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from jaxltl.core.language.parser import parse_program
 from jaxltl.core.language.resolve import resolve
 from jaxltl.core.language.syntax import Program, Syntax
-from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP
+from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
 from jaxltl.core.programs.build import MAX_STATES, build_model as build_model
 from jaxltl.core.programs.partial import solve_program as solve_program
 from jaxltl.core.programs.simulation import (
@@ -101,7 +101,7 @@ def read_program_model(
     constants: Constants = None,
     max_states: int | None = None,
     coalition: Sequence[str] | None = None,
-) -> SparseMDP | IntervalMDP | Game | POMDP:
+) -> SparseMDP | IntervalMDP | Game | MultiplayerGame | POMDP:
     """The model of a program in a file; see :func:`~jaxltl.core.programs.build.build_model`."""
     program = read_program(path, constants)
     max_states = MAX_STATES if max_states is None else max_states

@@ -6,8 +6,8 @@ import pytest
 from jaxltl.core.language.expressions import literal, substitute
 from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.language.resolve import read_program
-from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.programs import explore, local_choices, packed_states
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
@@ -176,12 +176,20 @@ module o [b] true -> true; [] turn=0 & x=1 -> (turn'=1); endmodule"""
 
 
 def test_games_have_an_owner_for_each_state():
-    with pytest.raises(ValueError, match="several players or to none"):
+    with pytest.raises(
+        ValueError, match=r"command of module o in the state .*belongs to no player"
+    ):
         built(GAME)
-    game = built(
+    with pytest.raises(ValueError, match=r"action \[b\] in the state .*belongs to no player"):
+        built(GAME.replace("n, [b] endplayer", "n, o endplayer"))
+    with pytest.raises(ValueError, match=r"\(turn=0,x=1\) belong to several players"):
+        built(GAME.replace("player two n", "player two n, o"))
+    smg = built(
         GAME.replace("player two n", "player two n, o").replace("turn=0 -> ", "turn=0&x=0 -> ")
     )
-    assert isinstance(game, Game)
+    assert isinstance(smg, MultiplayerGame)
+    assert smg.players == ("one", "two")
+    game = smg.game(["one"])
     order = np.argsort(np.asarray(game.mdp.valuation["turn"]) * 2 + game.mdp.valuation["x"])
     assert np.asarray(game.system)[order].tolist() == [True, False, False, False]
     other = built(

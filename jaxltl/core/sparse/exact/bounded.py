@@ -19,7 +19,7 @@ def until_within(
     target: Booleans,
     stay: Booleans | None,
     num_steps: int,
-    maximize: bool,
+    maximize: bool | Booleans,
     work: Work,
 ) -> Values:
     """Optimal probabilities of a target within some steps, through states of `stay`."""
@@ -38,7 +38,7 @@ def earned_within(
     reward: Sequence[Fraction],
     final: Values,
     num_steps: int,
-    maximize: bool,
+    maximize: bool | Booleans,
     work: Work,
 ) -> Values:
     """Optimal expected sums of the rewards of some steps and of a value after them."""

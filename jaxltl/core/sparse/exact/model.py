@@ -81,13 +81,17 @@ class ExactMDP:
         return total
 
     def backup(
-        self, constant: Sequence[Fraction], value: Values, maximize: bool, work: Work
+        self, constant: Sequence[Fraction], value: Values, maximize: bool | Booleans, work: Work
     ) -> list[Fraction | float]:
-        """Optimal sums of the constant of a row and the expected value of its successor."""
-        best: Callable[[Iterable[Fraction | float]], Fraction | float] = max if maximize else min
+        """Optimal sums of the constant of a row and the expected value of its successor.
+
+        In a game `maximize` is ``bool[S]``, the states of the maximiser.
+        """
+        best: dict[bool, Callable[[Iterable[Fraction | float]], Fraction | float]]
+        best = {True: max, False: min}
         return [
-            best(constant[r] + self.expectation(r, value, work) for r in self.choices(s))
-            for s in range(self.num_states)
+            best[up](constant[r] + self.expectation(r, value, work) for r in self.choices(s))
+            for s, up in enumerate(np.broadcast_to(maximize, self.num_states).tolist())
         ]
 
 

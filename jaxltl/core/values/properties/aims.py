@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypedDict
+from dataclasses import replace
+from typing import Literal, NamedTuple, TypedDict
+
+import numpy as np
 
 from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Model
@@ -15,14 +20,19 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.values.engine.row_form import row_form
 
 CheckableModel = SparseMDP | IntervalMDP | Game
+SourceModel = CheckableModel | MultiplayerGame  # before a coalition is chosen
 
-_OTHER = {"max": "min", "min": "max"}
+_Direction = Literal["max", "min"]
+_OTHER: dict[str, _Direction] = {"max": "min", "min": "max"}
 
 
-def checkable(model: Model | POMDP) -> CheckableModel:
+def checkable(model: Model | MultiplayerGame | POMDP) -> SourceModel:
     """Any concrete model with flat states, as sparse rows or intervals or a game on these."""
     if isinstance(model, SparseMDP | IntervalMDP):
         return model
+    if isinstance(model, MultiplayerGame):
+        owner = to_jax(np.asarray(model.owner).ravel())
+        return MultiplayerGame(checkable(model.mdp), owner, model.players)
     if isinstance(model, POMDP):
         raise ValueError(validation.unsupported_model(model))
     form = row_form(model)
@@ -30,10 +40,35 @@ def checkable(model: Model | POMDP) -> CheckableModel:
     return inner if form.system is None else Game(inner, to_jax(form.system))
 
 
-def graph_of_model(model: CheckableModel) -> SparseMDP:
+def graph_of_model(model: SourceModel) -> SparseMDP:
     """All of a model but its players and intervals."""
-    inner = model.mdp if isinstance(model, Game) else model
+    inner = model.mdp if isinstance(model, Game | MultiplayerGame) else model
     return inner.nominal if isinstance(inner, IntervalMDP) else inner
+
+
+def of_coalition(model: SourceModel, prop: Property) -> tuple[CheckableModel, Property]:
+    """The model of one or two players in which a property of a multi-player game is asked.
+
+    A coalition whose players, or whose opponents, have no choices leaves a decision process; without
+    a coalition all players are one.
+    """
+    if not isinstance(model, MultiplayerGame):
+        return model, prop
+    if prop.coalition is None or prop.direction is None:
+        if prop.coalition is not None:
+            ask = f"<<{', '.join(prop.coalition)}>> {prop.operator}max=?"
+            raise ValueError(f"{prop.text}: say what the coalition wants, as in {ask}.")
+        return model.mdp, prop
+    graph, direction = graph_of_model(model), prop.direction
+    member = np.isin(model.owner, model.members(prop.coalition))
+    choosing = np.diff(graph.host.row_start) > 1
+    alone = replace(prop, coalition=None)
+    if not (choosing & ~member).any():
+        return model.mdp, replace(alone, objective=direction)
+    if not (choosing & member).any():
+        return model.mdp, replace(alone, objective=_OTHER[direction])
+    two = replace(prop, objective=direction, coalition=("system",))
+    return Game(model.mdp, to_jax(member)), two
 
 
 class Directions(TypedDict, total=False):
@@ -67,6 +102,15 @@ class PropertyAim(NamedTuple):
         return aims
 
 
+def maximizers(model: CheckableModel, aim: PropertyAim) -> bool | Booleans:
+    """Whether the value is maximised; in a game the states ``bool[S]`` in which it is."""
+    up = aim.policy == "max"
+    if not isinstance(model, Game):
+        return up
+    system = np.asarray(model.system, bool)
+    return np.where(system, up, up == (aim.environment == "cooperative"))
+
+
 def aim_of(model: CheckableModel, prop: Property) -> PropertyAim:
     """Directions of the system, nature and the environment; ValueError if the text lacks one of them."""
     sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
@@ -75,7 +119,7 @@ def aim_of(model: CheckableModel, prop: Property) -> PropertyAim:
     if prop.coalition is not None:
         raise ValueError(
             f"{prop.text}: the model is no game; leave out the coalition, <<...>>, or make one by "
-            "make_game(model, system)."
+            "make_game(model, system) or make_multiplayer_game(model, owner, players)."
         )
     if isinstance(model, IntervalMDP):
         return _robust_aim(model, prop, sign)

@@ -15,6 +15,7 @@ from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -83,7 +84,7 @@ class Answer(NamedTuple):
     strategy: PropertyStrategy | None
 
 
-Model = SparseMDP | IntervalMDP | Game
+Model = SparseMDP | IntervalMDP | Game | MultiplayerGame
 
 
 def with_definitions(
@@ -94,7 +95,7 @@ def with_definitions(
     Raises:
       ValueError: a nested property is not decided in some state, or an unknown variable.
     """
-    inner = model.mdp if isinstance(model, Game) else model
+    inner = model.mdp if isinstance(model, Game | MultiplayerGame) else model
     world = inner.nominal if isinstance(inner, IntervalMDP) else inner
     columns: dict[str, Booleans] = {}
     for name, meaning in prop.definitions:
@@ -118,7 +119,7 @@ def with_definitions(
     label = np.column_stack([np.asarray(world.label), *columns.values()])
     more = replace(world, label=label, propositions=(*world.propositions, *columns))
     changed = replace(inner, nominal=more) if isinstance(inner, IntervalMDP) else more
-    return replace(model, mdp=changed) if isinstance(model, Game) else changed
+    return replace(model, mdp=changed) if isinstance(model, Game | MultiplayerGame) else changed
 
 
 def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:

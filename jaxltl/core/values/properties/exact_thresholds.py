@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -11,10 +13,13 @@ from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property
+from jaxltl.core.array_types import Booleans
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward, exact_state_reward
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.number_source import NumberSource, RationalNumbers
 from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
 from jaxltl.core.sparse.exact import bounded
 from jaxltl.core.sparse.exact.average import average
@@ -34,18 +39,69 @@ _WIDTH = 0.01  # of the bounds of the product, of which only the graph is used
 
 
 def exact_values(
-    model: SparseMDP | IntervalMDP | Game, prop: Property, states: np.ndarray, maximize: bool
+    model: SparseMDP | IntervalMDP | Game,
+    prop: Property,
+    states: np.ndarray,
+    maximize: bool | Booleans,
+    rows: np.ndarray | None = None,
 ) -> list[Fraction | float] | None:
-    """Values at some states, fractions or infinite; None if it is large, a game or has intervals."""
-    if not isinstance(model, SparseMDP):
+    """Values at some states, fractions or infinite; None if it is large or has intervals.
+
+    Args:
+      maximize: the direction; in a game ``bool[S]``, True in the states of the maximiser.
+      rows: of a game, the rows ``int[S]`` of optimal strategies of both players.
+    """
+    inner = model.mdp if isinstance(model, Game) else model
+    if not isinstance(inner, SparseMDP):
         return None
-    if model.num_states > MAX_STATES or model.num_transitions > MAX_TRANSITIONS:
+    if inner.num_states > MAX_STATES or inner.num_transitions > MAX_TRANSITIONS:
         return None
+    if isinstance(model, Game) and not _is_of_few_steps(prop):
+        return _between_answers(inner, prop, states, maximize, rows)
     try:
-        values = _values(_ExactQuery(model, states, prop.text), prop, maximize)
+        # Backward induction takes the directions of all states.
+        values = _values(_ExactQuery(inner, states, prop.text), prop, cast(bool, maximize))
     except (TooLarge, OverflowError):  # a reward may be infinite
         return None
     return list(values)
+
+
+def _is_of_few_steps(prop: Property) -> bool:
+    """True if backward induction over some steps gives the values."""
+    path = prop.path
+    if isinstance(path, Bounded):
+        return path.reward is None and not path.lower and path.upper is not None
+    if isinstance(path, Formula):
+        return prop.operator == "P" and path.operator == "X" and is_boolean(path.operands[0])
+    return isinstance(path, Earned) and path.steps is not None
+
+
+def _between_answers(
+    model: SparseMDP,
+    prop: Property,
+    states: np.ndarray,
+    maximize: bool | Booleans,
+    rows: np.ndarray | None,
+) -> list[Fraction | float] | None:
+    """Values of a game between the optimal answers to memoryless strategies of the players.
+
+    The minimiser's optimal answer to a strategy bounds the value from below and the maximiser's from
+    above; None unless they agree.
+    """
+    if rows is None or rows.size != model.num_states:
+        return None
+    numbers, bounds = exact_numbers(model), []
+    for up in (False, True):
+        kept = np.broadcast_to(np.equal(maximize, up), model.num_states)[model.host.state]
+        kept[rows] = True
+        source = NumberSource(partial(_constant, numbers.select(kept)))
+        part = replace(with_allowed(model, kept), numbers=source)
+        bounds.append(exact_values(part, prop, states, up))
+    return bounds[0] if bounds[0] == bounds[1] else None
+
+
+def _constant(numbers: RationalNumbers, model: SparseMDP) -> RationalNumbers:
+    return numbers
 
 
 def _values(query: _ExactQuery, prop: Property, maximize: bool) -> Values:
@@ -138,7 +194,8 @@ class _ExactQuery:
 
     def complement(self, path: Formula | Bounded, maximize: bool) -> Values:
         """One minus the probability of the complementary event."""
-        return [1 - x for x in self.probability(path, not maximize)]
+        opposite = cast(bool, np.logical_not(maximize))
+        return [1 - x for x in self.probability(path, opposite)]
 
     def within(self, path: Bounded, maximize: bool) -> Values:
         """The probability of a bounded formula."""

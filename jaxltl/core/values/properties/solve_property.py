@@ -20,6 +20,8 @@ from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS
 from jaxltl.core.models.action_numbers import rows_of_policy
 from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, SparseMDP
@@ -38,9 +40,12 @@ from jaxltl.core.values.multi_objective.multi_objective import (
 from jaxltl.core.values.properties.aims import (
     CheckableModel,
     PropertyAim,
+    SourceModel,
     aim_of,
     checkable,
     graph_of_model,
+    maximizers,
+    of_coalition,
 )
 from jaxltl.core.values.properties.answers import (
     Answer as Answer,
@@ -83,7 +88,7 @@ class _Result(NamedTuple):
 
 @validated(games=True, host=True)
 def solve_property(
-    model: Model | POMDP,
+    model: Model | MultiplayerGame | POMDP,
     prop: Property | str,
     *,
     states: ArrayLike | None = None,
@@ -95,7 +100,9 @@ def solve_property(
     Args:
       model: any concrete model. An interval model needs the directions of the policy and of nature, as
         in ``Pmaxmin=?``; an interval chain that of nature; a game a coalition of its players, system
-        and environment, as in ``<<system>> Pmax=?``. States of a product are numbered ``s * Q + q``.
+        and environment, as in ``<<system>> Pmax=?``. In a multi-player game a coalition has names or
+        numbers of players, ``<<p1, 3>>``, or all, ``<<*>>``; without one all players are one. States
+        of a product are numbered ``s * Q + q``.
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
       states: ``int[I]``; default the initial states. Not with ``multi(...)``.
       tolerance: width of the bounds, absolute for probabilities and relative otherwise.
@@ -119,30 +126,33 @@ def solve_property(
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
     """
-    model = checkable(model)
+    source = checkable(model)
     if isinstance(prop, str):
-        prop = parse_property(prop, Definitions(variables=tuple(graph_of_model(model).valuation)))
+        prop = parse_property(prop, Definitions(variables=tuple(graph_of_model(source).valuation)))
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     again = partial(solve_property, tolerance=tolerance, relative=relative)
     if prop.definitions:
-        model = with_definitions(
-            model,
+        source = with_definitions(
+            source,
             prop,
             lambda world, part: cast(Answer, again(world, part, states=range(world.num_states))),
         )
+    width = RelativeTolerance if relative else float
+    if prop.aggregate is not None:
+        return _filter(source, prop, states, width(tolerance))
+    chosen, prop = of_coalition(source, prop)
     if relative and (
         prop.operator in ("multi", "LRA")
         or prop.path == Earned("average")
-        or (not isinstance(model, SparseMDP) and prop.operator == "P")
+        or (not isinstance(chosen, SparseMDP) and prop.operator == "P")
     ):
         raise ValueError(
             f"{prop.text}: relative=True is for probabilities of path formulas, without intervals or a "
             "second player, and for total rewards."
         )
-    width = RelativeTolerance if relative else float
     if prop.operator == "multi":
-        if states is not None or not isinstance(model, SparseMDP):
+        if states is not None or not isinstance(chosen, SparseMDP):
             restriction = (
                 "from other than the initial states"
                 if states is not None
@@ -151,19 +161,22 @@ def solve_property(
             raise ValueError(
                 f"{prop.text}: multi(...) is not supported {restriction}; ask for one objective at a time."
             )
-        return solve_multi_objective(model, prop, tolerance)
-    if prop.aggregate is not None:
-        return _filter(model, prop, states, width(tolerance))
+        return solve_multi_objective(chosen, prop, tolerance)
     if states is None:
-        states = np.flatnonzero(np.asarray(model.initial) > 0)
-    states = starting_states(model, states)
+        states = np.flatnonzero(np.asarray(chosen.initial) > 0)
+    states = starting_states(chosen, states)
     tolerance = requested_width(tolerance)
-    aim = aim_of(model, prop)
-    solve = partial(_solved, _ModelQuery(model, states, prop.text), prop, aim)
-    exact = partial(exact_values, model, prop, states, maximize=aim.policy == "max")
+    aim = aim_of(chosen, prop)
+    solve = partial(_solved, _ModelQuery(chosen, states, prop.text), prop, aim)
     result = solve(width(tolerance))
+
+    def exact() -> list[Fraction | float] | None:
+        strategy = result.strategy
+        rows = strategy.row if strategy is not None and strategy.memory is None else None
+        return exact_values(chosen, prop, states, maximizers(chosen, aim), rows)
+
     if prop.relation is None:
-        if tolerance <= _EXACT and not _is_exact(result) and _is_tiny(model):
+        if tolerance <= _EXACT and not _is_exact(result) and _is_tiny(chosen):
             result = _with_values(result, exact())
         return _answer(prop, states, result, None, width(tolerance))
     verdicts = _verdicts(prop, result)
@@ -172,7 +185,7 @@ def solve_property(
             break
         result = solve(width(tolerance * share))
         verdicts = _verdicts(prop, result)
-    if None in verdicts or _is_close(model, prop, result):
+    if None in verdicts or _is_close(chosen, prop, result):
         values = exact()
         if values is not None:
             assert prop.threshold is not None
@@ -181,7 +194,7 @@ def solve_property(
     return _answer(prop, states, result, verdicts, tolerance)
 
 
-def _filter(model: CheckableModel, prop: Property, states: object, tolerance: float) -> Answer:
+def _filter(model: SourceModel, prop: Property, states: object, tolerance: float) -> Answer:
     """The aggregate of a property over the states of a filter."""
     if states is not None:
         raise ValueError(f"{prop.text}: a filter is over its own states; leave states out.")
@@ -280,7 +293,8 @@ def _with_values(result: _Result, exact: list[Fraction | float] | None) -> _Resu
 
 def _is_close(model: CheckableModel, prop: Property, result: _Result) -> bool:
     """True if the doubles of a model and the numbers of its source may differ in the verdict."""
-    if not isinstance(model, SparseMDP) or model.numbers.read is None:
+    inner = model.mdp if isinstance(model, Game) else model
+    if not isinstance(inner, SparseMDP) or inner.numbers.read is None:
         return False
     assert prop.threshold is not None
     threshold = float(prop.threshold)
