@@ -5,7 +5,8 @@ the file is no certificate (2). docs/certificates.md has the format and derives 
 
 A node is a state s with an automaton state q and a memory state m, numbered (s Q + q) M + m. An
 option of it is a tuple: successors, numerators of their (least) probabilities, the denominator,
-greatest numerators if the probabilities are intervals (or None), and rewards (or none).
+greatest numerators if the probabilities are intervals (or None), rewards (or none), and of
+intervals the parts (begin, end, mass) that are rows: several if a randomised policy mixes them.
 """
 
 from __future__ import annotations
@@ -33,9 +34,13 @@ OTHER = {"max": "min", "min": "max"}
 CODES = {"uint32": "I", "uint64": "Q", "double64": "d"}  # of the module array
 # Keys and types of tables in the index; "?" marks optional keys. A formula is the name of a label
 # or a list of an operator and its operands.
-INDEX = "version:int producer:str numbers:str question:dict claims:list members:dict"
-QUESTION = "text:str path:dict objective:str nature?:str environment?:str observations?:str"
-CLAIM = "side:str bound:str values:str policy?:str memory?:int next?:str"
+INDEX = "version:int producer:str numbers:str question:dict claims:list members:dict counts?:dict"
+POLICY = " policy?:str memory?:int next?:str"
+QUESTION = (
+    "text:str path:dict objective:str nature?:str environment?:str observations?:str" + POLICY
+)
+CLAIM = "side:str bound:str values:str" + POLICY
+COUNTS = "member:str method:str confidence:str assumption:str"
 PATHS = {
     "until": "kind:str target:str|list stay?:str|list steps?:int",
     "reward": "kind:str target:str|list reward:str",
@@ -268,9 +273,9 @@ def staying(graph: dict) -> dict:
     inside = {*graph}
 
     def stays(option: tuple) -> bool:
-        targets, low, total, high, _ = option
+        targets, low, _, high, _, parts = option
         is_inner = [t in inside for t in targets]
-        can_stay = not high or sum(compress(high, is_inner)) >= total
+        can_stay = all(sum(compress(high[a:b], is_inner[a:b])) >= mass for a, b, mass in parts)
         return can_stay and sum(compress(low, is_inner)) == sum(low)
 
     before, pending = sources(graph), [*graph]
@@ -447,8 +452,34 @@ class HoaAutomaton:
         postponed = functools.reduce(or_, (v[3] for v in graph))
         untils = [i for i in range(len(tableau.nodes)) if postponed >> i & 1]
         marks = [{v for v in graph if not v[3] >> i & 1} for i in untils]
-        edges = {v: [((w,), (1,), 1, None, ()) for w in out] for v, out in graph.items()}
+        edges = {v: [((w,), (1,), 1, None, (), ()) for w in out] for v, out in graph.items()}
         return bool(accepting(edges, {v: v[2] for v in graph}, parity, marks))
+
+
+# --- counts ---------------------------------------------------------------------------------------
+@functools.lru_cache(2**16)
+def excludes(method: str, k: int, n: int, x: Fraction, chance: Fraction) -> bool:
+    """True if k of n excludes all probabilities up to x < k / n, with a chance of error."""
+    if x * n >= k:
+        return False
+    (a, d), j = x.as_integer_ratio(), n - k
+    likelihood = math.comb(n, k) * a**k * (d - a) ** j
+    if method == "anytime":  # the mixture of Jeffreys over the likelihood is a martingale
+        mixture = math.comb(2 * k, k) * math.comb(2 * j, j) * d**n
+        return likelihood * 4**n <= chance * mixture
+    if method == "hoeffding":  # exp(2 n (k/n - x)^2) >= 2 / chance, from below
+        y, term, total = int(2 * n * (Fraction(k, n) - x) ** 2 * 2**64), 2**64, 0
+        for i in range(1, 2**12):
+            total, term = total + term, (term * y >> 64) // i
+        return total * chance >= 2**65
+    need(method == "clopper-pearson", f"the method {method!r:.40} is unknown")
+    # The tail P(Bin(n, x) >= k), rounded up to 256 bits below its first term.
+    shift = max(0, likelihood.bit_length() - 256)
+    total = term = (likelihood >> shift) + 1
+    for i in range(k, n):
+        term = -(-term * (n - i) * a // ((i + 1) * (d - a)))
+        total += term
+    return total << shift <= chance / 2 * d**n
 
 
 # --- the question ---------------------------------------------------------------------------------
@@ -467,6 +498,7 @@ def question_text(question: dict) -> str:
     head = players.get(question.get("environment", ""), "") + head
     notes = [f"discount {path['discount']}"] if "discount" in path else []
     notes += ["policies see observations"] if "observations" in question else []
+    notes += ["of a given policy"] if "policy" in question else []
     return f"{head}=? [ {formula_text(inner)} ]" + (f" // {', '.join(notes)}" if notes else "")
 
 
@@ -492,7 +524,9 @@ class CertificateFile:
             self.direction[player] = OTHER[objective] if word == "adversarial" else objective
         text = question_text(self.question)
         hold(self.question["text"] == text, f"the text of the question is not {text!r}")
-        self.automaton, self.trusted = None, ""
+        self.automaton, self.trusted, self.confidence, self.unproven = None, "", "", ""
+        if "counts" in index:
+            self.check_counts(record(index["counts"], COUNTS))
         if self.kind == "formula":
             tableau = Tableau(self.path["formula"])
             text = contents[f"certificate/{self.path['automaton']}.hoa"].decode()
@@ -503,7 +537,7 @@ class CertificateFile:
                 wrong = self.automaton.meets(1, tableau, tableau.root)
                 hold(not wrong, "the automaton rejects a word that satisfies the formula")
             except OverflowError:
-                self.trusted = "the automaton, as its product with the tableau is too large"
+                self.unproven = "the automaton, as its product with the tableau is too large"
 
     def letters(self, names: Iterable[str]) -> tuple[list[frozenset[str]], list[int]]:
         """The sets of propositions that hold in some state, and the number of each state's set."""
@@ -521,13 +555,35 @@ class CertificateFile:
         need(is_boolean, f"{formula_text(formula):.80} is temporal, and no set of states")
         return [bool(ways[i]) for i in letter_of]
 
-    def array(self, name: str, shape: list[int], *kinds: str) -> Sequence:
-        """An array of the certificate."""
+    def array(self, name: str, **shapes: list[int]) -> Sequence:
+        """An array of the certificate, of one of some kinds of numbers and their shape."""
         entry = record(self.members.get(name), "dtype:str shape:list")
-        dtype = "double64" if entry["dtype"] == "double" else entry["dtype"]
-        fits = entry["shape"] == shape and dtype.startswith(kinds)
-        need(fits, f"{name:.80} is {entry!s:.80}; expected {kinds} of shape {shape}")
+        dtype, shape = entry["dtype"], entry["shape"]
+        fits = shapes.get(dtype.rstrip("0123456789")) == shape
+        need(fits, f"{name:.80} is {entry!s:.80}; expected {shapes}")
+        dtype = "double64" if dtype == "double" else dtype
         return read_numbers(self.contents, f"certificate/{name}", dtype, math.prod(shape))
+
+    def check_counts(self, table: dict) -> None:
+        """The intervals of the model contain confidence sets of all rows together, from counts.
+
+        A row of 2 successors is one event, a row of J > 2 successors J events: a union bound.
+        """
+        confidence = to_fraction(table["confidence"])
+        counts = self.array(table["member"], uint=[self.model.branch_start[-1]])
+        need(0 < confidence < 1 and self.model.opponents["nature"], "counts are of intervals")
+        ends = [(a, b) for a, b in zip(self.model.branch_start, self.model.branch_start[1:])]
+        sizes = [b - a for a, b in ends if b - a > 1]
+        chance = (1 - confidence) / max(1, sum(1 if n == 2 else n for n in sizes))
+        for r, (begin, end) in enumerate(ends):
+            low, common, high = self.model.rows[r][1:]
+            n = sum(counts[begin:end])
+            for k, a, b in zip(counts[begin:end], low, high or low):
+                tests = (k, Fraction(a, common)), (n - k, 1 - Fraction(b, common))
+                holds = all(x <= 0 or excludes(table["method"], i, n, x, chance) for i, x in tests)
+                hold(holds or end - begin == 1, f"row {r}: the counts allow more than an interval")
+        self.confidence = f", with confidence {table['confidence']}"
+        self.trusted += f"the counts, and that {table['assumption']}"
 
 
 # --- the conditions -------------------------------------------------------------------------------
@@ -546,29 +602,49 @@ class ClaimChecker:
         self.is_negated = side == "lower" and kind == "formula"
         self.is_upper = side == "upper" or self.is_negated
         # The memory is that of the policy, or counts the steps that remain.
-        self.counts, has_memory = "steps" in path, "memory" in claim
-        hold(not (self.counts and has_memory), "a memory and bounded steps are not covered")
-        self.memory = path["steps"] + 1 if self.counts else claim.get("memory", 1)
+        sizes = [table["memory"] for table in (file.question, claim) if "memory" in table]
+        sizes += [path["steps"] + 1] if "steps" in path else []
+        hold(len(sizes) < 2, "two memories, or a memory and bounded steps, are not covered")
+        self.counts, self.memory = "steps" in path, [*sizes, 1][0]
         axes = [file.automaton.num_states] if file.automaton else []
-        axes += [self.memory] * (self.counts or has_memory)
+        axes += sizes
         shape, self.width = [states, *axes], math.prod(axes)
-        self.values = file.array(claim["values"], shape, "double", "rational")
-        self.policy = file.array(claim["policy"], shape, "uint") if "policy" in claim else ()
-        self.next = file.array(claim["next"], shape, "uint") if has_memory else ()
+        self.values = file.array(claim["values"], double=shape, rational=shape)
+        # A policy of the question knows states and memory alone, that of the claim nodes.
+        axes = [self.memory] if "memory" in file.question else []
+        rule, inner = (file.question, axes) if axes else (claim, shape[1:])
+        self.next: Sequence = ()
+        if "memory" in rule:
+            self.next, self.block = (
+                file.array(rule["next"], uint=[states, *inner]),
+                math.prod(inner),
+            )
         need(max(self.next, default=0) < self.memory, "a memory state is out of range")
         directions = file.direction["system"], file.direction["environment"], ""
         self.is_ours = [directions[owner] == ours for owner in self.model.owner]
-        self.is_our_nature = file.direction["nature"] == ours
-        if "observations" in file.question and directions[0] == ours:
-            seen = file.array(file.question["observations"], [states], "uint")
+        self.is_our_nature, num_rows = file.direction["nature"] == ours, len(self.model.rows)
+        hold(not (self.is_our_nature and file.confidence), "counts prove what all intervals prove")
+        fixing = {i: (claim, shape[1:]) for i in (0, 1) if directions[i] == ours}
+        fixing |= {0: (file.question, axes)} if "policy" in file.question else {}
+        # Of each owner: choices of nodes, or weights of rows at nodes, and nodes of a state.
+        self.policy: dict[int, tuple] = {}
+        for owner, (table, more) in fixing.items():
+            if "policy" in table:
+                rows, nodes = [num_rows, *more], [states, *more]
+                numbers = file.array(table["policy"], uint=nodes, double=rows, rational=rows)
+                self.policy[owner] = numbers, math.prod(more)
+        if "observations" in file.question and (directions[0] == ours or 0 in self.policy):
+            seen = file.array(file.question["observations"], uint=[states])
             choices: dict[tuple, tuple] = {}
-            hold(self.policy, "a policy that sees observations is missing")
-            starts, zeros = self.model.row_start, [0] * len(self.model.rows)
+            hold(0 in self.policy, "a policy that sees observations is missing")
+            starts, zeros = self.model.row_start, [0] * num_rows
             name = "actions/choices/values"
             action = read_numbers(file.contents, name, "uint32", len(zeros), zeros)
-            for v, k in enumerate(self.policy):
+            for v in range(states * self.width):
                 s = v // self.width
-                choice = k, [*action[starts[s] : starts[s + 1]]], self.next[v] if self.next else 0
+                chosen, weights = self.taken(v, 0)
+                names = [action[r] for r in range(starts[s], starts[s + 1])]
+                choice = [r - starts[s] for r in chosen], weights, names, self.after(v)
                 is_same = choices.setdefault((seen[s], v % self.memory), choice) == choice
                 hold(is_same, f"state {s}: the policy depends on more than observations")
         # Values and rewards of branches as integers over one denominator.
@@ -597,40 +673,75 @@ class ClaimChecker:
         more = f", automaton and memory state {divmod(k, self.memory)}" if self.width > 1 else ""
         return f"{self.claim['side']} bound: state {s}{more}"
 
+    def after(self, v: int) -> int:
+        """The memory state after a node."""
+        s, k = divmod(v, self.width)
+        if self.next:
+            return self.next[s * self.block + k % self.block]
+        return k % self.memory - self.counts
+
+    def taken(self, v: int, owner: int) -> tuple[Sequence, list]:
+        """The rows of a node that its owner's policy takes, if it has one, and their weights."""
+        (s, k), starts = divmod(v, self.width), self.model.row_start
+        rows, (policy, block) = range(starts[s], starts[s + 1]), self.policy.get(owner, ((), 1))
+        if not policy or len(rows) == 1:
+            return rows, []
+        if getattr(policy, "typecode", "d") != "d":
+            choice = policy[s * block + k % block]
+            hold(choice < len(rows), f"state {s}: the policy has no such choice")
+            return (rows[choice],), []
+        weights = [policy[r * block + k % block] for r in rows]
+        is_known = all(0 <= x < math.inf for x in weights) and any(weights)
+        hold(is_known, f"state {s}: the weights of a policy are negative, or no numbers")
+        return [*compress(rows, weights)], [x for x in weights if x]
+
     def options(self, v: int) -> list[tuple]:
-        """The options of a node: its rows, or that of the policy."""
+        """The options of a node: its rows, or that of the policy, or its mean of rows."""
         model, width, (s, k) = self.model, self.width, divmod(v, self.width)
-        numbers: Sequence = range(model.row_start[s], model.row_start[s + 1])
-        if self.policy and self.is_ours[s]:
-            hold(self.policy[v] < len(numbers), f"state {s}: the policy has no such choice")
-            numbers = (numbers[self.policy[v]],)
+        rows, weights = self.taken(v, model.owner[s])
         options, offset, automaton = [], 0, self.file.automaton
         if width > 1:
-            q, m = divmod(k, self.memory)
+            q = k // self.memory
             q = automaton.edges[automaton.letter_of[s]][q][0] if automaton else q
-            offset = q * self.memory + (m - 1 if self.counts else self.next[v] if self.next else m)
-        for r in numbers:
+            offset = q * self.memory + self.after(v)
+        for r in rows:
             targets, low, total, high = model.rows[r]
             targets = [t * width + offset for t in targets] if width > 1 else targets
             rewards = self.rewards[model.branch_start[r] : model.branch_start[r + 1]]
-            option = targets, low, total, high, rewards
+            option = targets, low, total, high, rewards, ((0, len(low), total),) if high else ()
             if high and self.is_our_nature:
-                option = targets, self.extreme(option)[1], total, None, rewards
+                option = targets, self.extreme(option)[1], total, None, rewards, ()
             options.append(option)
-        return options
+        if len(options) < 2 or not weights:
+            return options
+        # One option, whose parts have the mass of their weights.
+        (weights,), _ = to_integers(weights)
+        common = math.lcm(*(option[2] for option in options))
+        mixed: tuple = [], [], sum(weights) * common, [] if options[0][3] else None, [], []
+        for (targets, low, total, high, rewards, _), weight in zip(options, weights):
+            scale, begin = weight * (common // total), len(mixed[0])
+            mixed[0].extend(targets)
+            mixed[1].extend([n * scale for n in low])
+            mixed[4].extend(rewards)
+            if high:
+                mixed[3].extend([n * scale for n in high])
+                mixed[5].append((begin, len(mixed[0]), total * scale))
+        return [mixed]
 
     def extreme(self, option: tuple) -> tuple[list, list]:
         """Values of successors with rewards, and numerators of the worst (or our best) distribution.
 
         What is missing to 1 goes to successors in the order of values, and equal values share it.
         """
-        targets, low, total, high, rewards = option
+        targets, low, _, high, rewards, parts = option
         values = [self.following[t] for t in targets]
         if rewards:
             values = list(map(add, values, rewards))
         if high:
-            low, missing, value_of = low[:], total - sum(low), values.__getitem__
-            order = sorted(range(len(low)), key=value_of, reverse=not self.is_our_nature)
+            low, value_of = low[:], values.__getitem__
+        for begin, end, mass in parts:
+            missing = mass - sum(low[begin:end])
+            order = sorted(range(begin, end), key=value_of, reverse=not self.is_our_nature)
             for _, group in groupby(order, value_of):
                 if not missing:
                     break
@@ -702,7 +813,7 @@ class ClaimChecker:
             raise Refusal(f"{self.place(v)}: paths may stay forever, and miss the target")
         if self.infinite and not self.is_upper:
             final = graph.keys() - nodes
-            loops = {v: [((v,), (1,), 1, None, ())] for v in final}
+            loops = {v: [((v,), (1,), 1, None, (), ())] for v in final}
             for v in recurring({**nodes, **loops}, [final]).keys() & self.infinite:
                 raise Refusal(f"{self.place(v)}: the target can be reached surely, no infinity")
         # The bound in the initial states.
@@ -713,7 +824,7 @@ class ClaimChecker:
         why = f"{self.place(v)}: {self.values[v]!s:.40} is beyond {text:.40}"
         hold(relation(self.values[v], bound), why)
         claimed = f"{self.file.question['text']} is {'>=' if is_lower else '<='} {text}"
-        return len(graph), f"{claimed} in every initial state"
+        return len(graph), f"{claimed} in every initial state{self.file.confidence}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -729,8 +840,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for claim in file.claims:
             num_nodes, text = ClaimChecker(file, claim).check()
             lines += [f"claimed: {text}", f"checked: {num_nodes} nodes of the claim's graph"]
-        lines += [f"on trust: that the model is the one meant; {file.trusted or 'nothing else'}"]
-        lines += ["ACCEPTED, given the automaton" if file.trusted else "ACCEPTED"]
+        trust = "; ".join(x for x in (file.trusted, file.unproven) if x) or "nothing else"
+        lines += [f"on trust: that the model is the one meant; {trust}"]
+        lines += ["ACCEPTED, given the automaton" if file.unproven else "ACCEPTED"]
     except Refusal as why:
         status, lines = 1, [f"REFUSED: {why}"]
     except Exception as why:  # no error of any kind is an acceptance

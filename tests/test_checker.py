@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 import jaxltl
-from jaxltl.checker import formula_text, main, question_text
+from jaxltl.checker import excludes, formula_text, main, question_text
 from jaxltl.core.logic.ltl import as_formula
-from tests.certificate_files import certificate, model, words, write
-from tests.reference_certificates import chain_values, optimum, total_values
+from tests.certificate_files import certificate, doubles, model, words, write
+from tests.reference_certificates import chain_values, optimum, total_values, vertices
 
 CHECKER = Path(jaxltl.__file__).parent / "checker.py"
 QUARTER = [(1, 0.75), (4, 0.25)]
@@ -833,6 +833,122 @@ def test_policies_that_see_observations_alone(tmp_path, capsys):
     peeking = [0, 0, 1, 1] + [0] * 8
     made = memory_file(peeking, FLIP, arrays={"seen": ("uint32", [3], [0, 1, 1])}, **more)
     assert outcome(tmp_path, capsys, made)[0] == 1
+
+
+def mixed_values(states, weights, direction, value_of_chain):
+    """Values of a randomised policy, with the vertices of each row that are best in a direction."""
+    choose, best = {"max": max, "min": min}[direction], None
+    every = [vertices(row) for rows in states for row in rows]
+    for chosen in itertools.product(*every):
+        rows, chain = iter(chosen), []
+        for s, options in enumerate(states):
+            total = sum(weights[s])
+            mean: dict = {}
+            for w, row in zip(weights[s], [next(rows) for _ in options], strict=True):
+                for t, p in row:
+                    mean[t] = mean.get(t, 0) + p * w / total
+            chain.append([*mean.items()])
+        values = value_of_chain(chain)
+        best = values if best is None else [*map(choose, best, values)]
+    return best
+
+
+@pytest.mark.parametrize("nature", ["adversarial", "cooperative"])
+@pytest.mark.parametrize("form", ["mdp", "intervals"])
+def test_a_given_randomised_policy(form, nature, tmp_path, capsys):
+    rng = random.Random(f"{form} {nature}")
+    accepted = refused = 0
+    goal, everything = {2}, {0, 1, 2}
+    for _ in range(10):
+        states = random_states(rng, 3, form == "intervals")
+        weights = [[Fraction(rng.randint(1, 3)) for _ in rows] for rows in states]
+        direction = "max" if nature == "cooperative" else "min"
+        best = mixed_values(
+            states, weights, direction, lambda chain: chain_values(chain, goal, everything)
+        )
+        question = {"path": UNTIL, "objective": "max", "policy": "given"}
+        question |= {"nature": nature} if form == "intervals" else {}
+        head = f"Pmax{direction}" if form == "intervals" else "Pmax"
+        question["text"] = f'{head}=? [ F "goal" ] // of a given policy'
+        flat = [float(w) for row in weights for w in row]
+        for side, sign in (("lower", 1), ("upper", -1)):
+            for move in (0, 0.25, -0.25):
+                values = [x + Fraction(move) * (i < 2) for i, x in enumerate(best)]
+                made = claim_file(
+                    model(states, labels={"goal": [2]}), question, side, values, [0] * 3, [3]
+                )
+                index = json.loads(made["certificate/index.json"])
+                del index["claims"][0]["policy"]
+                index["members"]["given"] = {"dtype": "double", "shape": [len(flat)]}
+                made["certificate/given.bin"] = doubles(flat)
+                made["certificate/index.json"] = json.dumps(index).encode()
+                status, text = outcome(tmp_path, capsys, made)
+                true = sign * (values[0] - best[0]) <= 0
+                assert (status == 0) if not move else (status == 1 or true), text
+                accepted, refused = accepted + (status == 0), refused + (status == 1)
+    assert accepted > 20 and refused > 5
+
+
+@pytest.mark.parametrize("weights", [[1.0, -1.0, 3.0], [0.0, 0.0, 0.0], [math.nan, 1.0, 1.0]])
+def test_weights_of_a_policy_are_numbers_of_at_least_0(weights, tmp_path, capsys):
+    arrays = {"policy": ("double", [7], [*weights, 1.0, 1.0, 1.0, 1.0])}
+    status, text = outcome(tmp_path, capsys, five(arrays=arrays))
+    assert status == 1 and "the weights of a policy" in text
+
+
+# --- counts -----------------------------------------------------------------------------------
+
+COIN = {  # 90 of 100, with a confidence of 0.95: intervals of three tests
+    "hoeffding": (0.7641, 1.0),
+    "clopper-pearson": (0.8237, 0.9511),
+    "anytime": (0.7724, 0.9710),
+}
+
+
+def coin_file(method, low, high, confidence="0.95", **more):
+    """A coin that fell 90 times of 100 on the goal, and its interval."""
+    states = [[[(1, (low, high)), (2, (1 - high, 1 - low))]], [[(1, (1.0, 1.0))]]]
+    states += [[[(2, (1.0, 1.0))]]]
+    question = {"text": 'Pmaxmin=? [ F "goal" ]', "path": UNTIL, "objective": "max"}
+    question |= {"nature": "adversarial"}
+    arrays = {"low": ("double", [3], [low, 1.0, 0.0]), "counts": ("uint64", [4], [90, 10, 0, 0])}
+    claims = [{"side": "lower", "bound": str(Fraction(low)), "values": "low"}]
+    made = certificate(model(states, labels={"goal": [1]}), question, claims, arrays)
+    counts = {"member": "counts", "method": method, "confidence": confidence}
+    return edited(made, counts={**counts, "assumption": "there are no others"}, **more)
+
+
+@pytest.mark.parametrize("method", COIN)
+def test_intervals_contain_confidence_sets_of_counts(method, tmp_path, capsys):
+    low, high = COIN[method]
+    status, text = outcome(tmp_path, capsys, coin_file(method, low, high))
+    assert status == 0 and "with confidence 0.95" in text and "there are no others" in text
+    for ends in ((low + 0.001, high), (low, high - 0.001)):
+        status, text = outcome(tmp_path, capsys, coin_file(method, *ends))
+        assert status == 1 and "the counts allow more" in text, ends
+    assert outcome(tmp_path, capsys, coin_file(method, low, high, "0.96"))[0] == 1
+    assert outcome(tmp_path, capsys, coin_file("guess", low, high))[0] == 2
+    index = json.loads(coin_file(method, low, high)["certificate/index.json"])
+    question = {**index["question"], "nature": "cooperative", "text": 'Pmaxmax=? [ F "goal" ]'}
+    status, text = outcome(tmp_path, capsys, coin_file(method, low, high, question=question))
+    assert status == 1 and "what all intervals prove" in text
+
+
+def test_intervals_of_the_library_contain_confidence_sets():
+    intervals_from_counts = jaxltl.statistics.intervals_from_counts
+
+    rng = random.Random(3)
+    for method in COIN:
+        for n in (1, 2, 7, 40, 1000):
+            counts = [[k, n - k] for k in {0, 1, n, rng.randint(0, n)} if k <= n]
+            found = intervals_from_counts(counts, 0.9, method=method)
+            chance = Fraction(1, 10) / len(counts)
+            for (k, j), low in zip(counts, found.lower, strict=True):
+                for count, end in ((k, low[0]), (j, low[1])):
+                    for shift, expected in ((0, True), (2.0**-8, False)):
+                        x = Fraction(float(end)) + Fraction(shift) * (count > 0)
+                        is_in = x == 0 or excludes(method, count, n, x, chance)
+                        assert is_in == (expected or count == 0), (method, n, count)
 
 
 def test_the_command_verify_is_the_checker(tmp_path):

@@ -186,8 +186,105 @@ def test_products_with_formulas(label_on, tmp_path, capsys):
     found, path = jl.optimal_satisfaction(product), tmp_path / "file.umb"
     write_certificate(path, product, found, 'Pmax=? [ (G F "g") & (G !"t") ]')
     assert width(verified(path, capsys)) < 1e-5
-    with pytest.raises(ValueError, match="products are for formulas"):
-        write_certificate(path, product, found, 'Pmax=? [ F "g" ]')
+    found = jl.optimal_satisfaction(jl.product(world, "F g", label_on=label_on))
+    write_certificate(path, product, found, 'Pmax=? [ F "g" ]')  # without an automaton
+    assert width(verified(path, capsys)) < 1e-5
+
+
+def with_labels(seed):
+    """A random model with two labels."""
+    model, label = random_model(seed, size=7), np.random.default_rng(seed).random((7, 2)) < 0.5
+    return replace(model, label=label, propositions=("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("formula", "directions"), [*zip(FORMULAS, ("maxmax", "minmin", "maxmin"), strict=False)]
+)
+def test_formulas_of_interval_models_and_games(formula, directions, tmp_path, capsys):
+    model, path, objective = with_labels(2), tmp_path / "file.umb", directions[:3]
+    p, plain = np.asarray(model.probability), formula.replace('"', "")
+    rough = jl.make_interval(model, 0.5 * p, np.minimum(1.5 * p, 1))
+    nature = "cooperative" if directions[3:] == objective else "adversarial"
+    found = jl.optimal_satisfaction(rough, plain, objective=objective, nature=nature)
+    write_certificate(path, rough, found, f"P{directions}=? [ {formula} ]")
+    assert width(verified(path, capsys)) < 1e-5
+    game = jl.make_game(model, np.random.default_rng(2).random(7) < 0.5)
+    found = jl.optimal_satisfaction(game, plain, objective=objective)
+    write_certificate(path, game, found, f"P{objective}=? [ {formula} ]")
+    text = verified(path, capsys)
+    assert "<<system>>" in text and width(text) < 1e-5
+
+
+def random_policy(model, shape, seed=0):
+    """Weights of all actions of each state, in a shape."""
+    number = np.asarray(model.action_number)
+    weights = np.zeros((*shape, number.max() + 1))
+    some = np.random.default_rng(seed).random((model.num_rows, *shape[1:])) + 0.1
+    weights[(model.host.state, ..., number)] = some
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def test_policies_of_states(tmp_path, capsys):
+    model, path = random_model(0, reward=True), tmp_path / "file.umb"
+    goal, policy = np.asarray(model.states_with_label("goal")), random_policy(model, (SIZE,))
+    game = jl.make_game(model, np.random.default_rng(2).random(SIZE) < 0.5)
+    for world, one in ((model, policy), (model, policy.argmax(-1)), (game, policy)):
+        found = jl.reachability_probability(world, goal, policy=one)
+        write_certificate(path, world, found, 'Pmax=? [ F "goal" ]', policy=one)
+        text = verified(path, capsys)
+        assert "// of a given policy" in text and width(text) < 1e-5
+        for question in ('Pmax=? [ F<=5 "goal" ]', 'R{"cost"}max=? [ F "goal" ]'):
+            write_certificate(path, world, None, question, policy=one)
+            verified(path, capsys)
+        write_certificate(path, world, None, 'R{"cost"}max=? [ C ]', policy=one, discount=0.9)
+        assert width(verified(path, capsys)) < 1e-5
+    with pytest.raises(ValueError, match="contradict"):
+        write_certificate(
+            path,
+            game,
+            replace(found, lower=found.lower + 0.5),
+            'Pmax=? [ F "goal" ]',
+            policy=policy,
+        )
+
+
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_policies_with_memory(label_on, tmp_path, capsys):
+    model, path = with_labels(1), tmp_path / "file.umb"
+    formula, plain = FORMULAS[2], FORMULAS[2].replace('"', "")
+    product = jl.product(model, plain, label_on=label_on)
+    policy = random_policy(model, product.state_shape)
+    found = jl.satisfaction_probability(product, policy)
+    write_certificate(path, product, found, f"Pmax=? [ {formula} ]", policy=policy)
+    assert width(verified(path, capsys)) < 1e-5
+    best = jl.optimal_satisfaction(model, plain, label_on=label_on)
+    policy = jl.project_policy(model, best)
+    write_certificate(path, model, best, f"Pmax=? [ {formula} ]", policy=policy)
+    assert width(verified(path, capsys)) < 1e-5
+    rough = jl.make_interval(model, model.probability, model.probability)
+    with pytest.raises(ValueError, match="policy is randomised"):
+        policy = random_policy(model, (7,))
+        write_certificate(path, rough, None, f"Pmaxmin=? [ {formula} ]", policy=policy)
+
+
+@pytest.mark.parametrize("objective", ["max", "min"])
+def test_guarantees_from_counts(objective, tmp_path, capsys):
+    model, path = with_labels(2), tmp_path / "file.umb"
+    counts = np.rint(500 * np.asarray(model.probability)).astype(int)
+    nature = "min" if objective == "max" else "max"
+    question = f'P{objective}{nature}=? [ G F "a" ]'
+    for method in ("anytime", "clopper-pearson", "hoeffding"):
+        found = jl.learn_guarantee(
+            model, counts, "G F a", 0.95, graph="given", method=method, objective=objective
+        )
+        write_certificate(path, found.model, found, question)
+        text = verified(path, capsys)
+        assert "with confidence 0.95" in text and text.count("claimed") == 1
+        bound = float(Fraction(text.split(" is ")[1].split()[1]))
+        assert abs(bound - found.bound) < 1e-5
+    found = jl.learn_guarantee(model, counts, "G F a", 0.95, graph="given", method="weissman")
+    with pytest.raises(ValueError, match="smallest intervals"):
+        write_certificate(path, found.model, found, question)
 
 
 def test_padded_models_and_chains(tmp_path, capsys):

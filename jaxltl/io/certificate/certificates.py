@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 
@@ -17,41 +18,46 @@ from jaxltl.core.logic.labels import is_boolean, satisfying
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.lifting import project_policy
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, reward_structure
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.validation import errors_in
-from jaxltl.io.files import write_bytes
-from jaxltl.io.formula_claims import formula_claims
-from jaxltl.io.hoa.hoa import write_hoa
-from jaxltl.io.inductive_bounds import (
+from jaxltl.core.values.engine.row_form import row_form, row_of_action
+from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee
+from jaxltl.io.certificate.formula_claims import formula_claims
+from jaxltl.io.certificate.induced_model import induced_problem, solved
+from jaxltl.io.certificate.inductive_bounds import (
+    OPPOSITE,
     SHIFTS,
     TIGHT,
     Booleans,
     Certified,
     Floats,
     Integers,
-    as_text,
     candidates,
+    contents_of,
+    proven,
     store,
 )
+from jaxltl.io.files import write_bytes
+from jaxltl.io.hoa.hoa import write_hoa
 from jaxltl.io.umb.members import tar_pieces, write_gzip
-
-_OPPOSITE = {"max": "min", "min": "max"}
 
 
 def write_certificate(
     path: str | os.PathLike[str],
     model: Model,
-    solution: Solution,
+    solution: Solution | DataGuarantee | None,
     question: str,
     *,
     reward: Rewards | chex.Array | None = None,
     discount: float | None = None,
+    policy: FiniteMemoryPolicy | chex.Array | None = None,
 ) -> None:
     """Writes a model with a certificate of a solution's bounds in its initial states.
 
@@ -62,9 +68,10 @@ def write_certificate(
     Args:
       path: the file, a UMB archive.
       model: a SparseMDP, MDP or DenseMDP, an IntervalMDP without L1 balls, or a Game of one of them,
-        whose environment is adversarial. For a formula also a Product of a model without players.
+        whose environment is adversarial; for a formula also a Product.
       solution: of the question, such as of :func:`~jaxltl.reachability_probability`, with bounds
-        and a deterministic policy; of a formula that of :func:`~jaxltl.optimal_satisfaction`.
+        and a deterministic policy; of a formula that of :func:`~jaxltl.optimal_satisfaction`, or the
+        guarantee of :func:`~jaxltl.learn_guarantee`, with the counts of its log. None: it is solved.
       question: in PRISM's syntax, over labels of the model: ``Pmax=? [ F "goal" ]``,
         ``Pmin=? [ "safe" U "goal" ]``, ``Pmax=? [ F<=9 "goal" ]``, ``R{"time"}min=? [ F "goal" ]``,
         ``R{"time"}max=? [ C ]``, ``R{"time"}max=? [ C<=9 ]``, ``Pmax=? [ G F "goal" ]``.
@@ -73,6 +80,8 @@ def write_certificate(
       reward: ``float[S]``, ``float[R]`` or ``float[S, A]``: replaces the reward that the question
         names.
       discount: in [0, 1), of a question ``R{"name"}max=? [ C ]``: discounted instead of total reward.
+      policy: the question is about this policy of the system: actions ``int[S]`` or weights
+        ``float[S, A]``, of a product ``[S, Q]`` and ``[S, Q, A]``, or with a finite memory.
 
     Raises:
       ValueError: the model or the question is of another kind, the solution has no bounds, or they
@@ -95,32 +104,37 @@ def write_certificate(
       0
     """
     with errors_in("write_certificate: "):
-        product = model if isinstance(model, Product) else None
-        world: Model = model if product is None else product.mdp
-        problem = _problem(world, parse_property(question), reward, discount)
-        steps, is_formula = problem.path.get("steps"), problem.path["kind"] == "formula"
-        if not is_formula and (product is not None or solution.product_policy is not None):
-            raise ValueError(
-                f"{question}: products are for formulas; give to_sparse(product) and its Solution."
-            )
-        policy = None
-        if not is_formula and steps is None:
-            policy = _offsets(model, solution, problem)
-        contents = problem.contents(policy)
+        lazy = model.mdp if isinstance(model, Game) else model
+        world: Model = model
+        if isinstance(lazy, Product):
+            world = replace(model, mdp=lazy.mdp) if isinstance(model, Game) else lazy.mdp
+        problem, formula = _problem(world, parse_property(question), reward, discount)
+        answer = solution.satisfaction if isinstance(solution, DataGuarantee) else solution
+        simple = None if policy is not None or isinstance(lazy, Product) else answer
+        if simple is not None and simple.product_policy is not None:
+            simple = None  # its values are those of a product
+        automaton = None if formula is None else to_automaton(formula)
+        if isinstance(lazy, Product) and not isinstance(policy, FiniteMemoryPolicy | None):
+            policy = project_policy(lazy, policy)
+        induced = None if policy is None else induced_problem(problem, policy)
+        problem.question["text"] = checker.question_text(problem.question)
+        text = "" if automaton is None else write_hoa(automaton)
+        guarantee = solution if isinstance(solution, DataGuarantee) else None
+        if guarantee is not None:  # of what holds for all probabilities in the intervals
+            side = "lower" if problem.directions[1] == "min" else "upper"
+            problem = replace(problem, sides=(side,))
+        contents = contents_of(problem.model, problem.question, text, guarantee)
         file = checker.CertificateFile(contents)
-        claims = []
-        if is_formula:
-            claims = formula_claims(problem, file)
-            _check_initial(product, solution, claims)
-        for side in () if is_formula else ("lower", "upper"):
-            bound = np.array(getattr(solution, side), np.float64).ravel()
-            if bound.shape != (problem.host.num_states,) or np.isnan(bound).any():
-                raise ValueError(f"solution.{side} has shape {bound.shape}, or NaN; expected [S].")
-            if isinstance(steps, int):
-                claims.append(_step_claim(problem, file, side, bound, steps))
-            elif policy is not None and (side == "lower" or problem.is_bounded(bound)):
-                value = np.array(solution.value).ravel()
-                claims.append(_claim(problem, file, side, (value, bound), policy))
+        if induced is not None:
+            problem, arrays = induced
+            for name, (values, shape) in arrays.items():
+                store(file, name, values, shape)
+        if automaton is not None:
+            claims = formula_claims(problem, file, automaton)
+        else:
+            claims = _claims(problem, file, solved(problem) if simple is None else simple)
+        if answer is not None:
+            _check_initial(answer, model, claims)
     index = json.loads(contents["certificate/index.json"])
     index |= {"claims": claims, "members": file.members}
     contents["certificate/index.json"] = json.dumps(index, indent=1).encode()
@@ -130,8 +144,8 @@ def write_certificate(
 
 def _problem(
     model: Model, prop: Property, reward: Rewards | chex.Array | None, discount: float | None
-) -> Certified:
-    """Validates the model and the question."""
+) -> tuple[Certified, Formula | None]:
+    """Validates the model and the question; with the formula that needs an automaton."""
     inner = model.mdp if isinstance(model, Game) else model
     if isinstance(inner, IntervalMDP):
         refuse_ball(inner, "a certificate holds intervals")
@@ -166,10 +180,6 @@ def _problem(
         path = {"kind": "total", "reward": name, "steps": earned.steps}
     elif prop.operator == "P" and isinstance(prop.path, Formula):
         path = {"kind": "formula", "formula": _nested(prop.path), "automaton": "automaton"}
-        if system is not None or isinstance(inner, IntervalMDP):
-            raise ValueError(
-                f"{prop.text}: of games and interval models, only F and U are written."
-            )
     is_wrong = "kind" not in path or prop.definitions
     if is_wrong or (discount is not None and (path["kind"] != "total" or "steps" in path)):
         raise ValueError(
@@ -182,13 +192,12 @@ def _problem(
     environment: str = direction
     nature: str = direction
     if system is not None:
-        question["environment"], environment = "adversarial", _OPPOSITE[direction]
+        question["environment"], environment = "adversarial", OPPOSITE[direction]
     if isinstance(inner, IntervalMDP):
         if prop.nature is None:
             raise ValueError(f"{prop.text}: give nature's direction too, as in Pmaxmin=?.")
         nature = prop.nature
         question["nature"] = "cooperative" if nature == direction else "adversarial"
-    question["text"] = checker.question_text(question)
     written: Model = replace(inner, nominal=sparse) if isinstance(inner, IntervalMDP) else sparse
     written = replace(model, mdp=written) if isinstance(model, Game) else written
     host = sparse.host
@@ -200,9 +209,6 @@ def _problem(
         for part, place in (*parts, (structure.transition, slice(None))):
             gain += 0 if part is None else np.asarray(part, np.float64)[place]
     everywhere = np.ones(host.num_states, bool)
-    hoa = ""
-    if path["kind"] == "formula" and isinstance(prop.path, Formula):
-        hoa = write_hoa(to_automaton(prop.path))
 
     def mask(formula: Formula | None) -> Booleans:
         names = formula.propositions if formula else ()
@@ -210,7 +216,7 @@ def _problem(
         label = np.stack([everywhere, *columns], axis=1)[:, 1:]
         return satisfying(label, names, formula or "true", prop.text)
 
-    return Certified(
+    problem = Certified(
         model=written,
         sparse=sparse,
         uncertain=inner.host if isinstance(inner, IntervalMDP) else None,
@@ -223,8 +229,11 @@ def _problem(
         stay=mask(until[0]) if "stay" in path else everywhere,
         gain=gain,
         discount=1.0 if discount is None else float(discount),
-        automaton=hoa,
+        node=np.arange(host.num_states),
+        shape=(host.num_states,),
     )
+    is_formula = path["kind"] == "formula"
+    return problem, prop.path if is_formula and isinstance(prop.path, Formula) else None
 
 
 def _nested(formula: Formula) -> str | list[object]:
@@ -239,58 +248,34 @@ def _nested(formula: Formula) -> str | list[object]:
     return [formula.operator, *operands]
 
 
-def _offsets(model: Model, solution: Solution, problem: Certified) -> Integers:
-    """The policy as numbers of rows within their states."""
-    policy = np.asarray(solution.policy)
-    if policy.ndim != len(model.state_shape) or not np.issubdtype(policy.dtype, np.integer):
-        raise ValueError(
-            "solution.policy is randomised or missing; expected an action of each state."
-        )
-    return row_of_action(problem.sparse, policy) - problem.host.row_start[:-1]
-
-
-def _claim(
-    problem: Certified,
-    file: checker.CertificateFile,
-    side: str,
-    value_and_bound: tuple[Floats, Floats],
-    policy: Integers,
-) -> dict[str, str]:
-    """A claim that the checker accepts, whose arrays are added to the file."""
-    claim = {"side": side, "values": side, "policy": "policy", "bound": ""}
-    rows = problem.host.row_start[:-1] + policy
-    reason = "no bound"
-    value, bound = value_and_bound
-    for values in candidates(problem, side, bound, value, rows):
-        store(file, side, values)
-        worst = [values[s] for s in np.flatnonzero(np.asarray(problem.sparse.initial) > 0)]
-        claim["bound"] = as_text((min if side == "lower" else max)(worst), side)
-        try:
-            checker.ClaimChecker(file, claim).check()
-        except checker.Refusal as error:
-            reason = str(error)
-            continue
-        return claim
-    raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
-
-
-def _check_initial(
-    product: Product | None, solution: Solution, claims: list[dict[str, str]]
-) -> None:
-    """Raises a ValueError if bounds of a solution contradict the claims in the initial states."""
-    if solution.product_policy is not None:
-        bounds = [np.asarray(x, np.float64) for x in (solution.lower, solution.upper)]
-    elif product is not None:
-        initial = np.asarray(product.initial) > 0
-        bounds = [np.asarray(x, np.float64)[initial] for x in (solution.lower, solution.upper)]
-    else:
-        raise ValueError(
-            "solution: give that of optimal_satisfaction(model, formula), or the product."
-        )
-    proven = {claim["side"]: Fraction(claim["bound"]) for claim in claims}
-    low, high = float(bounds[0].min()), float(bounds[1].max())
-    if not (low <= proven["upper"] + TIGHT and high >= proven["lower"] - TIGHT):
-        raise ValueError(f"solution has the bounds {low} and {high}, which {claims} contradict.")
+def _claims(
+    problem: Certified, file: checker.CertificateFile, solution: Solution
+) -> list[dict[str, str]]:
+    """Claims of reachability and rewards, of both sides where they have bounds."""
+    steps, claims, host = problem.path.get("steps"), [], problem.host
+    policy, name = np.asarray(solution.policy), ""
+    rows: Integers = np.array(host.row_start[:-1], np.int64)
+    if not host.is_chain and steps is None:
+        if policy.size != host.num_states or not np.issubdtype(policy.dtype, np.integer):
+            raise ValueError(
+                "solution.policy is randomised or missing; expected an action of each state, or "
+                "give it as policy=."
+            )
+        rows, name = row_of_action(problem.sparse, policy).astype(np.int64), "choices"
+        choices = np.zeros(int(np.prod(problem.shape)), np.int64)
+        choices[problem.node] = rows - host.row_start[:-1]
+        store(file, name, choices, problem.shape)
+    for side in problem.sides:
+        bound = np.array(getattr(solution, side), np.float64).ravel()
+        if bound.shape != (host.num_states,) or np.isnan(bound).any():
+            raise ValueError(f"solution.{side} has shape {bound.shape}, or NaN; expected [S].")
+        if isinstance(steps, int):
+            claims.append(_step_claim(problem, file, side, bound, steps))
+        elif side == "lower" or np.isfinite(bound[problem.initial]).any():
+            value = np.array(solution.value).ravel()
+            bounds = candidates(problem, side, bound, value, rows)
+            claims.append(proven(problem, file, side, bounds, policy=name))
+    return claims
 
 
 def _step_claim(
@@ -301,30 +286,44 @@ def _step_claim(
     first, inside = host.row_start[:-1], ~problem.target & problem.stay
     is_max = np.where(problem.system, problem.objective, problem.directions[0]) == "max"
     ends = np.where(problem.target, float(problem.is_probability), 0.0)
-    initial = np.flatnonzero(np.asarray(problem.sparse.initial) > 0)
-    claim, reason = {"side": side, "values": side, "bound": ""}, "none"
-    for factor in SHIFTS:
-        layers = [ends]
-        for _ in range(steps):
-            mean, _ = problem.means(layers[-1])
-            scale = max(1.0, float(np.abs(mean).max()), float(np.abs(problem.gain).max()))
-            best = np.where(
-                is_max, np.maximum.reduceat(mean, first), np.minimum.reduceat(mean, first)
+    initial = problem.initial
+
+    def bounds() -> Iterator[Floats]:
+        for factor in SHIFTS:
+            layers = [ends]
+            for _ in range(steps):
+                mean, _ = problem.means(layers[-1])
+                scale = max(1.0, float(np.abs(mean).max()), float(np.abs(problem.gain).max()))
+                most, least = (x.reduceat(mean, first) for x in (np.maximum, np.minimum))
+                best = np.where(is_max, most, least)
+                best = best + sign * 4 * factor * host.backup_unit * scale
+                best = np.clip(best, 0, 1) if problem.is_probability else best
+                layers.append(np.where(inside, best, ends))
+            beyond = sign * (layers[-1] - bound)[initial]  # a proven bound may be wider by rounding
+            if beyond.max(initial=0) > TIGHT * max(1.0, float(np.abs(bound[initial]).max())):
+                raise ValueError(
+                    f"no {side} bounds could be made inductive: they are beyond the values."
+                )
+            yield np.stack(layers, axis=1).ravel()
+
+    shape = host.num_states, steps + 1
+    counted = replace(problem, node=np.arange(shape[0] * shape[1]), shape=shape)
+    return proven(counted, file, side, bounds(), initial * (steps + 1) + steps)
+
+
+def _check_initial(solution: PyTree, model: Model, claims: list[dict[str, str]]) -> None:
+    """Raises a ValueError if bounds of a solution contradict the claims in the initial states."""
+    initial: Booleans | slice = slice(None)
+    if solution.product_policy is None:
+        initial = np.asarray(model.initial) > 0
+    low, high = (np.asarray(x, np.float64)[initial] for x in (solution.lower, solution.upper))
+    slack = TIGHT * max([1.0, *(abs(x) for x in (low.min(), high.max()) if np.isfinite(x))])
+    for claim in claims:
+        bound = float("inf") if claim["bound"] == "inf" else float(Fraction(claim["bound"]))
+        fits = (
+            bound <= high.max() + slack if claim["side"] == "lower" else bound >= low.min() - slack
+        )
+        if not fits:
+            raise ValueError(
+                f"solution has the bounds {low.min()} and {high.max()}, which {claims} contradict."
             )
-            best = best + sign * 4 * factor * host.backup_unit * scale
-            best = np.clip(best, 0, 1) if problem.is_probability else best
-            layers.append(np.where(inside, best, ends))
-        beyond = sign * (layers[-1] - bound)[initial]  # a proven bound may be wider by rounding
-        if beyond.max(initial=0) > TIGHT * max(1.0, float(np.abs(bound[initial]).max())):
-            reason = "they are beyond the values"
-            break
-        store(file, side, np.stack(layers, axis=1), [host.num_states, steps + 1])
-        worst = layers[-1][initial]
-        claim["bound"] = as_text(float(worst.min() if side == "lower" else worst.max()), side)
-        try:
-            checker.ClaimChecker(file, claim).check()
-        except checker.Refusal as error:
-            reason = str(error)
-            continue
-        return claim
-    raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -19,12 +19,15 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.statistics.confidence_sets import LeastProbability
+from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee
 from jaxltl.io.umb.umb import umb_contents
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Values = Floats | list[Fraction]
+OPPOSITE = {"max": "min", "min": "max"}
 SHIFTS = (1, 8, 64, 4096)  # multiples of the largest violation by which bounds are widened
 _LARGEST_SHIFT = 1e-3  # relative; a larger violation means that the bounds are wrong
 _LARGEST_EXACT = 60  # states that are solved in fractions
@@ -47,7 +50,9 @@ class Certified:
     stay: Booleans
     gain: Floats  # float[T], the reward of a transition with that of its row and state
     discount: float
-    automaton: str = ""  # of a formula, in HOA
+    node: Integers  # int[S], of each state the node of the file's arrays
+    shape: tuple[int, ...]  # of these arrays
+    sides: tuple[str, ...] = ("lower", "upper")  # of the claims
 
     @property
     def host(self) -> HostMDP:
@@ -55,34 +60,30 @@ class Certified:
 
     @property
     def is_probability(self) -> bool:
-        return self.path["kind"] == "until"
+        return self.path["kind"] in ("until", "formula")
 
-    def is_bounded(self, bound: Floats) -> bool:
-        """True if some initial state has a finite bound."""
-        return bool(np.isfinite(bound[np.asarray(self.sparse.initial) > 0]).any())
+    @property
+    def nature(self) -> str | None:
+        """The direction of nature in relation to the objective; games have an adversary."""
+        is_same = self.directions[1] == self.objective
+        return None if self.uncertain is None else "cooperative" if is_same else "adversarial"
 
     @cached_property
     def row_of_entry(self) -> Integers:
         return np.repeat(np.arange(self.host.num_rows), np.diff(self.host.entry_start))
 
-    def contents(self, policy: Integers | None) -> dict[str, bytes]:
-        """Members of the archive, with a policy, if there is one, and without claims."""
-        index = {
-            "version": 1,
-            "producer": f"jaxltl {jaxltl.__version__}",
-            "numbers": checker.NUMBERS,
-            "question": self.question,
-            "claims": [{}],
-            "members": {},
-        }
-        members = {name: bytes(content) for name, content in umb_contents(self.model)}
-        if policy is not None:
-            index["members"] = {"policy": {"dtype": "uint32", "shape": [policy.size]}}
-            members["certificate/policy.bin"] = policy.astype("<u4").tobytes()
-        if self.automaton:
-            members["certificate/automaton.hoa"] = self.automaton.encode()
-        members["certificate/index.json"] = json.dumps(index).encode()
-        return members
+    @cached_property
+    def initial(self) -> Integers:
+        return np.flatnonzero(np.asarray(self.sparse.initial).ravel() > 0)
+
+    def complement(self) -> Certified:
+        """The same with opposite directions, as for the probability of the complement."""
+        nature = OPPOSITE[self.directions[1]]
+        return replace(
+            self,
+            objective=OPPOSITE[self.objective],
+            directions=(OPPOSITE[self.directions[0]], nature),
+        )
 
     def means(self, x: Floats) -> tuple[Floats, Floats]:
         """Expected reward and value of each row, and nature's distribution, for finite values."""
@@ -97,13 +98,50 @@ class Certified:
         return np.add.reduceat(p * value, host.entry_start[:-1]), p
 
 
+def contents_of(
+    model: Model, question: dict[str, object], automaton: str, guarantee: DataGuarantee | None
+) -> dict[str, bytes]:
+    """Members of the archive, without claims; of a guarantee from data with its counts."""
+    index: dict[str, object] = {
+        "version": 1,
+        "producer": f"jaxltl {jaxltl.__version__}",
+        "numbers": checker.NUMBERS,
+        "question": question,
+        "claims": [{}],
+        "members": {},
+    }
+    members = {name: bytes(content) for name, content in umb_contents(model)}
+    if automaton:
+        members["certificate/automaton.hoa"] = automaton.encode()
+    if guarantee is not None:
+        sets, host = guarantee.sets, guarantee.model.nominal.host
+        if isinstance(guarantee.graph, LeastProbability):
+            raise ValueError(
+                "solution: guarantees that assume a least probability have no certificates; those "
+                "with the graphs 'given', 'seen' and 'complete' have."
+            )
+        total = np.repeat(sets.num_samples, np.diff(host.entry_start))
+        counts = np.rint(sets.center * total).astype("<u8")
+        members["certificate/counts.bin"] = counts.tobytes()
+        index["members"] = {"counts": {"dtype": "uint64", "shape": [counts.size]}}
+        index["counts"] = {
+            "member": "counts",
+            "method": sets.method,
+            "confidence": str(sets.confidence),
+            "assumption": guarantee.assumption,
+        }
+    members["certificate/index.json"] = json.dumps(index).encode()
+    return members
+
+
 def store(
-    file: checker.CertificateFile, name: str, values: Values, shape: list[int] | None = None
+    file: checker.CertificateFile, name: str, values: Values | Integers, shape: tuple[int, ...]
 ) -> None:
-    """Adds an array of doubles or fractions."""
-    dtype, shape = "double", shape or [len(values)]
+    """Adds an array of doubles, integers or fractions."""
+    dtype = "double"
     if isinstance(values, np.ndarray):
-        content = values.astype("<f8").tobytes()
+        dtype = "double" if values.dtype.kind == "f" else "uint32"
+        content = values.astype("<f8" if dtype == "double" else "<u4").tobytes()
     else:
         ratios = [x.as_integer_ratio() for x in values]
         words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
@@ -112,7 +150,39 @@ def store(
             n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
         )
     file.contents[f"certificate/{name}.bin"] = content
-    file.members[name] = {"dtype": dtype, "shape": shape}
+    file.members[name] = {"dtype": dtype, "shape": [*shape]}
+
+
+def proven(
+    problem: Certified,
+    file: checker.CertificateFile,
+    side: str,
+    bounds: Iterable[Values],
+    initial: Integers | None = None,
+    policy: str = "",
+) -> dict[str, str]:
+    """A claim of the first bounds that the checker accepts; its arrays are added to the file."""
+    claim, reason = {"side": side, "values": side, "bound": ""}, "no bound"
+    claim |= {"policy": policy} if policy else {}
+    initial = problem.initial if initial is None else initial
+    size = int(np.prod(problem.shape))
+    for values in bounds:
+        nodes: Values = np.zeros(size) if isinstance(values, np.ndarray) else [Fraction(0)] * size
+        if isinstance(nodes, np.ndarray):
+            nodes[problem.node] = values
+        else:
+            for v, x in zip(problem.node.tolist(), values, strict=True):
+                nodes[v] = x
+        store(file, side, nodes, problem.shape)
+        worst = [values[s] for s in initial]
+        claim["bound"] = as_text((min if side == "lower" else max)(worst), side)
+        try:
+            checker.ClaimChecker(file, claim).check()
+        except checker.Refusal as error:
+            reason = str(error)
+            continue
+        return claim
+    raise ValueError(f"no {side} bounds could be made inductive; the checker's reason: {reason}.")
 
 
 def as_text(value: float | Fraction, side: str) -> str:

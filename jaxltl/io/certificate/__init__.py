@@ -1,0 +1,1 @@
+"""Certificates of bounds, which `jaxltl.checker` proves without the solvers."""
