@@ -46,6 +46,13 @@ def _exact_tree(e: Expression, text: str, memory: dict[int, Expression]) -> Expr
     return result
 
 
+def is_inexact(expression: Expression) -> bool:
+    """True if doubles may differ from the rational value: it has quotients or decimals."""
+    if expression.is_literal:
+        return isinstance(expression.value, float | Fraction)
+    return expression.operator in ("/", "pow", "log") or any(map(is_inexact, expression.operands))
+
+
 def _written(value: float, text: str, place: int) -> Fraction:
     """The decimal at a place of a text, if it rounds to the value; else its shortest decimal."""
     match = _NUMBER.match(text, place) if place >= 0 else None

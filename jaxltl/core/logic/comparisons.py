@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +21,10 @@ from jaxltl.core.language.expressions import (
     compile_expressions,
     literal,
     names_in,
+    substitute,
     type_of,
 )
-from jaxltl.core.language.exact import exact_constant, exact_program
+from jaxltl.core.language.exact import exact_constant, exact_program, exact_tree, is_inexact
 from jaxltl.core.language.resolve import constant_value
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
@@ -33,7 +37,8 @@ class Comparison:
 
     Attributes:
       text: as it was written.
-      expression: the tree, over the variables of a model.
+      expression: the tree, over variables of a model, labels in quotes and definitions.
+      definitions: properties whose results the expression uses, by name.
 
     Example:
       >>> from jaxltl.core.language.parser import parse_expression
@@ -44,11 +49,28 @@ class Comparison:
 
     text: str
     expression: Expression
+    definitions: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def is_number(self) -> bool:
+        """True if it has a number as value, as far as its operators show."""
+        tree, results = self.expression, dict(self.definitions)
+        while tree.operator == "?:":
+            tree = tree.operands[1]
+        if tree.operator == "name" and (meaning := results.get(str(tree.value))) is not None:
+            return bool(meaning.is_number)
+        is_number = tree.is_literal and not isinstance(tree.value, bool)
+        return is_number or tree.operator in _NUMBERS
+
+    @property
+    def needs_results(self) -> bool:
+        """True if labels or results of properties occur."""
+        return any(name[0] in '"[' for name in names_in(self.expression))
 
     def holds(self, valuation: Mapping[str, ArrayLike]) -> Booleans:
         """The states ``bool[S]`` in which it holds; ValueError for an unknown variable."""
         names = sorted(names_in(self.expression))
-        values = {name: self._values(name, valuation) for name in names}
+        values = {name: self.values_of(name, valuation) for name in names}
         try:
             kind = self._type(values)
         except LanguageError as error:
@@ -60,6 +82,8 @@ class Comparison:
                 raise ValueError(f"{self.text}: {error.message}") from None
         if kind != "bool":
             raise ValueError(f"{self.text} is a number; write a comparison, such as x>0.")
+        if is_inexact(self.expression):
+            return self._exact(values)
         truth, *parts = compile_expressions([self.expression, *_undefined(self.expression)])(values)
         if not all(np.isfinite(x).all() for x in parts):
             raise ValueError(f"{self.text} divides by zero or overflows in some state.")
@@ -67,11 +91,30 @@ class Comparison:
         holds: Booleans = np.broadcast_to(np.asarray(truth, bool), (size,))
         return holds
 
+    def _exact(self, values: Mapping[str, NDArray[np.generic]]) -> Booleans:
+        """The states in which it holds, in rational arithmetic for each distinct valuation."""
+        tree = exact_tree(self.expression)
+        rows = list(zip(*(x.tolist() for x in values.values()), strict=True))
+        truth: dict[tuple[Value, ...], Value] = {}
+        for row in set(rows):
+            numbers = [Fraction(x) if isinstance(x, float) else x for x in row]
+            names = {n: literal(x) for n, x in zip(values, numbers, strict=True)}
+            try:
+                value = substitute(tree, names).value
+                parts = [substitute(e, names).value for e in _undefined(tree)]
+            except LanguageError as error:
+                raise ValueError(f"{self.text}: {error.message}") from None
+            if not all(math.isfinite(cast(float, x)) for x in parts):
+                raise ValueError(f"{self.text} divides by zero or overflows in some state.")
+            truth[row] = cast(Value, value)
+        return np.array([truth[row] for row in rows], bool)
+
     def _type(self, values: Mapping[str, NDArray[np.generic]]) -> Type:
         types: dict[str, Type] = {n: _TYPES[x.dtype.kind] for n, x in values.items()}
         return type_of(self.expression, types)
 
-    def _values(self, name: str, valuation: Mapping[str, ArrayLike]) -> NDArray[np.generic]:
+    def values_of(self, name: str, valuation: Mapping[str, ArrayLike]) -> NDArray[np.generic]:
+        """The values of a variable in all states; ValueError if there is none."""
         if name not in valuation:
             raise ValueError(
                 f"{self.text} mentions {name}, which is no variable of the model; it has "
@@ -92,6 +135,7 @@ def _undefined(expression: Expression) -> list[Expression]:
 
 
 RationalNames = tuple[dict[str, Expression], dict[str, Value]]
+_NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "pow", "mod", "log")
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
 
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, TypeVar
+from typing import Any, Literal
 
+from jaxltl.core.language.expressions import FUNCTIONS, Expression
 from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
-from jaxltl.core.logic.ltl import TRUE, Formula
+from jaxltl.core.logic.ltl import TRUE, Formula, offending_subformula
 from jaxltl.core.logic.property import FILTERS, Property as Property
 from jaxltl.core.logic.property_paths import OPERATOR, PathParser
-from jaxltl.core.logic.property_tokens import BOUNDS, Token
+from jaxltl.core.logic.property_tokens import AFTER_OPERAND, BOUNDS, Token
 
 
 def parse_properties(text: str, definitions: Definitions | None = None) -> tuple[Property, ...]:
@@ -23,13 +24,16 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     `Pmax<1/3`. A path is any formula of linear temporal logic over labels in quotes, with
     `X F G U W R`; within `F G U W R` a bound on steps (`F<=10`, `U<10`, `F[2,5]`, `F=3`, `F>=4`)
     or, outermost, on a reward (`F{"time"}<=5 "goal"`); `F "a" || F "b"` is the first given the second.
-    Of a reward: `R{"name"}max=? [ F "goal" ]`, `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`.
+    Of a reward: `R{"name"}max=? [ F "goal" ]`, `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`; until any
+    co-safe formula is proven, `[ X F "goal" ]`, infinite where that has a probability below one.
+    Of the graph: `E [ PATH ]` and `A [ PATH ]`, of some and of all paths, nested as in CTL.
     Expected steps: `Tmin=? [ F "goal" ]`. Time in the long run: `LRAmax=? [ "up" ]`. Several at once:
     `multi(P, P, ...)`.
     State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
-    `P>=0.9 [ F P>0.5 [ X "a" ] ]`. A state formula is a property too. `filter(min, P=? [ F "a" ],
-    x = 0)` is over the states of a formula, by default all: one of `min max avg sum count range
-    first state forall exists print`.
+    `P>=0.9 [ F P>0.5 [ X "a" ] ]`. A state formula is a property too, and so is an expression over variables,
+    results and names of properties, `ceil(P=? [ F "a" ]) + 1` or `2 * "p1"`, in rational arithmetic on bounds.
+    `filter(min, P=? [ F "a" ], x = 0)` is over the states of a formula, by default all: one of `min max argmin argmax
+    avg sum count range first state forall exists print printall`; `P=? [ F "a" {x = 0}{min} ]` is the same.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
     second: `Pmaxmin=?`, `R{"time"}minmax=?`. In a game a coalition comes before that, whose players choose
     for the objective: `<<system>> Pmax=? [ PATH ]`, or, by names and numbers of a game of several
@@ -93,12 +97,18 @@ def parse_property(text: str, definitions: Definitions | None = None) -> Propert
 
 
 _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
-_Content = TypeVar("_Content")
+_SIGNS = {"&": "forall", "|": "exists", "+": "sum"}  # of filters
+_BEGINS = ("<<", "(", "!", "-")
+_CONTINUES = (*AFTER_OPERAND, "&", "|", "=>", "<=>")
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
 class _Parser(PathParser):
     """Properties; each method reads the construct of its name."""
+
+    def __init__(self, text: str, known: Definitions) -> None:
+        super().__init__(text, known)
+        self.memory: dict[tuple[str, int], tuple[Property | ValueError, int]] = {}
 
     def properties(self) -> tuple[Property, ...]:
         properties = []
@@ -113,31 +123,65 @@ class _Parser(PathParser):
                 name = self.quoted()
                 if not self.accept(":"):  # it is a label
                     name, self.place = None, before
-            properties.append(self.outermost(name))
+            properties.append(replace(self.outermost(), name=name))
         self.require(bool(properties), 'a property, such as Pmax=? [ F "goal" ]')
         return tuple(properties)
 
-    def outermost(self, name: str | None) -> Property:
-        """A property, or a state formula, which must hold in each initial state."""
-        start, before = self.token, self.place
-        begins_formula = start.kind == "quoted" or start.text in ("true", "false", "!", "(")
-        if not begins_formula and start.text not in self.known.known | self.names.keys():
-            prop = self.property_(name)
-            if prop.relation is None or self.token.text not in ("&", "|", "=>", "<=>"):
+    def remembered(self, read: Callable[[], Property]) -> Property:
+        """The result of a method at this place, which is read once however often it is tried."""
+        key = (read.__name__, self.place)
+        if key not in self.memory:
+            try:
+                self.memory[key] = read(), self.place
+            except ValueError as error:
+                self.memory[key] = error, self.place
+        result, self.place = self.memory[key]
+        if isinstance(result, ValueError):
+            raise result
+        return result
+
+    def outermost(self) -> Property:
+        """A property, or an expression of states: a formula, which must hold, or a number."""
+        return self.remembered(self.any_property)
+
+    def property_(self) -> Property:
+        """A property that is no expression of others."""
+        return self.remembered(self.operator_property)
+
+    def any_property(self) -> Property:
+        before, errors = self.place, []
+        begins = self.token.kind not in ("sign", "end") or self.token.text in _BEGINS
+        self.require(begins, 'a property, such as Pmax=? [ F "goal" ]')
+        if self.token.kind != "quoted" and (self.begins_property() or self.begins_unknown()):
+            prop = self.property_()
+            if self.token.text not in _CONTINUES:
                 return prop
+        for read in (self.state_property, self.state_value):
             self.place = before
-        return self.state_property(name)
+            try:
+                prop = read()
+                # A variable alone may be a number.
+                if read == self.state_property and _is_variable(prop):
+                    continue
+                if self.token.text not in _CONTINUES:
+                    return prop
+                errors.append((self.place, self.error("';' or the end of the property")))
+            except ValueError as error:
+                errors.append((self.place, error))
+        self.place, furthest = max(errors, key=lambda x: x[0])
+        raise furthest
 
-    def scoped(
-        self, read: Callable[[], _Content]
-    ) -> tuple[_Content, tuple[tuple[str, Comparison | Property], ...]]:
-        """The result of a method of the parser, and the definitions in its text."""
-        outer, self.definitions = self.definitions, {}
-        content = read()
-        defined, self.definitions = tuple(self.definitions.items()), outer
-        return content, defined
+    def begins_unknown(self) -> bool:
+        """True for a word that begins neither a formula nor an expression."""
+        known = self.known.known | self.names.keys() | {"true", "false", "func", *FUNCTIONS}
+        return self.token.kind == "word" and self.token.text not in known
 
-    def state_property(self, name: str | None = None) -> Property:
+    def state_value(self) -> Property:
+        """An expression over variables, labels, and results of properties."""
+        value = self.state_expression(0)
+        return Property(value.text, "value", expression=value)
+
+    def state_property(self) -> Property:
         """A state formula as a property: with probability one, which is 0 or 1."""
         start = self.token
         path, defined = self.scoped(self.state_content)
@@ -147,15 +191,14 @@ class _Parser(PathParser):
             relation=">=",
             threshold=Fraction(1),
             path=path,
-            name=name,
             definitions=defined,
         )
 
-    def property_(self, name: str | None = None) -> Property:
+    def operator_property(self) -> Property:
         start = self.token
         if self.accept("<<"):
             players = self.coalition()
-            inner = self.property_(name)
+            inner = self.property_()
             self.require(
                 inner.operator != "multi" and inner.aggregate is None and inner.coalition is None,
                 "P, R, T or LRA after a coalition",
@@ -163,12 +206,14 @@ class _Parser(PathParser):
             )
             return replace(inner, text=self.written(start), coalition=players)
         if self.accept("multi"):
-            return self.multi(start, name)
+            return self.multi(start)
         if self.accept("filter"):
-            return self.filter(start, name)
+            return self.filter(start)
+        if self.accept("E", "A"):
+            return self.of_paths(start)
         match = OPERATOR.fullmatch(start.text) if start.kind == "word" else None
         if match is None:
-            raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA or multi(...)")
+            raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA, E, A or multi(...)")
         self.take()
         fields: dict[str, Any] = {"operator": "LRA" if match[1] == "S" else match[1]}
         if match[1] == "R" and self.accept("{"):
@@ -181,8 +226,10 @@ class _Parser(PathParser):
         self.expect("[")
         content = _CONTENT[fields["operator"]]
         fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
+        states = self.state_filter() if self.accept("{") else {}
         self.expect("]", " or an operator")
-        return Property(self.written(start), **fields, name=name)
+        fields["definitions"] += states.pop("definitions", ())
+        return Property(self.written(start), **fields, **states)
 
     def coalition(self) -> tuple[str, ...]:
         """The players of a coalition, and the sign after it."""
@@ -199,7 +246,33 @@ class _Parser(PathParser):
         self.expect(">>", " or ','")
         return tuple(players)
 
-    def multi(self, start: Token, name: str | None) -> Property:
+    def of_paths(self, start: Token) -> Property:
+        """``E [ PATH ]`` or ``A [ PATH ]`` of computation tree logic."""
+        self.expect("[")
+        path, defined = self.scoped(self.path)
+        self.expect("]", " or an operator")
+        some: Literal["E", "A"] = "E" if start.text == "E" else "A"
+        return Property(
+            self.written(start),
+            some,
+            relation=">=",
+            threshold=Fraction(1),
+            path=path,
+            definitions=defined,
+        )
+
+    def state_filter(self) -> dict[str, Any]:
+        """States and aggregates after a path, ``{states}{min}{max}``, and their filter."""
+        among, defined = self.scoped(self.state_content)
+        self.expect("}", " or an operator")
+        kinds: list[str] = []
+        while self.accept("{"):
+            kinds.append(self.one_of(("min", "max"), "min or max"))
+            self.expect("}")
+        aggregate = "range" if len(set(kinds)) == 2 else kinds[0] if kinds else "state"
+        return {"aggregate": aggregate, "among": among, "definitions": defined}
+
+    def multi(self, start: Token) -> Property:
         self.expect("(")
         parts: list[Property] = []
         while not parts or self.accept(","):
@@ -217,22 +290,27 @@ class _Parser(PathParser):
         self.expect(")", " or ','")
         defined = tuple(one for part in parts for one in part.definitions)
         text = self.written(start)
-        return Property(text, "multi", parts=tuple(parts), name=name, definitions=defined)
+        return Property(text, "multi", parts=tuple(parts), definitions=defined)
 
-    def filter(self, start: Token, name: str | None) -> Property:
+    def filter(self, start: Token) -> Property:
         self.expect("(")
         place, kind = self.token, self.take().text
+        kind = _SIGNS.get(kind, kind)
         self.require(kind in FILTERS, f"the kind of the filter: {', '.join(FILTERS)}", place)
         self.expect(",")
-        first, before, inner = self.token, self.place, None
-        if first.text == "<<" or (first.kind == "word" and OPERATOR.fullmatch(first.text)):
-            inner = self.property_()
-        if inner is None or self.token.text not in (",", ")"):  # it begins a state formula
-            self.place = before
-            inner = self.state_property()
+        first = self.token
+        inner = self.outermost()
+        if inner.aggregate is not None:  # its result is the same in all states
+            value = Expression("name", value=f"[{inner.text}]")
+            inner = Property(
+                inner.text,
+                "value",
+                expression=Comparison(inner.text, value, ((f"[{inner.text}]", inner),)),
+            )
         wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
+        fits = FILTERS[kind] is None or inner.operator == "value"
         self.require(
-            FILTERS[kind] in (None, inner.relation is not None),
+            inner.operator != "multi" and (fits or FILTERS[kind] != inner.is_number),
             f"{wanted} in a filter of this kind",
             first,
         )
@@ -241,7 +319,6 @@ class _Parser(PathParser):
         return replace(
             inner,
             text=self.written(start),
-            name=name,
             definitions=(*inner.definitions, *defined),
             aggregate=kind,
             among=among,
@@ -274,7 +351,7 @@ class _Parser(PathParser):
             self.expect("=", " and a number of steps after I")
             return Earned("instantaneous", self.steps())
         if not self.accept("C"):
-            return self.reach_content("F and a state formula, C, C<=k, I=k, S or LRA")
+            return self.reach_content()
         relation = self.accept("<=", "<")
         if relation is None:
             self.require(
@@ -287,21 +364,28 @@ class _Parser(PathParser):
         self.require(steps >= 0, "a bound that some number of steps meets", place)
         return Earned("cumulative", steps)
 
-    def reach_content(self, wanted: str = "F and a state formula") -> Formula:
+    def reach_content(self) -> Formula:
+        """A co-safe formula, until which the reward is earned."""
         start = self.token
         following = self.tokens[min(self.place + 1, len(self.tokens) - 1)]
-        is_bounded = start.text == "F" and following.text in BOUNDS
         self.require(
-            not is_bounded,
-            f"{wanted}; F without a bound, since a reward until a bounded path is not solved for",
+            start.text != "F" or following.text not in BOUNDS,
+            "F without a bound, since a reward until a bounded path is not solved for",
             following,
         )
-        path = self.path()
-        if isinstance(path, Bounded) or path.operator != "F" or not is_boolean(path.operands[0]):
-            if isinstance(path, Formula) and path.operator == "F":
-                wanted += "; only labels and comparisons, not a path, under F"
-            raise self.error(wanted, start)
+        path = self.plain(self.path())
+        rest = offending_subformula(path, "cosafe")
+        self.require(
+            rest is None,
+            f"a path that a prefix satisfies, such as F and a state formula; {rest} is none",
+            start,
+        )
         return path
+
+
+def _is_variable(prop: Property) -> bool:
+    meaning = prop.definitions[0][1] if len(prop.definitions) == 1 else None
+    return isinstance(meaning, Comparison) and meaning.expression.operator == "name"
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Conditional | Earned]] = {

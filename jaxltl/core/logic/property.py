@@ -15,9 +15,9 @@ Relation = Literal["<", "<=", ">", ">="]
 
 # Kinds of filters: of truth values (True), of numbers (False), or of either.
 FILTERS = {
-    **dict.fromkeys(("min", "max", "avg", "sum", "range"), False),
+    **dict.fromkeys(("min", "max", "argmin", "argmax", "avg", "sum", "range"), False),
     **dict.fromkeys(("forall", "exists", "count"), True),
-    **dict.fromkeys(("first", "state", "print"), None),
+    **dict.fromkeys(("first", "state", "print", "printall"), None),
 }
 MAX_UNFOLDED_STEPS = 100  # of a step bound inside a formula, which is unfolded into nested X
 
@@ -30,7 +30,8 @@ class Property:
     Attributes:
       text: as it was written.
       operator: `"P"` (a probability), `"R"` (an expected reward), `"T"` (expected steps),
-        `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`.
+        `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`;
+        `"E"`, `"A"` (some or all paths satisfy a formula), `"value"` (an expression of states).
       objective: `"max"`, `"min"`, or None where it is not said.
       nature: the second of two directions, `"max"` in `Pminmax`: the direction in which nature optimises the number
         within intervals; None where only one is said, or none.
@@ -42,16 +43,18 @@ class Property:
       name: the name before the colon, or None.
       coalition: of a game, the players that choose for the objective, as in `<<system>> Pmax=?`, or None.
       definitions: propositions of the formulas that are no labels: comparisons and nested properties.
+      expression: of `"value"`, the expression.
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
 
     Example:
+      >>> from jaxltl.core.logic.properties import parse_property
       >>> prop = parse_property('Pmax>=0.9 [ F "goal" ]')
       >>> prop.operator, prop.objective, prop.relation, str(prop.threshold), str(prop.path)
       ('P', 'max', '>=', '9/10', 'F goal')
     """
 
     text: str
-    operator: Literal["P", "R", "T", "LRA", "multi"]
+    operator: Literal["P", "R", "T", "LRA", "multi", "E", "A", "value"]
     objective: Literal["max", "min"] | None = None
     relation: Relation | None = None
     threshold: Fraction | None = None
@@ -64,6 +67,7 @@ class Property:
     aggregate: str | None = None
     among: Formula = TRUE
     coalition: tuple[str, ...] | None = None
+    expression: Comparison | None = None
 
     @property
     def direction(self) -> Literal["max", "min"] | None:
@@ -74,6 +78,17 @@ class Property:
         if self.objective is not None or self.relation is None:
             return self.objective
         return "min" if (self.relation in (">", ">=")) == (self.coalition is None) else "max"
+
+    @property
+    def is_number(self) -> bool:
+        """True for a number, False for a truth value, as far as the text shows."""
+        if self.aggregate in ("forall", "exists"):
+            return False
+        if self.aggregate == "count" or FILTERS.get(str(self.aggregate), True) is False:
+            return True
+        if self.expression is not None:
+            return self.expression.is_number
+        return self.relation is None
 
     def __str__(self) -> str:
         return self.text

@@ -2,25 +2,50 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import functools
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from jaxltl.core.language.parser import SIMPLE
+from jaxltl.core.language.expressions import Expression
+from jaxltl.core.language.parser import SIMPLE, ExpressionParser
 from jaxltl.core.logic.bounded import Bounded, Conditional, unfolded
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
-from jaxltl.core.logic.property_tokens import AFTER_OPERAND, NUMBERS
+from jaxltl.core.logic.property_tokens import AFTER_OPERAND
 from jaxltl.core.logic.property_tokens import Token, TokenStream, instead_of
 
 OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
+_BRACKETS = {"E": "[", "A": "[", "filter": "(", "multi": "("}  # after other operators
 Path = Formula | Bounded
+
+
+class _OperandParser(ExpressionParser):
+    """Expressions in which properties and names of properties are operands."""
+
+    def __init__(self, stream: PathParser) -> None:
+        super().__init__(stream.text, stream.token.start)
+        self.stream = stream
+
+    def _atom(self) -> Expression:
+        stream, place = self.stream, self.place
+        stream.place = bisect.bisect_left(stream.starts, place)
+        label = stream.labels.get(self.texts[self.at].strip('"'))
+        if self.kinds[self.at] == "quoted" and label is not None and label.definitions:
+            stream.take()
+            name = stream.define(label)
+        elif stream.token.start == place and stream.begins_property():
+            name = stream.define(stream.nested())
+        else:
+            return super()._atom()
+        self.at = bisect.bisect_left(self.starts, stream.last.end)
+        return Expression("name", value=name, place=place)
 
 
 class PathParser(TokenStream, ABC):
@@ -28,15 +53,45 @@ class PathParser(TokenStream, ABC):
 
     def __init__(self, text: str, known: Definitions) -> None:
         super().__init__(text, known)
-        self.definitions: dict[str, Comparison | Property] = {}  # of the property being read
+        self.places = _names_of_properties(self.tokens)
+        self.named: dict[str, Property | None] = {}  # None while it is read
 
     @abstractmethod
-    def property_(self, name: str | None = None) -> Property:
+    def property_(self) -> Property:
         """A nested property."""
 
-    def written(self, start: Token) -> str:
-        """The text from a token up to here."""
-        return self.text[start.start : self.last.end]
+    @abstractmethod
+    def outermost(self) -> Property:
+        """A property or an expression of states."""
+
+    def operands(self) -> ExpressionParser:
+        return _OperandParser(self)
+
+    def begins_property(self) -> bool:
+        """True if the next token begins a property, or is the name of one."""
+        token = self.token
+        if token.kind == "quoted":
+            return token.text in self.places
+        if token.kind != "word" or token.text in self.known.known | self.names.keys():
+            return token.text == "<<"
+        following = self.tokens[min(self.place + 1, len(self.tokens) - 1)].text
+        return following == _BRACKETS.get(token.text) or bool(OPERATOR.fullmatch(token.text))
+
+    def nested(self) -> Property:
+        """The property that begins here, or that is mentioned by its name."""
+        token = self.token
+        if token.kind != "quoted":
+            return self.property_()
+        if token.text not in self.named:
+            self.named[token.text], before = None, self.place
+            self.place = self.places[token.text]
+            self.named[token.text], _ = self.scoped(self.outermost)
+            self.place = before
+        meaning = self.named[token.text]
+        if meaning is None:
+            raise self.error("another name; this property depends on itself")
+        self.take()
+        return meaning
 
     def condition(self, inside: bool = False) -> Path | Conditional:
         """A path, or two, of which the second one is the condition of the first; not `inside` parentheses."""
@@ -106,41 +161,45 @@ class PathParser(TokenStream, ABC):
         return Formula(operator, tuple(operands))
 
     def atom(self) -> Path:
+        token, before, known = self.token, self.place, dict(self.definitions)
+        path = self.simple_atom()
+        if self.token.text not in AFTER_OPERAND or token.text in ("!", "X", "F", "G"):
+            return path
+        # It begins a comparison.
+        self.place, self.definitions = before, known
+        return self.comparison_of_variables()
+
+    def simple_atom(self) -> Path:
         token = self.token
         if self.accept("!"):
             return ~self.plain(self.atom())
         if token.text == "(" and token.kind == "sign":
             return self.parentheses()
+        if self.begins_property():
+            nested = self.nested()
+            is_number = nested.is_number and self.token.text not in AFTER_OPERAND
+            self.require(not is_number, "a nested property with a threshold, such as P>=0.5", token)
+            return Formula("ap", proposition=self.define(nested))
         if token.kind == "quoted":
             name = self.quoted()
             self.require(bool(name), "a label's name between the quotes", token)
             if name in self.labels:
-                return self.defined(self.labels[name])
+                return Formula("ap", proposition=self.define(self.labels[name]))
             return Formula("ap", proposition=name)
         if constant := self.accept("true", "false"):
             return Formula(constant)
-        if token.text == "<<" or (
-            token.kind == "word" and token.text not in self.known.known | self.names.keys()
-        ):
-            if token.text in "XFG":
-                return self.prefixed()
-            if token.text == "<<" or OPERATOR.fullmatch(token.text):
-                nested = self.property_()
-                self.require(
-                    nested.relation is not None,
-                    "a nested property with a threshold, such as P>=0.5",
-                    token,
-                )
-                return self.defined(nested)
+        is_name = token.text in self.known.known | self.names.keys()
+        if token.kind == "word" and token.text in "XFG" and not is_name:
+            return self.prefixed()
         begins = token.kind in ("word", "number") or token.text == "-"
         self.require(begins, "a label in quotes, true, false, '(', '!' or one of X F G")
         return self.comparison_of_variables()
 
-    def defined(self, meaning: Comparison | Property) -> Formula:
-        """A proposition that stands for a comparison or a nested property."""
+    def define(self, meaning: Comparison | Property) -> str:
+        """The name of a proposition that stands for a comparison or a nested property."""
         name = f"[{meaning.text}]"
         self.definitions[name] = meaning
-        return Formula("ap", proposition=name)
+        return name
 
     def parentheses(self) -> Path:
         """A formula in parentheses, or a comparison that begins with one."""
@@ -160,14 +219,15 @@ class PathParser(TokenStream, ABC):
 
     def comparison_of_variables(self) -> Formula:
         start = self.token
-        comparison = self.expression(SIMPLE)
-        if comparison.is_literal and isinstance(comparison.value, bool):
-            return TRUE if comparison.value else FALSE
-        is_variable = comparison.operator != "name" or comparison.value in self.known.variables
-        self.require(is_variable, instead_of(start.text), start)
-        is_number = comparison.operator in NUMBERS or comparison.is_literal
-        self.require(not is_number, "a comparison, such as x+1<=3")
-        return self.defined(Comparison(self.written(start), comparison))
+        comparison = self.state_expression(SIMPLE)
+        tree = comparison.expression
+        if tree.is_literal and isinstance(tree.value, bool):
+            return TRUE if tree.value else FALSE
+        is_variable = tree.operator != "name" or tree.value in self.known.variables
+        is_defined = is_variable or str(tree.value)[:1] in ('"', "[")
+        self.require(is_defined, instead_of(start.text), start)
+        self.require(not comparison.is_number, "a comparison, such as x+1<=3")
+        return Formula("ap", proposition=self.define(comparison))
 
     # --- bounds ---
 
@@ -247,3 +307,14 @@ class PathParser(TokenStream, ABC):
             self.last,
         )
         return unfolded(path)
+
+
+def _names_of_properties(tokens: Sequence[Token]) -> dict[str, int]:
+    """The place of each property with a name, by the name in quotes."""
+    places: dict[str, int] = {}
+    for i, token in enumerate(tokens[1:]):  # i is the place before it
+        before = tokens[i - 1] if i else None
+        ends = before is None or before.kind != "sign" or before.text in (";", "]", ")")
+        if token.text == ":" and tokens[i].kind == "quoted" and ends:
+            places.setdefault(tokens[i].text, i + 2)
+    return places

@@ -5,11 +5,12 @@ from __future__ import annotations
 import bisect
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
-from jaxltl.core.language.exact import exact_tree, exact_value
+from jaxltl.core.language.exact import exact_tree, exact_value, is_inexact
 from jaxltl.core.language.expressions import (
     TRUE,
     Expression,
@@ -21,11 +22,14 @@ from jaxltl.core.language.expressions import (
 from jaxltl.core.language.parser import ADDITIVE, ExpressionParser
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.ltl import pointed
+from jaxltl.core.logic.property import Property
+
+_Definitions = tuple[tuple[str, Comparison | Property], ...]
+_Content = TypeVar("_Content")
 
 
 _OPERATORS = ("+", "-", "*", "/", "^")  # that continue a number as an expression
 AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")
-NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "pow", "mod", "log")
 BOUNDS = ("<=", "<", ">=", ">", "=", "[", "{", "^")  # what follows a bounded operator
 _MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
 
@@ -78,6 +82,7 @@ class TokenStream:
         self.names = dict(known.names)
         self.labels: dict[str, Comparison] = {}  # that the text defines
         self.rational: dict[str, Expression] = {}  # constants of the text, in exact arithmetic
+        self.definitions: dict[str, Comparison | Property] = {}  # of the property being read
         self.tree = TRUE  # the last expression, before substitution
 
     @property
@@ -193,12 +198,15 @@ class TokenStream:
         else:
             if kind != "const":
                 self.expect("=")
-            value = self.expression(0)
+            comparison = self.state_expression(0)
+            value = substitute(self.tree, self.names)
+            plain = kind == "label" or not comparison.definitions
+            self.require(plain, "an expression without properties", start)
             constant = kind != "const" or value.is_literal
             self.require(constant, "an expression of constants", start)
             exact = exact_value(*self.rational_tree()) if kind == "const" else None
         if kind == "label":
-            self.labels[name] = Comparison(f'"{name}"', value)
+            self.labels[name] = replace(comparison, text=f'"{name}"')
         else:
             if exact is not None:
                 self.rational[name] = literal(exact if type_ == "double" else int(exact))
@@ -207,13 +215,52 @@ class TokenStream:
             self.names[name] = value
         self.expect(";", " at the end of a declaration")
 
+    def operands(self) -> ExpressionParser:
+        """The parser of an expression that begins here."""
+        return ExpressionParser(self.text, self.token.start)
+
+    def scoped(self, read: Callable[[], _Content]) -> tuple[_Content, _Definitions]:
+        """The result of a method of the parser, and the definitions in its text."""
+        outer, self.definitions = self.definitions, {}
+        try:
+            content = read()
+            return content, tuple(self.definitions.items())
+        finally:
+            self.definitions = outer
+
+    def state_expression(self, level: int) -> Comparison:
+        """An expression over variables, labels, and results of properties."""
+        start = self.token
+        tree, defined = self.scoped(lambda: self.expression(level))
+        return Comparison(self.written(start), self.in_fractions(tree), defined)
+
+    def written(self, start: Token) -> str:
+        """The text from a token up to here."""
+        return self.text[start.start : self.last.end]
+
+    @property
+    def meanings(self) -> dict[str, Expression]:
+        """The expressions of labels that the text defines without properties."""
+        labels = {f'"{name}"': label for name, label in self.labels.items()}
+        return {name: x.expression for name, x in labels.items() if not x.definitions}
+
+    def in_fractions(self, tree: Expression) -> Expression:
+        """The last expression in exact arithmetic, `tree`, if doubles may differ from it."""
+        used = [self.names[name] for name in names_in(self.tree) & self.names.keys()]
+        if not any(map(is_inexact, (self.tree, *used))):
+            return tree
+        tree_, names = self.rational_tree()
+        try:
+            return substitute(tree_, names | self.meanings)
+        except LanguageError:
+            return tree
+
     def expression(self, level: int) -> Expression:
         """An expression with constants and formulas substituted."""
         try:
-            parser = ExpressionParser(self.text, self.token.start)
+            parser = self.operands()
             self.tree = tree = parser.expression(level)
-            meanings = {f'"{name}"': label.expression for name, label in self.labels.items()}
-            tree = substitute(tree, {**self.names, **meanings})
+            tree = substitute(tree, {**self.names, **self.meanings})
         except LanguageError as error:
             place = bisect.bisect_left(self.starts, error.place)
             token = self.tokens[min(place, len(self.tokens) - 1)]

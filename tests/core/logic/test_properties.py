@@ -354,7 +354,7 @@ NEAR_MISSES = {
     'R=? [ F<=3 "a" ]': "column 8: found '<=', .* F without a bound",
     "R=? [ F<=3 a ]": "column 8: found '<=', .* F without a bound",
     'T=? [ F[1,3] "a" ]': r"column 8: found '\[', .* F without a bound",
-    'R=? [ F G "a" ]': "column 7: .* not a path, under F",
+    'R=? [ F G "a" ]': "column 7: .* a prefix satisfies, .*; G a is none",
     'P=? [ O "a" ]': "column 7: found 'O', .* those of the past",
     "P=? [ O a ]": "column 7: found 'O', .* those of the past",
     "P=? [ WX a ]": "column 7: found 'WX', .* with blanks between",

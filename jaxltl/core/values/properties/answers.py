@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Status
 from jaxltl.core.models.product_policy import ProductPolicy
@@ -64,6 +66,7 @@ class Answer(NamedTuple):
       status: CONVERGED if all bounds are within the tolerance, or decide the threshold.
       method: the algorithm and the proof.
       strategy: an optimal strategy; None in chains.
+      exact: the values as fractions or infinite doubles, in exact arithmetic; else None.
 
     Example:
       >>> import jaxltl as jl
@@ -82,6 +85,7 @@ class Answer(NamedTuple):
     status: Status
     method: str
     strategy: PropertyStrategy | None
+    exact: tuple[Fraction | float, ...] | None = None
 
 
 Model = SparseMDP | IntervalMDP | Game | MultiplayerGame
@@ -103,17 +107,20 @@ def with_definitions(
             raise ValueError(f"{prop.text}: the model has a label {name!r}; rename it.")
         if name in columns:
             continue
+        if isinstance(meaning, Comparison) and meaning.needs_results:
+            meaning = Property(meaning.text, "value", expression=meaning)
         if isinstance(meaning, Comparison):
             columns[name] = np.broadcast_to(meaning.holds(world.valuation), (world.num_states,))
             continue
         holds = solve(model, meaning).holds
-        assert holds is not None
+        if holds is None:
+            raise ValueError(f"{meaning.text} is a number; compare it, as in {meaning.text} > 0.")
         if None in holds:
             raise ValueError(
                 f"{prop.text}: {meaning.text} is not decided in state {holds.index(None)}, where "
                 "the bounds lie on both sides of the threshold; change it a little."
             )
-        columns[name] = np.array(holds, bool)
+        columns[name] = np.broadcast_to(np.array(holds, bool), (world.num_states,))
     if not columns:
         return model
     label = np.column_stack([np.asarray(world.label), *columns.values()])
@@ -126,17 +133,29 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
     """The aggregate of an answer over its states; ``states`` are -1 if it is of no single one."""
     kind, count = prop.aggregate, answer.states.size
     lower, upper, value = answer.lower, answer.upper, answer.value
-    if kind == "print":
+    if kind in ("print", "printall"):
         return answer
     if kind == "state" and count != 1:
         raise ValueError(f"{prop.text}: {count} states satisfy the condition; one must.")
     if kind in ("state", "first"):
         return _at(answer, 0)
+    if kind in ("argmin", "argmax"):
+        bar = upper.min() if kind == "argmin" else lower.max()
+        best_states = np.flatnonzero(lower <= bar if kind == "argmin" else upper >= bar)
+        parts = {name: getattr(answer, name)[best_states] for name in ("states", "lower", "upper")}
+        sure = bool((parts["lower"] == parts["upper"]).all() or best_states.size == 1)
+        status = answer.status if sure else max(answer.status, Status.PRECISION)
+        exact = answer.exact and tuple(answer.exact[i] for i in best_states.tolist())
+        value = value[best_states]
+        return answer._replace(**parts, value=value, status=status, exact=exact, strategy=None)
     if kind in ("min", "max"):
-        place, best = (np.argmin, np.min) if kind == "min" else (np.argmax, np.max)
+        best, optimum = (np.min, min) if kind == "min" else (np.max, max)
+        place = int(np.flatnonzero(value == best(value))[0])
+        if answer.exact is not None:
+            place = answer.exact.index(optimum(answer.exact))
         numbers = best(lower), best(value), best(upper)
-        return _number(prop, _at(answer, int(place(value))), numbers, tolerance)
-    whole = answer._replace(states=np.array([-1]), strategy=None)
+        return _number(prop, _at(answer, place), numbers, tolerance)
+    whole = answer._replace(states=np.array([-1]), strategy=None, exact=None)
     if answer.holds is not None:
         return _truth(whole, kind, answer.holds)
     if kind == "range":  # the interval of the values, as in PRISM
@@ -150,6 +169,7 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
             lower=np.concatenate([x.lower for x in ends]),
             upper=np.concatenate([x.upper for x in ends]),
             status=max(x.status for x in ends),
+            exact=answer.exact and (min(answer.exact), max(answer.exact)),
         )
     divisor = count if kind == "avg" else 1
     # The sum of fsum is the nearest double.
@@ -157,6 +177,15 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
         math.nextafter(math.nextafter(math.fsum(x.tolist()), end) / divisor, end)
         for x, end in ((lower, -math.inf), (upper, math.inf))
     )
+    if answer.exact is not None:
+        total = sum(answer.exact, Fraction(0)) / divisor
+        low, high = double_bounds(total)
+        return whole._replace(
+            value=np.array([float(total)]),
+            lower=np.array([low]),
+            upper=np.array([high]),
+            exact=(total,),
+        )
     return _number(prop, whole, (low, math.fsum(value.tolist()) / divisor, high), tolerance)
 
 
@@ -169,6 +198,7 @@ def _at(answer: Answer, place: int) -> Answer:
         lower=answer.lower[one],
         upper=answer.upper[one],
         holds=None if answer.holds is None else answer.holds[one],
+        exact=answer.exact and answer.exact[one],
         strategy=None,
     )
 
@@ -179,7 +209,10 @@ def _truth(answer: Answer, kind: str | None, holds: list[bool | None]) -> Answer
     if kind == "count":
         low, high = np.array([float(sure)]), np.array([float(sure + open_)])
         status = Status.PRECISION if open_ else Status.CONVERGED
-        return answer._replace(value=low, lower=low, upper=high, holds=None, status=status)
+        exact = None if open_ else (Fraction(sure),)
+        return answer._replace(
+            value=low, lower=low, upper=high, holds=None, status=status, exact=exact
+        )
     decided = sure > 0 if kind == "exists" else sure + open_ < len(holds)
     # A true one decides "exists", a false one "forall".
     verdict = (kind == "exists") if decided else None if open_ else (kind == "forall")

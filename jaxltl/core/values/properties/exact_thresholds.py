@@ -23,7 +23,16 @@ from jaxltl.core.models.number_source import NumberSource, RationalNumbers
 from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
 from jaxltl.core.sparse.exact import bounded
 from jaxltl.core.sparse.exact.average import average
-from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP, TooLarge, Values, Work, flags
+from jaxltl.core.sparse.exact.model import (
+    MAX_WORK,
+    ONE,
+    ZERO,
+    ExactMDP,
+    TooLarge,
+    Values,
+    Work,
+    flags,
+)
 from jaxltl.core.sparse.exact.total import least_total, reachability, until_end
 from jaxltl.core.sparse.bounded.reward_bounded import in_units
 from jaxltl.core.sparse.product import SparseProduct
@@ -33,8 +42,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     sparse_satisfaction,
 )
 
-MAX_STATES = 1000
-MAX_TRANSITIONS = 10_000
+MAX_TRANSITIONS = 10_000  # and states, of which each counts for ten
 _WIDTH = 0.01  # of the bounds of the product, of which only the graph is used
 
 
@@ -44,23 +52,25 @@ def exact_values(
     states: np.ndarray,
     maximize: bool | Booleans,
     rows: np.ndarray | None = None,
+    effort: int = 1,
 ) -> list[Fraction | float] | None:
     """Values at some states, fractions or infinite; None if it is large or has intervals.
 
     Args:
       maximize: the direction; in a game ``bool[S]``, True in the states of the maximiser.
       rows: of a game, the rows ``int[S]`` of optimal strategies of both players.
+      effort: the multiple of the limits on states, transitions and work.
     """
     inner = model.mdp if isinstance(model, Game) else model
     if not isinstance(inner, SparseMDP):
         return None
-    if inner.num_states > MAX_STATES or inner.num_transitions > MAX_TRANSITIONS:
+    if max(inner.num_states * 10, inner.num_transitions) > MAX_TRANSITIONS * effort:
         return None
     if isinstance(model, Game) and not _is_of_few_steps(prop):
-        return _between_answers(inner, prop, states, maximize, rows)
+        return _between_answers(inner, prop, states, maximize, rows, effort)
     try:
         # Backward induction takes the directions of all states.
-        values = _values(_ExactQuery(inner, states, prop.text), prop, cast(bool, maximize))
+        values = _values(_ExactQuery(inner, states, prop.text, effort), prop, cast(bool, maximize))
     except (TooLarge, OverflowError):  # a reward may be infinite
         return None
     return list(values)
@@ -82,6 +92,7 @@ def _between_answers(
     states: np.ndarray,
     maximize: bool | Booleans,
     rows: np.ndarray | None,
+    effort: int,
 ) -> list[Fraction | float] | None:
     """Values of a game between the optimal answers to memoryless strategies of the players.
 
@@ -96,7 +107,7 @@ def _between_answers(
         kept[rows] = True
         source = NumberSource(partial(_constant, numbers.select(kept)))
         part = replace(with_allowed(model, kept), numbers=source)
-        bounds.append(exact_values(part, prop, states, up))
+        bounds.append(exact_values(part, prop, states, up, effort=effort))
     return bounds[0] if bounds[0] == bounds[1] else None
 
 
@@ -131,9 +142,10 @@ def _values(query: _ExactQuery, prop: Property, maximize: bool) -> Values:
 class _ExactQuery:
     """Values of path formulas at the requested states."""
 
-    def __init__(self, model: SparseMDP, states: np.ndarray, text: str) -> None:
+    def __init__(self, model: SparseMDP, states: np.ndarray, text: str, effort: int = 1) -> None:
         self.model, self.states, self.text = model, states, text
-        self.numbers, self.work = exact_numbers(model), Work()
+        self.numbers, self.work = exact_numbers(model), Work(MAX_WORK * effort)
+        self.effort = effort
 
     @property
     def mdp(self) -> ExactMDP:
@@ -230,7 +242,7 @@ class _ExactQuery:
         )
         policy = result.product_policy
         assert policy is not None
-        if policy.product.host.num_transitions > MAX_TRANSITIONS:
+        if policy.product.host.num_transitions > MAX_TRANSITIONS * self.effort:
             raise TooLarge
         problem = reachability_problem(policy, objective)
         mdp = _product(policy.product, self.mdp)

@@ -13,7 +13,7 @@ from jaxltl.core.sparse.exact import total
 from jaxltl.core.sparse.exact.bounded import until_within
 from jaxltl.core.sparse.exact.model import Work, double_bounds
 from jaxltl.core.types import Status
-from jaxltl.core.values.properties import solve_property as module
+from jaxltl.core.values.properties import model_query as module
 from jaxltl.core.values.properties.solve_property import meets, solve_property
 from tests.core.values.undiscounted.test_sparse_satisfaction import random_sparse
 from tests.storm_oracle import storm_model, storm_values

@@ -1,0 +1,110 @@
+"""Models on which properties become simpler ones: products with prefixes, and graphs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+
+from jaxltl.core.array_types import Integers
+from jaxltl.core.logic.good_prefixes import prefix_automaton, state_formulas
+from jaxltl.core.logic.labels import distinct_rows
+from jaxltl.core.logic.ltl import Formula, negation_normal_form
+from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.exact_numbers import exact_numbers
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.number_source import NumberSource, Part, RationalNumbers
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.exact.model import ExactMDP
+from jaxltl.core.sparse.product import SparseProduct, sparse_product
+from jaxltl.core.sparse.rows import row_entries
+
+END = "[end]"  # the label of states after a prefix that proves the formula
+
+
+def prefix_product(
+    model: SparseMDP | IntervalMDP | Game, formula: Formula, states: Integers, place: str
+) -> tuple[SparseMDP | IntervalMDP | Game, Integers]:
+    """Product with the automaton of a co-safe formula, of the kind of the model, and the states in it.
+
+    The label :data:`END` holds where the formula is proven by the prefix up to the state.
+    """
+    inner = model.mdp if isinstance(model, Game) else model
+    world = inner.nominal if isinstance(inner, IntervalMDP) else inner
+    normal = negation_normal_form(formula)
+    propositions = state_formulas(normal)
+    columns = [states_satisfying(world, f, place) for f in propositions]
+    letters, letter = distinct_rows(np.column_stack(columns))
+    delta = prefix_automaton(normal, letters).delta
+    start = states, delta[0, letter[states]]
+    product = sparse_product(world.host, delta, letter, start)
+
+    def change(base: SparseMDP) -> SparseMDP:
+        return _unrolled(base, product)
+
+    larger = inner.changed(change) if isinstance(inner, IntervalMDP) else change(inner)
+    if not isinstance(model, Game):
+        return larger, product.start
+    system = np.asarray(model.system)[product.base_state]
+    return Game(larger, to_jax(system)), product.start
+
+
+def transition_graph(model: SparseMDP) -> SparseMDP:
+    """The model in which each possible transition is a choice: some path is some policy."""
+    host = model.host
+    return replace(
+        model,
+        row_start=host.entry_start[host.row_start],
+        entry_start=np.arange(host.num_transitions + 1),
+        probability=np.ones(host.num_transitions),
+        rewards={},
+        action=None,
+        numbers=NumberSource(),
+    )
+
+
+def _unrolled(model: SparseMDP, product: SparseProduct) -> SparseMDP:
+    """The model of a product, with the labels, rewards and exact numbers of the model."""
+    row, state = product.base_row, product.base_state
+    entry, _ = row_entries(model.host.entry_start, row)
+    initial = np.bincount(product.start, minlength=state.size) / product.start.size
+    label = np.column_stack([np.asarray(model.label)[state], product.memory == 1])
+
+    def read(larger: SparseMDP) -> RationalNumbers:
+        numbers = exact_numbers(model)
+        successor, starts = product.host.successor, product.host.entry_start
+        rows: list[dict[int, Fraction]] = []
+        for base, (first, last) in zip(row.tolist(), _pairs(starts), strict=True):
+            after = successor[first:last].tolist()
+            rows.append({t: numbers.mdp.rows[base][int(state[t])] for t in after})
+        rewards = {
+            name: (_taken(parts[0], state), _taken(parts[1], row), _taken(parts[2], entry))
+            for name, parts in numbers.rewards.items()
+        }
+        return RationalNumbers(ExactMDP(product.host.row_start.tolist(), rows), rewards)
+
+    return replace(
+        model,
+        row_start=product.host.row_start,
+        entry_start=product.host.entry_start,
+        successor=product.host.successor,
+        probability=np.asarray(model.probability)[entry],
+        initial=initial,
+        label=label,
+        propositions=(*model.propositions, END),
+        rewards={name: x.gathered(state, row, entry) for name, x in model.rewards.items()},
+        action=None if model.action is None else np.asarray(model.action)[row],
+        valuation={name: np.asarray(x)[state] for name, x in model.valuation.items()},
+        numbers=NumberSource(read),
+    )
+
+
+def _pairs(starts: Integers) -> list[tuple[int, int]]:
+    return list(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True))
+
+
+def _taken(part: Part, index: Integers) -> Part:
+    return None if part is None else [part[i] for i in index.tolist()]
