@@ -18,7 +18,8 @@ from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, on_graph
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.array_namespace import jax_array
-from jaxltl.core.models.ops.choices import choice_mask, state_mask
+from jaxltl.core.models.ops.choices import choice_mask
+from jaxltl.core.models.ops.state_sets import state_set
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
@@ -49,12 +50,12 @@ class Attractor(NamedTuple):
 
 def attractor(
     model: Model,
-    goal: jax.Array,
+    goal: Array | str,
     allowed: jax.Array | None = None,
     *,
     rule: str | jax.Array | np.ndarray = "exists",
     chance: str = "some",
-    among: jax.Array | None = None,
+    among: Array | str | None = None,
 ) -> Attractor:
     """Attractor of a goal: the least R with ``goal <= R`` closed under a rule.
 
@@ -63,7 +64,7 @@ def attractor(
 
     Args:
       model: the model.
-      goal: ``bool[S]``.
+      goal: ``bool[S]``, a label's name, or a Boolean formula of labels; so are other sets.
       allowed: ``bool[S, A]``, the actions that count; default: the available ones.
       rule: ``"exists"``: some allowed action leads to R; ``"forall"``: every allowed
         action does (so a state without any is attracted). Or ``bool[S]``: True for exists.
@@ -87,10 +88,10 @@ def attractor(
         word = validation.choice("rule", rule, ("exists", "forall"))
         exists: Array | bool | None = word == "exists"
     else:
-        exists = state_mask(model, "rule", rule)
+        exists = state_set(model, "rule", rule)
     validation.choice("chance", chance, ("some", "all"))
-    goal = state_mask(model, "goal", goal)
-    among = None if among is None else state_mask(model, "among", among)
+    goal = state_set(model, "goal", goal)
+    among = None if among is None else state_set(model, "among", among)
     allowed = choice_mask(model, "allowed", allowed)
     return on_graph(partial(attract, chance=chance), model, goal, allowed, exists, among)
 
@@ -117,7 +118,7 @@ def attract(
     )
 
 
-def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
+def avoidable(model: Model, goal: Array | str, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
     The complement of the ``"forall"`` attractor: the minimal reachability probability is zero exactly there.
@@ -136,7 +137,7 @@ def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -
       >>> avoidable(fork, np.array([False, True, False])).tolist()
       [True, False, True]
     """
-    goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
+    goal, allowed = state_set(model, "goal", goal), choice_mask(model, "allowed", allowed)
     return jax_array(on_graph(avoid, model, goal, allowed, _system(model)))
 
 
@@ -154,7 +155,7 @@ def avoid(
 
 def almost_surely_reaching(
     model: Model,
-    goal: jax.Array,
+    goal: Array | str,
     allowed: jax.Array | None = None,
     *,
     reaching: Attractor | None = None,
@@ -179,7 +180,7 @@ def almost_surely_reaching(
       >>> almost_surely_reaching(fork, np.array([False, True, False])).region.tolist()
       [False, True, False]
     """
-    goal, allowed = state_mask(model, "goal", goal), choice_mask(model, "allowed", allowed)
+    goal, allowed = state_set(model, "goal", goal), choice_mask(model, "allowed", allowed)
     return on_graph(surely, model, goal, allowed, reaching, _system(model))
 
 

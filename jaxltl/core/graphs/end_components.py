@@ -20,7 +20,8 @@ from jaxltl.core.graphs.graph import (
     take,
 )
 from jaxltl.core.models.ops.array_namespace import jax_array, to_jax
-from jaxltl.core.models.ops.choices import choice_mask, state_mask
+from jaxltl.core.models.ops.choices import choice_mask
+from jaxltl.core.models.ops.state_sets import state_set
 from jaxltl.core.models.ops.operators import pushforward
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, Array
@@ -49,7 +50,7 @@ class EndComponents(NamedTuple):
 
 
 def end_components(
-    model: Model, region: jax.Array, allowed: jax.Array | None = None
+    model: Model, region: Array | str, allowed: jax.Array | None = None
 ) -> EndComponents:
     """Maximal end components that lie within a region (de Alfaro 1997).
 
@@ -58,7 +59,7 @@ def end_components(
 
     Args:
       model: the model.
-      region: ``bool[S]``.
+      region: ``bool[S]``, a label's name, or a Boolean formula of labels.
       allowed: ``bool[S, A]``, of a sparse model ``bool[R]``; default: the available actions.
 
     Returns:
@@ -71,7 +72,7 @@ def end_components(
       >>> end_components(fork, np.ones(3, bool)).inside.tolist()
       [[False, True], [True, False], [False, False]]
     """
-    region, allowed = state_mask(model, "region", region), choice_mask(model, "allowed", allowed)
+    region, allowed = state_set(model, "region", region), choice_mask(model, "allowed", allowed)
     return on_graph(components_within, model, region, allowed)
 
 

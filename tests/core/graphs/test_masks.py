@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.models.protocols import base_model
 from tests import reference
 from tests.support import as_mdp
 
@@ -80,3 +81,23 @@ def test_other_masks_are_refused(name):
                 SETS[name](model, wrong, part)
         with pytest.raises(ValueError, match=r"goal|region"):  # whose values are unknown
             jax.jit(lambda x, model=model, part=part: SETS[name](model, x, part))(mask.astype(int))
+
+
+@pytest.mark.parametrize("name", ["attractor", "avoidable", "almost surely", "end components"])
+def test_sets_are_labels_and_formulas_too(name):
+    for model, _, part, _ in models(1):
+        first, start = np.arange(S) < 2, np.asarray(base_model(model).initial) > 0
+        shape = (S, *[1] * (len(model.state_shape) - 1))
+        for text, states in (
+            ("a", first),
+            ("!a", ~first),
+            ("a | init", first | start),
+        ):
+            mask = np.broadcast_to(states.reshape(shape), model.state_shape)
+            expected = SETS[name](model, mask, part)
+            equal(SETS[name](model, text, part), expected)
+            equal(
+                jax.jit(lambda m, text=text, part=part: SETS[name](m, text, part))(model), expected
+            )
+        with pytest.raises(ValueError, match="Boolean"):
+            SETS[name](model, "F a", part)

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.models.action_numbers import row_actions
+from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.protocols import ActionModel, Array, Model, SuccessorModel, base_model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.exact.model import double_bounds
@@ -32,9 +33,9 @@ def reduction_for(objective: str) -> np.ufunc:
 
 
 def state_mask(model: SparseMDP, states: Array | str, name: str) -> np.ndarray:
-    """A set of states as ``bool[S]``, from one in the model's shape or a label."""
+    """A set of states as ``bool[S]``, from one in the model's shape or a Boolean formula of labels."""
     if isinstance(states, str):
-        return np.asarray(model.states_with_label(states), bool)
+        return states_satisfying(model, states, name)
     shape = np.shape(states)
     fits = shape and int(np.prod(shape)) == model.num_states
     require_states(name, states, shape if fits else (model.num_states,))

@@ -8,48 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.logic.labels import require_known, satisfying
-from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.ops.array_namespace import jit
-from jaxltl.core.models.ops.operators import require_policy, unpadded_states
+from jaxltl.core.models.ops.operators import require_policy
+from jaxltl.core.models.ops.state_sets import state_set
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel, Array, Model, base_model
+from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards
-from jaxltl.core.types import Solution, require_shape, require_states
+from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.door.question import Accuracy, Question, Reach, TotalReward
 from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.undiscounted import optimum
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
 
 World = MDP | DenseMDP | ShardedMDP
-
-
-def states_of(model: Model, name: str, states: Array | str) -> Array:
-    """A set of states in the model's shape, from a mask or a Boolean formula of labels."""
-    if not isinstance(states, str):
-        require_states(name, states, model.state_shape)
-        return states
-    world = cast(World, base_model(model))
-    formula, labels = as_formula(states), getattr(world, "propositions", ())
-    used = formula.propositions
-    require_known(used, (*labels, "init"), name)
-    # The truth of the formula for each combination of its labels.
-    place = np.arange(2 ** len(used))
-    combinations = (place[:, None] >> np.arange(len(used))) & 1 > 0
-    truth = jnp.asarray(satisfying(combinations, used, formula, name))
-    combination: Array = jnp.zeros(world.num_states, jnp.int32)
-    for i, label in enumerate(used):
-        if label in labels:
-            column = world.label[:, labels.index(label)]
-        else:
-            column = world.initial > 0
-        combination = combination + jnp.where(column, 2**i, 0)
-    inside = truth[combination] & unpadded_states(world)
-    return jnp.broadcast_to(
-        inside.reshape(-1, *[1] * (len(model.state_shape) - 1)), model.state_shape
-    )
 
 
 def reach(
@@ -64,7 +37,7 @@ def reach(
     """Probabilities of reaching a set in padded models, by interval iteration or a linear system."""
     path, policy, tolerance = question.path, question.policy, accuracy.tolerance
     assert isinstance(path, Reach)
-    target, padded = states_of(model, "target", path.target), cast(ActionModel, model)
+    target, padded = state_set(model, "target", path.target), cast(ActionModel, model)
     if policy is None:
         return optimum.optimal_reachability(
             padded, target, tolerance, max_steps, start, objective=question.objective
@@ -85,7 +58,7 @@ def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
             "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
             "target."
         )
-    target = states_of(model, "target", path.target)
+    target = state_set(model, "target", path.target)
     padded = cast(ActionModel, model)
     earned = _on_choices(padded, world, reward)
     _require_rewards(padded, world, earned)
