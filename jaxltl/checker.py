@@ -318,6 +318,7 @@ def formula_text(formula: Any) -> str:
     if isinstance(formula, str):
         return json.dumps(formula, ensure_ascii=False)
     op, *parts = formula
+    op = {"->": "=>", "<->": "<=>"}.get(op, op)
     texts = [formula_text(x) if isinstance(x, str) else f"({formula_text(x)})" for x in parts]
     return f" {op} ".join(texts) if len(parts) > 1 else " ".join([op, *texts])
 
@@ -827,16 +828,12 @@ class ClaimChecker:
         return len(graph), f"{claimed} in every initial state{self.file.confidence}"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Checks a file and prints the outcome; returns the exit status."""
-    parser = argparse.ArgumentParser(description="Check a certificate by exact arithmetic.")
-    parser.add_argument("file")
-    parser.add_argument("--limit", type=int, default=2**30, help="most bytes of the archive")
-    options = parser.parse_args(arguments)
+def verdict(path: str, limit: int = 2**30) -> tuple[int, list[str]]:
+    """Checks a file of at most `limit` bytes; returns the exit status and the lines to print."""
     status, lines = 0, []
     gc.disable()  # nothing here is cyclic, and there are millions of tuples
     try:
-        file = CertificateFile(read_archive(options.file, options.limit))
+        file = CertificateFile(read_archive(path, limit))
         for claim in file.claims:
             num_nodes, text = ClaimChecker(file, claim).check()
             lines += [f"claimed: {text}", f"checked: {num_nodes} nodes of the claim's graph"]
@@ -848,8 +845,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as why:  # no error of any kind is an acceptance
         status, lines = 2, [f"not a certificate: {type(why).__name__}: {why}"]
     gc.enable()
-    for line in lines:
-        print("".join(c if c.isprintable() else "?" for c in line[:2000]))
+    return status, ["".join(c if c.isprintable() else "?" for c in line[:2000]) for line in lines]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Checks a file and prints the outcome; returns the exit status."""
+    parser = argparse.ArgumentParser(description="Check a certificate by exact arithmetic.")
+    parser.add_argument("file")
+    parser.add_argument("--limit", type=int, default=2**30, help="most bytes of the archive")
+    options = parser.parse_args(arguments)
+    status, lines = verdict(options.file, options.limit)
+    print(*lines, sep="\n")
     return status
 
 

@@ -36,6 +36,12 @@ _out = click.option("--out", type=_PATH, help="Directory for the results.  [defa
 _as_json = click.option(
     "--json", "as_json", is_flag=True, help="End with the result as one JSON line."
 )
+_certificate = click.option(
+    "--certificate",
+    type=_PATH,
+    metavar="FILE",
+    help="File for a certificate, which `jaxltl verify` checks; numbered if there are several.",
+)
 
 
 def _begin(text: str, process: int = 0) -> Callable[[str], None]:
@@ -333,6 +339,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     show_default=True,
     help="Of a program: build the model, or explore some states until the bounds are narrow.",
 )
+@_certificate
 @click.option(
     "--checkpoint",
     type=_PATH,
@@ -352,6 +359,7 @@ def solve(
     constants: str | None,
     max_states: int | None,
     method: str,
+    certificate: Path | None,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
 ) -> None:
@@ -372,6 +380,7 @@ def solve(
     options = (
         ("--strategy", strategy, False),
         ("--relative", relative or None, False),
+        ("--certificate", certificate, False),
         ("--checkpoint", checkpoint, True),
     )
     for option, value, with_mesh in options:
@@ -382,8 +391,10 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (program is None or strategy is not None or relative):
-        raise ValueError("--method partial is for programs, without --strategy and --relative.")
+    if method == "partial" and (program is None or strategy or relative or certificate):
+        raise ValueError(
+            "--method partial is for programs, without --strategy, --relative and --certificate."
+        )
     from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.
@@ -417,10 +428,19 @@ def solve(
                 click.echo(f"\n{solving.text(result)}")
         if file is not None:
             file.write(solving.strategies(model, results, model_file))
+        proofs: Record = {}
+        if certificate is not None:
+            from jaxltl.app.reports.certificate import certificate_lines, write_certificates
+
+            answered = [solving.certifiable(model, result) for result in results]
+            records = write_certificates(certificate.parent, answered, certificate.name)
+            click.echo("\n".join(["", *certificate_lines(records, certificate.parent)]))
+            proofs = {"certificates": records}
     if not group.is_first:
         as_json = False
     if as_json:
-        _print_json({"model": entry, "results": [solving.result_entry(r) for r in results]})
+        entries = [solving.result_entry(r) for r in results]
+        _print_json({"model": entry, "results": entries, **proofs})
     if status := max(result.exit_status for result in results):
         raise SystemExit(status)
 
@@ -457,6 +477,7 @@ def solve(
     type=_PATH,
     help="Draw the bound over the number of samples (.svg, .png or .pdf).",
 )
+@_certificate
 @_as_json
 @plain_errors
 def certify(
@@ -472,9 +493,8 @@ def certify(
     least_probability: float | None,
     method: Method,
     smallest: bool,
-    policy: Path | None,
-    curve: Path | None,
     as_json: bool,
+    **outputs: Path | None,
 ) -> None:
     """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
@@ -485,7 +505,7 @@ def certify(
     """
     say = _begin(f"certifying {formula or 'the task'} from {log}")
     if log.suffix == ".npz":
-        others = (policy, curve, confidence, labels, model, graph, least_probability)
+        others = (*outputs.values(), confidence, labels, model, graph, least_probability)
         if initial or terminal or smallest or any(x is not None for x in others):
             raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
         _certify_policy(log, formula, as_json, say)
@@ -501,7 +521,7 @@ def certify(
     source = app.LogSource(
         labels=labels, model=model, initial=initial, terminal=terminal, graph=assumption
     )
-    result = app.certify_and_write(log, query, source, policy, curve)
+    result = app.certify_and_write(log, query, source, app.Outputs(**outputs))
     if as_json:
         _print_json(result)
     if result["status"] != "CONVERGED":

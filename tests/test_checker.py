@@ -607,7 +607,7 @@ def nested(formula):
         ("G F a", 'G (F "a")'),
         ("!b U a", '(! "b") U "a"'),
         ("a & b & X true", '"a" & "b" & (X (true))'),
-        ("(a -> b) W (a <-> b)", '("a" -> "b") W ("a" <-> "b")'),
+        ("(a -> b) W (a <-> b)", '("a" => "b") W ("a" <=> "b")'),
     ],
 )
 def test_formulas_as_text(formula, text):

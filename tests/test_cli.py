@@ -181,6 +181,7 @@ def test_learn_writes_its_results(learned):
         "result.json",
         "report.html",
         "task.toml",
+        "certificate.umb",
         "automaton.svg",
         "values.svg",
         "policy.svg",
@@ -190,6 +191,10 @@ def test_learn_writes_its_results(learned):
     written = json.loads((place / "out" / "result.json").read_text())
     assert written == json.loads(result.stdout.splitlines()[-1])
     page = (place / "out" / "report.html").read_text()
+    (proof,) = written["certificates"]
+    assert run("verify", place / "out" / proof["file"]).output.endswith("\nACCEPTED\n")
+    assert len(proof["claims"]) == 2 and all("of a given policy" in x for x in proof["claims"])
+    assert "on trust: that the model is the one meant" in page and "jaxltl verify" in page
     # What has a live part is not shown twice; the steps have none.
     assert page.count("data:image") == 1 and page.count("<svg") == 2 + 3
     assert "http" not in page and "prefers-color-scheme: dark" in page

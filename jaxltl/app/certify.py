@@ -299,27 +299,49 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
 # --- the command -----------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Files that the command writes, or None."""
+
+    policy: Path | None
+    curve: Path | None
+    certificate: Path | None
+
+
 def certify_and_write(
-    log: Path, query: CertificateQuery, source: LogSource, policy: Path | None, picture: Path | None
+    log: Path, query: CertificateQuery, source: LogSource, outputs: Outputs
 ) -> Record:
     """Runs the command, output files opened first, and returns the result."""
+    from jaxltl.app.reports.certificate import (
+        Certifiable,
+        certificate_lines,
+        formula_question,
+        write_certificates,
+    )
     from jaxltl.core.files import atomic_write
     from jaxltl.core.models.construct.lifting import project_policy
     from jaxltl.core.policies.policy_file import save_policy
 
     check_confidence(query.confidence)
+    picture, proof = outputs.curve, outputs.certificate
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
     with contextlib.ExitStack() as held:
         file, drawing = (
             None if path is None else held.enter_context(atomic_write(path))
-            for path in (policy, picture)
+            for path in (outputs.policy, picture)
         )
         evidence = read_evidence(log, source)
         begin = time.perf_counter()
         guarantee = certify(evidence, query)
         result = entry(evidence, query, guarantee, time.perf_counter() - begin)
         click.echo(text(evidence, result))
+        if proof is not None:
+            nature = "min" if query.objective == "max" else "max"
+            question = formula_question(query.formula, query.objective, nature)
+            one = Certifiable(guarantee.model, guarantee, question)
+            result["certificates"] = write_certificates(proof.parent, [one], proof.name)
+            click.echo("\n".join(certificate_lines(result["certificates"], proof.parent)))
         if file is not None:
             about = json.dumps({**result, "seconds": None}, allow_nan=False)
             learned = project_policy(evidence.model, guarantee.satisfaction, states=evidence.states)

@@ -35,6 +35,7 @@ from jaxltl.app.guarantee import (
 )
 from jaxltl.app.job import about, one_seed, plain, postfix as postfix, run_seeds, settings
 from jaxltl.app.protocols import Training
+from jaxltl.app.reports.certificate import Certifiable, policy_certificate
 from jaxltl.app.reports.learn import (
     live as live,
     pictures as pictures,
@@ -527,6 +528,14 @@ def _evidence(solution: Solution, model: Product, world: MappedModel, starts: np
         "status": Status(int(solution.status)).name,
         "residual": solution.residual,
     }
+
+
+def certifiable(outcome: MlirlOutcome) -> list[Certifiable] | str:
+    """The kept policy's satisfaction probability."""
+    setup, policy = outcome.setup, outcome.learned.policy[outcome.chosen]
+    if setup.world.logged is not None:
+        return "the policy is randomised and probabilities are intervals, from a log"
+    return [policy_certificate(setup.model, outcome.solution, setup.task.formula, policy)]
 
 
 def save(out: Path, outcome: MlirlOutcome) -> None:

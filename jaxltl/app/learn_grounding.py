@@ -19,6 +19,7 @@ from jaxltl.app.files.task_todirl import map_file
 from jaxltl.app.files.worlds import grid_options, MappedModel
 from jaxltl.app.job import about, automaton_picture, plain
 from jaxltl.app.protocols import Training
+from jaxltl.app.reports.certificate import Certifiable, policy_certificate
 from jaxltl.app.reports.drawing import drawing, Picture
 from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
@@ -295,6 +296,15 @@ def summary(outcome: GroundingOutcome) -> Record:
         ],
     }
     return plain(result)
+
+
+def certifiable(outcome: GroundingOutcome) -> list[Certifiable] | str:
+    """The satisfaction probability of the policy in each world."""
+    formula = outcome.setup.task.formula
+    return [
+        policy_certificate(x.model, x.attained, formula, np.asarray(x.policy))
+        for x in outcome.answers
+    ]
 
 
 def save(out: Path, outcome: GroundingOutcome) -> None:

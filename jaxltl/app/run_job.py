@@ -281,11 +281,15 @@ class _JobRun(Generic[T, S, O]):
 
     def _write(self, outcome: O, seconds: float, pictures: list[tuple[Picture, Drawn]]) -> Result:
         from jaxltl.app.job import took
+        from jaxltl.app.reports.certificate import write_certificates
 
         job, begin = self.job, self.console.artist
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
         result = {**job.summary(outcome), **took(seconds), "fingerprint": self.mark}
         job.save(self.out, outcome)
+        # Of jobs whose result is a policy of a finite model.
+        certifiable = getattr(job, "certifiable", lambda outcome: "the result is a network")
+        result["certificates"] = write_certificates(self.out, certifiable(outcome))
         images = [(picture, drawn()) for picture, drawn in pictures]
         parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
         write_results(self.out / "task.toml", job.report, result, parts, images)

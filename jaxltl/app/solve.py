@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
+from jaxltl.app.reports.certificate import Certifiable
 from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
@@ -319,6 +320,13 @@ def text(result: PropertyResult) -> str:
     values = {"result": result, "answer": result.answer, "vacuous": is_vacuous}
     lines = render("jaxltl.app.reports", "solve.txt", **values)
     return lines.rstrip("\n")
+
+
+def certifiable(model: SourceModel | POMDP, result: PropertyResult) -> Certifiable:
+    """The arguments of the certificate of a property's answer."""
+    text = result.query.text if result.query.parsed is None else result.query.parsed.text
+    reason = "" if isinstance(result.answer, Answer) else f"{text} has no answer of one number"
+    return Certifiable(model, None, text, reason=reason)
 
 
 # --- strategies -------------------------------------------------------------------------------

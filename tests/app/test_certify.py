@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 import jaxltl as jl
+from jaxltl.checker import verdict
 from jaxltl.cli import main
 from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
@@ -63,8 +64,11 @@ def told(printed):
 
 def test_what_is_guaranteed_is_printed_and_written(log):
     out = log.parent / "policy.npz"
-    found = certified_as_seen(log, "--json", "--policy", out)
+    proof = log.parent / "proof.umb"
+    found = certified_as_seen(log, "--json", "--policy", out, "--certificate", proof)
     assert found.exit_code == 0, found.output
+    status, lines = verdict(str(proof))
+    assert status == 0 and "with confidence 0.95" in lines[0] and lines[0][9:] in found.stdout
     model, counts = model_from_counts(
         read_log(log), initial="hall", graph="seen", labels=read_labels(log.parent / "labels.csv")
     )

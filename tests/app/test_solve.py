@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 import jaxltl
 from jaxltl.app import solve as module
+from jaxltl.checker import verdict
 from jaxltl.cli import main
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.io.model_files import read_model, write_model
@@ -77,6 +78,17 @@ def test_the_object_is_as_promised(model_file):
     first = found["results"][0]
     assert first["lower"] <= 0.4 <= first["upper"] and first["upper"] - first["lower"] <= 1e-6
     assert found["results"][1]["lower"] == found["results"][1]["upper"] == "inf"
+
+
+def test_certificates_of_properties(model_file, tmp_path):
+    properties = ['Pmax=? [ F "rich" ]', 'LRAmax=? [ "rich" ]', 'Pmin=? [ G F "rich" ]']
+    done = run(model_file, *properties, "--certificate", tmp_path / "proof.umb", "--json")
+    assert done.exit_code == 0, done.output
+    one, two, three = json.loads(done.stdout.splitlines()[-1])["certificates"]
+    assert "reason" in two and 'no certificate: LRAmax=? [ "rich" ]' in done.stdout
+    for record in (one, three):
+        path = tmp_path / record["file"]
+        assert verdict(str(path))[0] == 0 and f"jaxltl verify {path}" in done.stdout
 
 
 def test_what_people_see(model_file):

@@ -108,6 +108,7 @@ def test_the_files_of_a_strategy(won):
     _, result, out = won
     assert {path.name for path in out.iterdir()} == {
         "game.toml",
+        "certificate.umb",
         "strategy.npz",
         "result.json",
         "report.html",
@@ -192,11 +193,14 @@ def test_an_unrealizable_task_is_an_answer(lost):
     assert len(result["region"]["lost_initial_states"]) == 6
     assert {path.name for path in out.iterdir()} == {
         "game.toml",
+        "certificate.umb",
         "counter_strategy.npz",
         "result.json",
         "report.html",
         "region.svg",
     }
+    claims = result["certificates"][0]["claims"]
+    assert [" is >= 0 in" in claims[0], " is <= 0 in" in claims[1]] == [True, True]
 
 
 def test_the_play_obeys_the_rules_and_ends_in_failure(lost):
@@ -261,6 +265,7 @@ def test_some_initial_states_are_won_and_others_lost(arrays, tmp_path):
     }
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "game.toml",
+        "certificate.umb",
         "strategy.npz",
         "counter_strategy.npz",
         "result.json",

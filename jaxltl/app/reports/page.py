@@ -16,6 +16,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from jaxltl.app.reports.certificate import certificate_lines
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.explorer import START, Curves, Explorer, ReportTrajectory
 from jaxltl.app.wording import Record, Result, counted, position_text, state_position
@@ -54,7 +55,8 @@ class Report:
         """The result as text for the terminal."""
         lines = render_text(f"{self.name}.txt", result=result, **self.values(result))
         remarks = self.remarks(result) if self.has_remarks else []
-        return "\n".join(lines + remark_lines(remarks))
+        proofs = certificate_lines(result.get("certificates", ()))
+        return "\n".join(lines + remark_lines(remarks) + ([""] if proofs else []) + proofs)
 
     def remarks(self, result: Result) -> list[Remark]:
         """Remarks on the result, by a template whose lines are ``kind: text``."""
@@ -85,6 +87,7 @@ def render_page(
         "seconds": result["seconds"],
         "result": result,
         "remarks": (),
+        "proofs": certificate_lines(result.get("certificates", ())),
         "file_title": "Task file",
         "file_text": file_text,
         "explorers": explorers,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxltl.app.files.game import task_text
 from jaxltl.app.job import plain, took
 from jaxltl.app.run_job import write_results
+from jaxltl.app.reports.certificate import Certifiable, formula_question, write_certificates
 from jaxltl.app.reports.drawing import Picture, draw
 from jaxltl.app.reports.explorer import Explorer, ReportTrajectory
 from jaxltl.app.reports.page import Report, aligned, number
@@ -247,6 +248,7 @@ def _arrays(synthesis: Synthesis, game: Game, node: np.ndarray) -> Record:
 
 
 FILES = (
+    "certificate.umb",
     "strategy.npz",
     "counter_strategy.npz",
     "automaton.svg",
@@ -373,9 +375,22 @@ def write(synthesis: Synthesis, out: Path, place: int | None, seconds: float) ->
     drawings = pictures(synthesis, place)
     part = play_explorer(synthesis)
     parts = [(part, {key: draw(each).decode() for key, each in part.drawings.items()})]
-    result = summary(synthesis, seconds)
+    result = {
+        **summary(synthesis, seconds),
+        "certificates": write_certificates(out, _certifiable(synthesis)),
+    }
     write_results(out / "game.toml", report_of(synthesis), result, parts, drawings)
     return result
+
+
+def _certifiable(synthesis: Synthesis) -> list[Certifiable] | str:
+    """The greatest probability of the objective, which 1 and 0 bound where one player wins surely."""
+    game, automaton = synthesis.world.game, synthesis.nodes.automaton
+    if synthesis.file.task.chance == "adversarial" and not is_deterministic(game):
+        return "random moves are the environment's, and the certified game has probabilities"
+    count = game.num_states * (1 if automaton is None else len(automaton.delta))
+    question = formula_question(task_text(synthesis.file.task))
+    return [Certifiable(game, None, question, num_nodes=count)]
 
 
 def play_explorer(synthesis: Synthesis) -> Explorer:

@@ -21,6 +21,8 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.lifting import project_policy
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
+from jaxltl.core.models.multiplayer import MultiplayerGame
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, reward_structure
@@ -51,7 +53,7 @@ from jaxltl.io.umb.members import tar_pieces, write_gzip
 
 def write_certificate(
     path: str | os.PathLike[str],
-    model: Model,
+    model: Model | MultiplayerGame | POMDP,
     solution: Solution | DataGuarantee | None,
     question: str,
     *,
@@ -104,11 +106,19 @@ def write_certificate(
       0
     """
     with errors_in("write_certificate: "):
+        prop = parse_property(question)
+        if isinstance(model, MultiplayerGame) and prop.coalition:
+            model, prop = model.game(prop.coalition), replace(prop, coalition=None)
+        if isinstance(model, MultiplayerGame | POMDP):
+            raise ValueError(
+                f"{question}: certificates are written for a coalition, as in <<a>> Pmax=?, and for "
+                "models whose states are observed."
+            )
         lazy = model.mdp if isinstance(model, Game) else model
         world: Model = model
         if isinstance(lazy, Product):
             world = replace(model, mdp=lazy.mdp) if isinstance(model, Game) else lazy.mdp
-        problem, formula = _problem(world, parse_property(question), reward, discount)
+        problem, formula = _problem(world, prop, reward, discount)
         answer = solution.satisfaction if isinstance(solution, DataGuarantee) else solution
         simple = None if policy is not None or isinstance(lazy, Product) else answer
         if simple is not None and simple.product_policy is not None:
@@ -146,6 +156,8 @@ def _problem(
     model: Model, prop: Property, reward: Rewards | chex.Array | None, discount: float | None
 ) -> tuple[Certified, Formula | None]:
     """Validates the model and the question; with the formula that needs an automaton."""
+    if prop.coalition not in (None, ("system",)):
+        raise ValueError(f"{prop.text}: certificates are written for the system of a game.")
     inner = model.mdp if isinstance(model, Game) else model
     if isinstance(inner, IntervalMDP):
         refuse_ball(inner, "a certificate holds intervals")
@@ -170,16 +182,16 @@ def _problem(
     goal = until[-1] if until and all(map(is_boolean, until)) else None
     earned = prop.path if isinstance(prop.path, Earned) else Earned("average")
     if prop.operator == "P" and goal is not None and operator in ("F", "U"):
-        path |= {"kind": "until", "target": _nested(goal)}
-        path |= {"stay": _nested(until[0])} if operator == "U" else {}
+        path |= {"kind": "until", "target": nested(goal)}
+        path |= {"stay": nested(until[0])} if operator == "U" else {}
     elif prop.operator == "R" and goal is not None and operator == "F":
-        path = {"kind": "reward", "reward": name, "target": _nested(goal)}
+        path = {"kind": "reward", "reward": name, "target": nested(goal)}
     elif prop.operator == "R" and earned == Earned("total"):
         path = {"kind": "total", "reward": name}
     elif prop.operator == "R" and earned.kind == "cumulative" and earned.steps is not None:
         path = {"kind": "total", "reward": name, "steps": earned.steps}
     elif prop.operator == "P" and isinstance(prop.path, Formula):
-        path = {"kind": "formula", "formula": _nested(prop.path), "automaton": "automaton"}
+        path = {"kind": "formula", "formula": nested(prop.path), "automaton": "automaton"}
     is_wrong = "kind" not in path or prop.definitions
     if is_wrong or (discount is not None and (path["kind"] != "total" or "steps" in path)):
         raise ValueError(
@@ -236,11 +248,11 @@ def _problem(
     return problem, prop.path if is_formula and isinstance(prop.path, Formula) else None
 
 
-def _nested(formula: Formula) -> str | list[object]:
+def nested(formula: Formula) -> str | list[object]:
     """A formula as the checker reads it: a label, or a list of an operator and its operands."""
     if formula.operator == "ap":
         return formula.proposition
-    operands = [_nested(x) for x in formula.operands]
+    operands = [nested(x) for x in formula.operands]
     if formula.operator == "xor":
         return ["!", ["<->", *operands]]
     if formula.operator == "M":
