@@ -24,8 +24,9 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     `Pmax<1/3`. A path is any formula of linear temporal logic over labels in quotes, with
     `X F G U W R`; within `F G U W R` a bound on steps (`F<=10`, `U<10`, `F[2,5]`, `F=3`, `F>=4`)
     or, outermost, on a reward (`F{"time"}<=5 "goal"`); `F "a" || F "b"` is the first given the second.
-    Of a reward: `R{"name"}max=? [ F "goal" ]`, `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`; until any
-    co-safe formula is proven, `[ X F "goal" ]`, infinite where that has a probability below one.
+    Of a reward: `R{"name"}max=? [ F "goal" ]`, or `F0` and `Fc`, with which a run that never arrives is worth 0
+    and the sum of its rewards in place of infinity; `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`; until
+    any co-safe formula is proven, `[ X F "goal" ]`, infinite where that has a probability below one.
     Of the graph: `E [ PATH ]` and `A [ PATH ]`, of some and of all paths, nested as in CTL.
     Expected steps: `Tmin=? [ F "goal" ]`. Time in the long run: `LRAmax=? [ "up" ]`. Several at once:
     `multi(P, P, ...)`.
@@ -225,6 +226,9 @@ class _Parser(PathParser):
         fields["relation"], fields["threshold"] = self.comparison(match[1])
         self.expect("[")
         content = _CONTENT[fields["operator"]]
+        if match[1] == "R" and (variant := self.accept("F0", "Fc")):
+            fields["unreached"] = "zero" if variant == "F0" else "sum"
+            content = _Parser.eventual_state
         fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
         states = self.state_filter() if self.accept("{") else {}
         self.expect("]", " or an operator")
@@ -363,6 +367,10 @@ class _Parser(PathParser):
         steps = self.steps() - (relation == "<")
         self.require(steps >= 0, "a bound that some number of steps meets", place)
         return Earned("cumulative", steps)
+
+    def eventual_state(self) -> Formula:
+        """The formula after a variant of F."""
+        return Formula("F", (self.state_content(),))
 
     def reach_content(self) -> Formula:
         """A co-safe formula, until which the reward is earned."""

@@ -42,6 +42,8 @@ class Property:
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
       coalition: of a game, the players that choose for the objective, as in `<<system>> Pmax=?`, or None.
+      unreached: of a reward until `F`, that of a run that never arrives: infinite (`F`), zero (`F0`) or the sum
+        of its rewards (`Fc`).
       definitions: propositions of the formulas that are no labels: comparisons and nested properties.
       expression: of `"value"`, the expression.
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
@@ -68,6 +70,7 @@ class Property:
     among: Formula = TRUE
     coalition: tuple[str, ...] | None = None
     expression: Comparison | None = None
+    unreached: Literal["infinite", "zero", "sum"] = "infinite"
 
     @property
     def direction(self) -> Literal["max", "min"] | None:

@@ -68,8 +68,11 @@ class UncertainMDP:
         droppable = (self.lower == 0) & (self.upper > 0)
         count = np.add.reduceat(droppable.astype(np.int64), start[:-1])
         kept = self.sum_rows(np.where(droppable, 0, self.upper)) - 1 - self.rounding
-        # With one droppable successor the sum of the others decides; with several, subsets do.
-        unclear = (count > 0) & (kept <= 0) & ((count > 1) | (np.abs(kept) <= 3 * self.rounding))
+        # With one droppable successor the sum of the others decides; with several, subsets do,
+        # unless each can have the whole mass, as the choices of a player in a game.
+        partial = np.add.reduceat((droppable & (self.upper < 1)).astype(np.int64), start[:-1])
+        subsets = (count > 1) & (partial > 0)
+        unclear = (count > 0) & (kept <= 0) & (subsets | (np.abs(kept) <= 3 * self.rounding))
         if self.ball is None and not unclear.any():
             return None
         upper = np.where(self.upper > 0, np.minimum(self.upper + _DECIMALS, 1), 0)

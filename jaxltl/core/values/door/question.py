@@ -27,6 +27,7 @@ class TotalReward(NamedTuple):
 
     reward: Reward
     target: Array | str | None = None
+    unreached: str = "infinite"  # or "sum": the reward of a run that never reaches the set
 
 
 class DiscountedReward(NamedTuple):
@@ -96,6 +97,20 @@ Path = (
     | RewardAfterSteps
     | ReachAtCost
 )
+
+
+def require_infinite(path: TotalReward) -> None:
+    """Raises ValueError unless runs that avoid the target of a total reward are worth infinity."""
+    if path.target is None:
+        raise ValueError(
+            "total rewards of interval models need a target, as those inside jit and over a mesh do; "
+            "give one."
+        )
+    if path.unreached != "infinite":
+        raise ValueError(
+            f"unreached={path.unreached!r} is for models of known probabilities on the host, without "
+            "intervals, outside jit and over no mesh; leave it out."
+        )
 
 
 class Question(NamedTuple):

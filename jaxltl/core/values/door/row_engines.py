@@ -7,14 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats
+from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward
 from jaxltl.core.sparse.interval import discounted as interval_discounted
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.interval.total_reward import total_reward
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import discounted, reachability as exact
+from jaxltl.core.sparse.solvers.game_reward import game_reward_forever
 from jaxltl.core.types import Solution
 from jaxltl.core.values.door.question import (
     Accuracy,
@@ -23,6 +26,7 @@ from jaxltl.core.values.door.question import (
     Reach,
     TotalReward,
     Until,
+    require_infinite,
 )
 from jaxltl.core.values.engine.host_solution import (
     default_tolerance,
@@ -62,10 +66,12 @@ def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
         chain = policy_chain(host, form.weights(question.policy))
         earned = chain.mean(earned, host.row_start)
         host, depth = chain.mdp, chain.depth
-    if path.target is None:
+    if path.target is None or path.unreached == "sum":
+        ended, earned, row = _ended(form, host, earned, path)
         enclosure = exact.reward_forever(
-            host, earned, maximize=maximize, tolerance=requested, depth=depth
+            ended, earned, maximize=maximize, tolerance=requested, depth=depth
         )
+        enclosure = replace(enclosure, row=row[enclosure.row])
     else:
         target = form.states("target", path.target)
         enclosure = exact.total_reward(
@@ -125,8 +131,9 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
     """Total rewards under intervals, and of games: ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``."""
     path, form = question.path, row_form(model)
     assert isinstance(path, TotalReward)
-    if path.target is None:
-        raise ValueError("total rewards of games and interval models need a target; give one.")
+    if form.interval is None and (path.target is None or path.unreached == "sum"):
+        return _earn_in_game(form, question, accuracy.width(TOLERANCE))
+    require_infinite(path)
     requested, target = accuracy.width(TOLERANCE), form.states("target", path.target)
     reward = certain_reward(form, path.reward)
 
@@ -135,6 +142,35 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
         return total_reward(sides.host, earned, sides.states(target), sides.query(requested))
 
     return robust_solution(form, question, earn, requested, relative=True)
+
+
+def _earn_in_game(form: RowForm, question: Question, requested: float) -> Solution:
+    """Total rewards of a game for ever, or until a set of states that runs may avoid."""
+    path = question.path
+    assert isinstance(path, TotalReward) and form.system is not None
+    if question.policy is not None:
+        raise ValueError(
+            "policy: rewards of a game whose runs need not reach a target are solved for optimal "
+            "strategies; leave policy out, or restrict the model by with_allowed."
+        )
+    earned = nonnegative_reward(form.sparse, form.reward(path.reward), "total rewards")
+    ended, earned, row = _ended(form, form.host, earned, path)
+    aims = directions(question.objective, None, question.environment)
+    maximizing = np.where(form.system, aims.system, aims.environment)
+    enclosure = game_reward_forever(ended, earned, maximizing, tolerance=requested)
+    enclosure = replace(enclosure, row=row[enclosure.row])
+    return solution_from_enclosure(form, enclosure, requested, relative=True)
+
+
+def _ended(
+    form: RowForm, host: HostMDP, earned: Floats, path: TotalReward
+) -> tuple[HostMDP, Floats, Integers]:
+    """The rows in which nothing is earned from the target on, their rewards and original rows."""
+    if path.target is None:
+        return host, earned, np.arange(host.num_rows)
+    target = form.states("target", path.target)
+    ended, row = UncertainMDP(host, host.probability, host.probability).with_absorbing(target)
+    return ended.mdp, np.where(target[ended.mdp.state], 0, earned[row]), row
 
 
 def discount_with_nature(model: Model, question: Question, accuracy: Accuracy) -> Solution:

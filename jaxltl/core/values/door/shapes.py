@@ -11,7 +11,6 @@ from jaxltl.core import validation
 from jaxltl.core.logic.labels import require_known, satisfying
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import BUILT_IN
-from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -26,6 +25,7 @@ from jaxltl.core.values.door.question import (
     ReachWithin,
     TotalReward,
     Until,
+    require_infinite,
 )
 
 
@@ -38,9 +38,8 @@ def require_known_parts(model: Model, question: Question) -> None:
             _require_formula(world, states, name)
         elif states is not None:
             require_states(name, states, model.state_shape)
-    has_opponent = isinstance(model, Game) or isinstance(world, IntervalMDP)
-    if isinstance(path, TotalReward) and path.target is None and has_opponent:
-        raise ValueError("total rewards of games and interval models need a target; give one.")
+    if isinstance(path, TotalReward) and isinstance(world, IntervalMDP):
+        require_infinite(path)
     if not isinstance(path, Reach | Until | Acceptance | NextStep | ReachWithin):
         _require_reward(model, path.reward)
     steps, bound = getattr(path, "num_steps", None), getattr(path, "bound", None)

@@ -131,6 +131,8 @@ def _values(query: _ExactQuery, prop: Property, maximize: bool) -> Values:
         return query.at(average(mdp, reward, maximize, work))
     if isinstance(path, Formula):
         final_states = dict.fromkeys(flags(query.where(path.operands[0])), ZERO)
+        if prop.unreached == "sum":
+            return query.at(least_total(mdp, reward, final_states, maximize, work))
         return query.at(until_end(mdp, reward, final_states, maximize, work))
     assert isinstance(path, Earned)
     if path.steps is not None:

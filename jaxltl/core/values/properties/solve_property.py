@@ -439,10 +439,15 @@ def _solved(query: ModelQuery, prop: Property, aim: PropertyAim, tolerance: floa
         cumulative = path.kind == "cumulative"
         solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
         return query.result(solve(model, reward, path.steps, **aim.directions), by="steps")
-    elif not isinstance(model, SparseMDP):
+    inner = model.mdp if isinstance(model, Game) else model
+    if isinstance(inner, IntervalMDP) and (target is None or prop.unreached != "infinite"):
         raise ValueError(
-            f"{prop.text}: rewards for ever (C) are not solved for where probabilities are intervals or two "
-            "players choose; ask for those until a state is reached (F), of so many steps (C<=k) or "
+            f"{prop.text}: rewards for ever (C, F0, Fc) are not solved for where probabilities are "
+            "intervals; ask for those until a state is reached (F), of so many steps (C<=k) or "
             "after them (I=k), or for the average (S)."
         )
-    return query.result(total_reward(model, reward, target, tolerance=tolerance, **aim.directions))
+    directed = aim.directions
+    solution = total_reward(
+        model, reward, target, unreached=prop.unreached, tolerance=tolerance, **directed
+    )
+    return query.result(solution)

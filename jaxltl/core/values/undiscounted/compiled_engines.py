@@ -17,7 +17,13 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards
 from jaxltl.core.types import Solution, require_shape
-from jaxltl.core.values.door.question import Accuracy, Question, Reach, TotalReward
+from jaxltl.core.values.door.question import (
+    Accuracy,
+    Question,
+    Reach,
+    TotalReward,
+    require_infinite,
+)
 from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.undiscounted import optimum
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
@@ -53,11 +59,7 @@ def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
     assert isinstance(path, TotalReward)
     world: Array = model.mdp if isinstance(model, Product) else model
     reward = path.reward
-    if path.target is None:
-        raise ValueError(
-            "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
-            "target."
-        )
+    require_infinite(path)
     target = state_set(model, "target", path.target)
     padded = cast(ActionModel, model)
     earned = _on_choices(padded, world, reward)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Array, Model
@@ -35,6 +36,7 @@ def total_reward(
     objective: str = "max",
     nature: str | None = None,
     environment: str | None = None,
+    unreached: str = "infinite",
     tolerance: jax.Array | float | None = None,
     throw: bool = False,
 ) -> Solution:
@@ -43,7 +45,10 @@ def total_reward(
     The least solution of ``x = 0`` on the target, ``x = opt_a (r(s, a) + (P x)(s, a))`` elsewhere
     (Puterman 1994, chapter 7; Baier and Katoen 2008, section 10.5.1). It is infinite where the
     target is not reached almost surely: for ``"max"`` under some policy, for ``"min"`` under every
-    policy; without a target, where reward is earned for ever.
+    policy; without a target, where reward is earned for ever. With ``unreached="sum"`` a run that never
+    reaches the target is worth the sum of its rewards, and the value is infinite where reward is
+    earned for ever (the semantics ``F`` and ``Fc`` of Chen, Forejt, Kwiatkowska, Parker and Simaitis
+    2013).
 
     Args:
       model: any model.
@@ -51,7 +56,9 @@ def total_reward(
         also as of :func:`~jaxltl.core.models.sparse.choice_reward`, of a ShardedMDP the name of one.
         Rewards of transitions must not differ within a row of intervals.
       target: ``bool[S]``, a label's name, or a Boolean formula of labels; required inside ``jit``, over
-        a mesh, and of games and interval models.
+        a mesh, and of interval models.
+      unreached: the reward of a run that never reaches the target, ``"infinite"`` or ``"sum"``; the latter
+        without intervals, on the host, and in a game without a policy.
       policy, objective, nature, environment, throw: as of :func:`reachability_probability`.
       tolerance: relative width of the enclosure; default 1e-6 in double precision, 1e-3 in single.
 
@@ -72,7 +79,9 @@ def total_reward(
       >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
       [2.0, 0.0]
     """
-    question = Question(TotalReward(reward, target), objective, nature, environment, policy)
+    validation.choice("unreached", unreached, ("infinite", "sum"))
+    path = TotalReward(reward, target, unreached)
+    question = Question(path, objective, nature, environment, policy)
     return solve(model, question, Accuracy(tolerance), throw=throw)
 
 

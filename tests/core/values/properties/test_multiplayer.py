@@ -16,7 +16,7 @@ from jaxltl.core.types import Status
 # Bob may try a door (1/3) or call Carol with Alice; Carol opens or sends back to Alice.
 VAULT = """smg
 player alice [quiet], [loud], [lost] endplayer
-player bob guard, [goal] endplayer
+player bob guard, [goal], [try], [call] endplayer
 player carol [open], [shut] endplayer
 module vault
   s : [0..4];
@@ -33,8 +33,9 @@ module guard n : [0..0]; endmodule
 label "goal" = s=4;
 label "lost" = s=3;
 label "alice" = s=0;
+rewards "steps" s<3 : 1; endrewards
+rewards "cost" [quiet] true : 2; [try] true : 5; [call] true : 1; endrewards
 """
-VAULT = VAULT.replace("player bob guard, [goal]", "player bob guard, [goal], [try], [call]")
 
 
 @cache
@@ -97,3 +98,143 @@ def test_reachability_of_every_coalition(coalition):
 )  # fmt: skip
 def test_paths_of_coalitions(text, value):
     check(game(VAULT), text, value)
+
+
+# Total rewards by the members that maximise them: the steps, and the cost, before goal or lost.
+STEPS = {
+    "": "3/2", "1": 2, "2": "3/2", "3": 2, "1,2": 5, "1,3": 3, "2,3": 3, "1,2,3": "inf",
+}  # fmt: skip
+COST = {"": 0, "1": 6, "2": 0, "3": 0, "1,2": 7, "1,3": 7, "2,3": 0, "1,2,3": "inf"}
+OTHERS = {
+    "": "1,2,3", "1": "2,3", "2": "1,3", "3": "1,2", "1,2": "3", "1,3": "2", "2,3": "1", "1,2,3": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("members", STEPS)
+def test_total_rewards_of_every_coalition(members):
+    for objective, coalition in (("max", members), ("min", OTHERS[members])):
+        for path in ('Fc "goal"', "Fc s>2", "C", "F s>2"):
+            check(
+                game(VAULT), f'<<{coalition}>> R{{"steps"}}{objective}=? [ {path} ]', STEPS[members]
+            )
+        # Only all players together can be sure of the goal.
+        reached = "inf" if members else 5
+        check(game(VAULT), f'<<{coalition}>> R{{"steps"}}{objective}=? [ F "goal" ]', reached)
+        check(game(VAULT), f'<<{coalition}>> R{{"cost"}}{objective}=? [ C ]', COST[members])
+        check(game(VAULT), f'<<{coalition}>> R{{"cost"}}{objective}=? [ Fc s>2 ]', COST[members])
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('<<>> R{"steps"}max=? [ C<=0 ]', 0), ('<<>> R{"steps"}max=? [ C<=1 ]', 1),
+        ('<<1>> R{"steps"}max=? [ C<=2 ]', 2), ('<<2,3>> R{"steps"}max=? [ C<=2 ]', "3/2"),
+        ('<<1,2>> R{"steps"}max=? [ C<=3 ]', 3), ('<<1,3>> R{"steps"}max=? [ C<=3 ]', 2),
+        ('<<3>> R{"steps"}max=? [ C<=3 ]', 2), ('<<2>> R{"steps"}max=? [ C<=3 ]', "3/2"),
+        ('<<1>> R{"steps"}min=? [ C<=3 ]', 2), ('<<1,3>> R{"steps"}min=? [ C<=3 ]', "3/2"),
+        ('<<>> R{"steps"}max=? [ I=0 ]', 1), ('<<>> R{"steps"}max=? [ I=1 ]', "1/2"),
+        ('<<1>> R{"steps"}max=? [ I=1 ]', 1), ('<<1,3>> R{"steps"}min=? [ I=1 ]', "1/2"),
+        ('<<1>> R{"cost"}max=? [ C<=1 ]', 2), ('<<1,2>> R{"cost"}max=? [ C<=2 ]', 7),
+        ('<<1>> R{"cost"}max=? [ C<=2 ]', 3), ('<<2,3>> R{"cost"}max=? [ C<=9 ]', 0),
+        ('<<1,2,3>> R{"steps"}max=? [ S ]', 1), ('<<1,2>> R{"steps"}max=? [ S ]', 0),
+        ('<<>> R{"steps"}min=? [ S ]', 1), ('<<1,3>> R{"steps"}max=? [ LRA ]', 0),
+        # Thresholds: some strategy of the coalition meets them.
+        ('<<1,2>> R{"steps"}>=5 [ C ]', True), ('<<1,2>> R{"steps"}>5 [ C ]', False),
+        ('<<3>> R{"steps"}<=5 [ C ]', True), ('<<3>> R{"steps"}<5 [ C ]', False),
+        ('<<1,3>> R{"steps"}>=3 [ Fc "goal" ]', True), ('<<1,2,3>> R{"steps"}>=1000000 [ C ]', True),
+        ('<<1>> R{"cost"}>=6 [ Fc s>2 ]', True), ('<<1>> R{"cost"}>6 [ Fc s>2 ]', False),
+        ('<<1,2,3>> R{"steps"}<=5 [ F "goal" ]', True), ('<<1,2>> R{"steps"}<=1000 [ F "goal" ]', False),
+        ('<<1,2>> P>=1/3 [ F "goal" ]', True), ('<<1,2>> P>1/3 [ F "goal" ]', False),
+        ('<<bob,carol>> P>=1/2 [ F "goal" ]', True), ('<<bob,carol>> P>1/2 [ F "goal" ]', False),
+        ('<<alice>> P<=1/2 [ F "goal" ]', True), ('<<alice>> P<1/2 [ F "goal" ]', False),
+        ('<<>> P>0 [ F "goal" ]', False), ('<<>> P<=0 [ F "goal" ]', False), ('<<>> P<=1 [ F "goal" ]', True),
+        ('<<1,2,3>> P>=3/4 [ F<=4 "goal" ]', True), ('<<1,2,3>> P>3/4 [ F<=4 "goal" ]', False),
+        ('<<1,2,3>> P>=1 [ F "goal" ]', True), ('<<1>> P>=1/2 [ X "lost" ]', True),
+    ],
+)  # fmt: skip
+def test_rewards_and_thresholds(text, value):
+    check(game(VAULT), text, value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("<<1,2,3>> Pmax=? [ G F s=0 ]", 1), ("<<1,3>> Pmax=? [ G F s=0 ]", 0),
+        ("<<2,3>> Pmax=? [ G F s=0 ]", 0), ("<<>> Pmin=? [ G F s=0 ]", 1),
+        ('<<1,3>> Pmax=? [ F G "goal" ]', "1/2"), ('<<2>> Pmin=? [ F G "goal" ]', "1/2"),
+        ("<<1,3>> Pmax=? [ F (s=2 & F s=0) ]", "1/2"), ("<<2,3>> Pmax=? [ F (s=2 & F s=0) ]", "1/2"),
+        ("<<3>> Pmax=? [ F (s=2 & F s=0) ]", 0), ("<<1,2>> Pmax=? [ F (s=2 & F s=0) ]", 0),
+        ("<<*>> Pmax=? [ F (s=2 & F s=0) ]", 1), ("<<1>> Pmin=? [ F (s=2 & X s=0) ]", "1/2"),
+        ('<<1,2>> Pmax=? [ (F "goal") & (G s!=2) ]', "1/3"), ('<<2>> Pmax=? [ (F "goal") & (G s!=2) ]', 0),
+        ('<<1>> Pmax=? [ (F "goal") & (G s!=2) ]', 0), ('<<1,3>> Pmax=? [ (F "goal") | (F "lost") ]', 1),
+        ('<<1,2>> Pmax=? [ X X "lost" ]', "2/3"), ('<<1>> Pmax=? [ X X ("lost" | "goal") ]', "1/2"),
+        ('<<1,2>> P>=0.33 [ (F "goal") & (G s!=2) ]', True), ('<<1,2>> P>=0.34 [ (F "goal") & (G s!=2) ]', False),
+        ("<<1,2,3>> P>=1 [ G F s=0 ]", True), ("<<1,2>> P>0 [ G F s=0 ]", False),
+    ],
+)  # fmt: skip
+def test_formulas_of_linear_temporal_logic(text, value):
+    check(game(VAULT), text, value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('filter(forall, <<1,3>> P>=0.5 [ F "goal" ] <=> (s=0|s=2|s=4))', True),
+        ('filter(forall, (<<1,3>> P>=0.5 [ F "goal" ]) => s!=3)', True),
+        ('filter(exists, <<1,3>> P>0.5 [ F "goal" ], s<2)', False),
+        ('filter(count, <<2>> P>=1/3 [ F "goal" ])', 2), ('filter(sum, <<1,2>> Pmax=? [ F "goal" ])', 2),
+        ('filter(max, <<carol>> Pmax=? [ F "goal" ], s<2)', "1/3"),
+        ('filter(min, <<carol>> Pmax=? [ F "goal" ], s<3)', "1/3"),
+        ('filter(avg, <<2,3>> Pmax=? [ F "goal" ], s<3)', "3/4"),
+        ('filter(state, <<1,2>> R{"steps"}max=? [ C ], s=1)', 4),
+        ('filter(forall, <<1,2>> R{"steps"}>=4 [ C ] <=> (s=0|s=1))', True),
+        ('filter(forall, !"lost" => <<*>> P>=1 [ F "goal" ])', True),
+        ('<<1>> Pmax=? [ F (<<2,3>> P>=3/4 [ F "goal" ]) ]', 1),
+        ('<<1>> Pmin=? [ F (<<2,3>> P>=3/4 [ F "goal" ]) ]', "1/2"),
+        ('<<1>> Pmin=? [ F <<2,3>> P>=3/4 [ F "goal" ] ]', "1/2"),
+        ('<<1,2>> P>=1 [ F <<3>> P>=1 [ X "goal" ] ]', True),
+        ('<<1,2>> Pmax=? [ F <<1,2>> P>=1 [ X "goal" ] ]', "1/3"),
+        ('<<2>> Pmax=? [ X <<2>> P>=1/3 [ F "goal" ] ]', 0), ('<<1>> Pmax=? [ X <<2>> P>=1/3 [ F "goal" ] ]', 1),
+        ('<<1,2>> R{"steps"}max=? [ Fc <<3>> P>=1 [ X "goal" ] ]', 4),
+        ('!(<<3>> P>=1/2 [ F "goal" ]) & <<1,3>> P>=1/2 [ F "goal" ]', True),
+        ('<<1,3>> P>=1/2 [ F "goal" ] & <<3>> P>=1/2 [ F "goal" ]', False),
+    ],
+)  # fmt: skip
+def test_nested_coalitions_and_filters(text, value):
+    check(game(VAULT), text, value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<<dave>> Pmax=? [ F "goal" ]', r"no player 'dave'.*alice \(1\), bob \(2\), carol \(3\)"),
+        ('<<4>> Pmax=? [ F "goal" ]', "no player '4'"), ('<<1,>> Pmax=? [ F "goal" ]', "expected a player"),
+        ('<<*,1>> Pmax=? [ F "goal" ]', "expected '>>'"), ('<<1,*>> Pmax=? [ F "goal" ]', "no other players"),
+        ('<<1>> P=? [ F "goal" ]', "say what the coalition wants"),
+        ('<<1>> <<2>> Pmax=? [ F "goal" ]', "after a coalition"), ("<<1 Pmax=? [ X true ]", "expected '>>'"),
+        ('<<1>> R{"time"}max=? [ C ]', "time"), ('<<1>> P>=1/2 [ Fc "goal" ]', "Fc"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_coalitions_are_named(text, message):
+    with pytest.raises(ValueError, match=message):
+        jl.solve_property(game(VAULT), text)
+
+
+def test_players_of_models_from_arrays():
+    world = jl.from_dense(
+        [[[0.5, 0.5], [1.0, 0]], [[0, 1.0], [0, 1.0]]], label={"b": [1]}, initial=[1, 0]
+    )
+    smg = jl.models.make_multiplayer_game(world, [1, 0], ["x", "y"])
+    assert jl.solve_property(smg, '<<y>> Pmax=? [ F "b" ]').value.tolist() == [1]
+    assert jl.solve_property(smg, '<<x>> Pmax=? [ F "b" ]').value.tolist() == [0]
+    assert smg.game([2]).system.tolist() == [True, False]
+    for owner, players, message in (
+        ([0, 2], ["x", "y"], "owner is 2 in state 1"), ([0], ["x"], "shape"), ([0, 0], ["x", "x"], "distinct"),
+        ([0.0, 1.0], ["x", "y"], "integers"), ([0, 0], "xy", "distinct"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            jl.models.make_multiplayer_game(world, owner, players)
+    with pytest.raises(ValueError, match=r"several players.*model\.game"):
+        jl.reachability_probability(smg, "b")
+    with pytest.raises(ValueError, match="give a list"):
+        smg.game("x")

@@ -368,7 +368,6 @@ def test_coalitions_of_the_players_of_a_game():
         ('<<system>> Pmaxmin=? [ F "a" ]', "no intervals"),
         ('<<system>> multi(Pmax=? [ F "a" ])', "after a coalition"),
         ('<<system Pmax=? [ F "a" ]', ">>"),
-        ("<<system>> Rmax=? [ C ]", "rewards for ever"),
     ):
         with pytest.raises(ValueError, match=message):
             ask(text)

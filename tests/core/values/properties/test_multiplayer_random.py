@@ -1,0 +1,70 @@
+"""Properties of random multi-player games against brute force over positional strategies."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.core.types import Status
+from tests.reference_multiplayer import RandomGame, random_smg
+
+COALITIONS = [set(c) for k in range(4) for c in itertools.combinations(range(3), k)]
+
+
+def references(game: RandomGame):
+    """Texts of paths and rewards, with functions from a coalition to the values of all states."""
+    a, b = game.label.T
+
+    def of(quantity):
+        return lambda members: game.coalition_value(quantity, members)
+
+    return {
+        'P{} [ X "a" ]': lambda m: game.backward(a.astype(float), m, 1),
+        'P{} [ F "a" ]': of(game.reached(a)),
+        'P{} [ G !"b" ]': of(1 - game.reached(b)),
+        'P{} [ !"b" U "a" ]': of(game.reached(a, ~b)),
+        'P{} [ G F "a" ]': of(game.recurrent(lambda after: (after & a).any(2))),
+        'P{} [ F G "a" ]': of(game.recurrent(lambda after: (~after | a).all(2))),
+        'P{} [ (F G "a") | (G F "b") ]': of(
+            game.recurrent(lambda after: (~after | a).all(2) | (after & b).any(2))
+        ),
+        'R{{"r"}}{} [ F "a" ]': of(game.total(a, unreached="infinite")),
+        'R{{"r"}}{} [ Fc "a" ]': of(game.total(a, unreached="sum")),
+        'R{{"r"}}{} [ C ]': of(game.total(np.zeros(game.size, bool), unreached="sum")),
+        'R{{"r"}}{} [ S ]': of(game.average()),
+        'R{{"r"}}{} [ C<=3 ]': lambda m: game.backward(np.zeros(game.size), m, 3, earn=True),
+    }
+
+
+def check_game(seed: int, most: int = 8) -> int:
+    """Compares every form for every coalition, alternately maximised and minimised by it."""
+    game, count = random_smg(seed, most), 0
+    for text, reference in references(game).items():
+        for number, members in enumerate(COALITIONS):
+            up = (number + seed) % 2 == 0
+            players = ", ".join(f"p{i + 1}" for i in sorted(members))
+            prop = f"<<{players}>> " + text.format("max=?" if up else "min=?")
+            maximisers = members if up else {0, 1, 2} - members
+            exact = reference(maximisers)
+            answer = jl.solve_property(game.model, prop, states=range(game.size))
+            assert answer.status == Status.CONVERGED, (seed, prop)
+            slack = 1e-9 * (1 + np.where(np.isfinite(exact), exact, 0))
+            assert (answer.lower - slack <= exact).all(), (seed, prop, answer.lower, exact)
+            assert (exact <= answer.upper + slack).all(), (seed, prop, answer.upper, exact)
+            count += 1
+    return count
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_every_form_for_every_coalition(seed):
+    assert check_game(seed, most=6) == 96
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(3, 503, 50))
+def test_many_games(first):
+    for seed in range(first, first + 50):
+        check_game(seed)
