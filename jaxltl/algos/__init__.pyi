@@ -13,5 +13,6 @@ from . import (
     regions as regions,
     rmax as rmax,
     todirl as todirl,
+    training as training,
     trust_region as trust_region,
 )

@@ -139,7 +139,7 @@ def bands(
 
 def sweep(
     metrics: Mapping[str, ArrayLike] | object,
-    settings: Sequence[str],
+    settings: Sequence[str] | None = None,
     *,
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
@@ -147,10 +147,11 @@ def sweep(
     """The learning curves of several settings: mean and standard deviation over seeds.
 
     Args:
-      metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``
-        of a ``vmap`` over seeds within one over settings.
-      settings: the names of the H settings; at most six, the number of distinct colours.
-      steps, show: as for :func:`curves`.
+      metrics: a :class:`~jaxltl.algos.training.Sweep`; or figures ``[H, N, T]`` of H settings and N
+        seeds by name, or a learner's ``Metrics`` of a ``vmap`` over seeds within one over settings.
+      settings: the names of the H settings; at most six, the number of distinct colours. Default:
+        those of the sweep.
+      steps, show: as for :func:`curves`; the steps of a sweep by default are its own.
 
     Returns:
       The figure, without seeds that are not finite at a step.
@@ -162,6 +163,12 @@ def sweep(
       >>> len(sweep({"loss": np.ones((2, 3, 5))}, ["slow", "fast"]).axes)  # settings, seeds, steps
       1
     """
+    runs: Any = metrics
+    if hasattr(runs, "names") and hasattr(runs, "metrics"):  # a Sweep; importing it takes a second
+        steps = runs.step if steps is None else steps
+        settings, metrics = settings or runs.names, runs.metrics
+    if settings is None:
+        raise ValueError("sweep: settings is None; give the names of the settings.")
     series, count = _shown("sweep", metrics, show), len(settings)
     if count > len(SERIES):
         raise ValueError(

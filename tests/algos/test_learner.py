@@ -22,7 +22,7 @@ from jax.tree_util import Partial
 
 import jaxltl as jl
 from jaxltl import algos
-from jaxltl.algos import mlirl
+from jaxltl.algos import mlirl, training
 from jaxltl.algos.common import checkpoint, learner, loops
 from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
 from jaxltl.core import struct
@@ -532,3 +532,35 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
     for changed in ({"hparams": other}, {"hparams": hparams, "problem": nudged(problem)}):
         with pytest.raises(ValueError, match="does not belong to this run"):
             run(state=start(name), checkpoint=path, **changed)
+
+
+# --- from the host: callbacks, saved runs and sweeps --------------------------------------------
+
+
+@by_learner
+def test_a_run_with_a_callback_that_was_interrupted_is_the_run(name, tmp_path):
+    module, problem, hparams, *_ = case(name)
+    own, metrics = four_steps(name)  # metrics of the steps 2 and 4
+    run = partial(training.train, module, start(name), problem, hparams)
+    run = partial(run, num_steps=4, max_rows=4, every=2, checkpoint=tmp_path / "run.npz")
+    half, rows = run(callback=lambda *_: next(iter(())))  # StopIteration
+    assert half.step.item() == 2 == len(jax.tree.leaves(rows)[0])
+    seen = []
+    state, rows = run(callback=lambda state, newest: seen.append((state, newest)))
+    assert_bitwise(state, own)
+    assert_bitwise(jax.tree.map(lambda x: x[1::2], rows), metrics)
+    assert_bitwise(seen, [(own, lane(rows, 3))])
+    assert_bitwise(run(callback=lambda *_: 1 / 0), (own, rows))  # finished: only read
+
+
+@pytest.mark.parametrize(
+    "name", [x if x in ("toy", "sarsa") else pytest.param(x, marks=pytest.mark.slow) for x in CASES]
+)
+def test_a_run_of_a_sweep_is_the_run_by_itself(name):
+    module, problem, hparams, *_ = case(name)
+    keys = jax.random.split(jax.random.key(3), 2)
+    runs = training.sweep(module, keys, problem, hparams, num_steps=4, max_rows=2)
+    state, metrics = steps(name, module.init(keys[1], problem, hparams), 4)
+    assert_bitwise(runs.states[0][1], state)
+    assert_bitwise(jax.tree.map(lambda x: x[0, 1], runs.metrics), metrics)
+    assert runs.step.tolist() == [2, 4]
