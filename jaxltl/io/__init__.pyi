@@ -1,4 +1,5 @@
 from .certificate.certificates import write_certificate as write_certificate
+from .certificate.storm_text import write_storm_certificate as write_storm_certificate
 from .colored_world import read_world as read_world, write_world as write_world
 from .drn.drn import read_drn as read_drn, write_drn as write_drn
 from .hoa.hoa import (

@@ -9,7 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.checker import main
-from jaxltl.io import read_umb, write_certificate
+from jaxltl.io import read_drn, read_umb, write_certificate, write_storm_certificate
 
 SIZE = 12
 
@@ -367,3 +367,55 @@ def test_other_questions_are_refused_by_name(question, why, tmp_path):
     found = jl.reachability_probability(model, np.asarray(model.states_with_label("goal")))
     with pytest.raises(ValueError, match=why):
         write_certificate(tmp_path / "file.umb", model, found, question)
+
+
+def storm_conditions(text, model, direction):
+    """The conditions of the format, by its own text: `u >= B u`, `l <= B l`, and the ranks."""
+    lines = text.splitlines()
+    kind, objective = lines[1].split()
+    size, sets = int(lines[2]), [{*map(int, x.split())} for x in lines[3 : 4 + (kind == "until")]]
+    target, stay = sets[0], sets[-1] if kind == "until" else {*range(size)}
+    table = [x.split() for x in lines[3 + len(sets) :]]
+    low, high = ([Fraction(x[i]) for x in table] for i in (1, 3))
+    rank = [float(x[2]) for x in table]
+    assert objective == direction and [int(x[0]) for x in table] == [*range(size)]
+    host, choose = model.host, {"max": max, "min": min}[direction]
+    for s in range(size):
+        if s in target:
+            assert low[s] <= 1 <= high[s]
+            continue
+        if s not in stay:
+            assert low[s] <= 0 <= high[s] and rank[s] == np.inf
+            continue
+        assert low[s] <= 0 or rank[s] < np.inf
+        options = []
+        for r in range(host.row_start[s], host.row_start[s + 1]):
+            entries = range(host.entry_start[r], host.entry_start[r + 1])
+            pairs = [(Fraction(float(host.probability[e])), host.successor[e]) for e in entries]
+            pairs = [(p / sum(q for q, _ in pairs), t) for p, t in pairs]
+            means = [sum(p * x[t] for p, t in pairs) for x in (low, high)]
+            options.append((*means, min(rank[t] for _, t in pairs)))
+        best = choose(x[0] for x in options)
+        assert best >= low[s] and choose(x[1] for x in options) <= high[s]
+        taken = [x[2] for x in options if direction == "min" or x[0] == best]
+        assert (max if direction == "min" else min)(taken) + 1 <= rank[s]
+    return low[0], high[0]
+
+
+@pytest.mark.parametrize("objective", ["max", "min"])
+@pytest.mark.parametrize("seed", range(4))
+def test_certificates_in_storms_format(objective, seed, tmp_path):
+    model, path = random_model(seed), tmp_path / "file.txt"
+    goal, safe = (np.asarray(model.states_with_label(x)) for x in ("goal", "safe"))
+    for stay, formula in ((None, 'F "goal"'), (safe, '"safe" U "goal"')):
+        found = jl.reachability_probability(model, goal, stay=stay, objective=objective)
+        drn = tmp_path / "model.drn"
+        write_storm_certificate(path, model, found, f"P{objective}=? [ {formula} ]", drn=drn)
+        read = read_drn(drn)
+        assert "@value_type: rational" in drn.read_text() and " : 1\n" in drn.read_text()
+        np.testing.assert_array_max_ulp(read.probability, model.probability)
+        low, high = storm_conditions(path.read_text(), model, objective)
+        assert low - 1e-5 <= found.value[0] <= high + 1e-5 and high - low < 1e-5
+    for question in ('Pmax=? [ G F "goal" ]', 'Pmax=? [ F<=3 "goal" ]'):
+        with pytest.raises(ValueError, match="Storm has certificates of P of F and U"):
+            write_storm_certificate(path, model, None, question)

@@ -118,7 +118,7 @@ def write_certificate(
         world: Model = model
         if isinstance(lazy, Product):
             world = replace(model, mdp=lazy.mdp) if isinstance(model, Game) else lazy.mdp
-        problem, formula = _problem(world, prop, reward, discount)
+        problem, formula = question_problem(world, prop, reward, discount)
         answer = solution.satisfaction if isinstance(solution, DataGuarantee) else solution
         simple = None if policy is not None or isinstance(lazy, Product) else answer
         if simple is not None and simple.product_policy is not None:
@@ -152,7 +152,7 @@ def write_certificate(
         write_gzip(target, tar_pieces(list(contents.items())))
 
 
-def _problem(
+def question_problem(
     model: Model, prop: Property, reward: Rewards | chex.Array | None, discount: float | None
 ) -> tuple[Certified, Formula | None]:
     """Validates the model and the question; with the formula that needs an automaton."""
