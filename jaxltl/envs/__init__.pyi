@@ -20,6 +20,7 @@ from .gridworld import gridworld as gridworld
 from .gymnasium_runner import run_policy as run_policy
 from .gymnasium_tables import from_gymnasium as from_gymnasium
 from .gymnasium_task import gymnasium_task as gymnasium_task
+from .gymnasium_vector import gymnasium_vector as gymnasium_vector
 from .letter_world import letter_world as letter_world
 from .robots import grid_game as grid_game
 from .zone_world import zone_world as zone_world
