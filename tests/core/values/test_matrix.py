@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -594,3 +595,20 @@ def test_traced_models_are_refused_by_a_value_error(kind):
 def test_traced_models_are_answered_rightly(kind):
     names = [name for name in QUESTIONS if name not in refusals(kind)]
     check(kind, names, TRACED, np.random.default_rng(KINDS.index(kind)), jax.jit)
+
+
+def lanes(ask):
+    """The second lane of two equal models."""
+
+    def second(model):
+        both = jax.vmap(ask)(jax.tree.map(lambda x: jnp.stack([x, x]), model))
+        return jax.tree.map(lambda x: x[1], both)
+
+    return second
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FEW, ids=case_of)
+def test_lanes_are_answered_rightly(kind):
+    names = [name for name in QUESTIONS if name not in refusals(kind)]
+    check(kind, names, TRACED, np.random.default_rng(KINDS.index(kind)), lanes)
