@@ -102,6 +102,10 @@ class RandomGame:
         matrix, reward = self.chains
         return np.einsum("jst,jt->js", _limit(matrix), reward)
 
+    def maximised(self, members: set[int]) -> set[int]:
+        """The states of the members."""
+        return {s for s in range(self.size) if self.owner[s] in members}
+
     # --- steps ---
 
     def backward(
@@ -119,6 +123,30 @@ class RandomGame:
                 ]
             )
         return value
+
+
+def least_if_reached(
+    game: RandomGame, target: np.ndarray, members: set[int], steps: int, limit: int
+) -> np.ndarray:
+    """Rewards that count if the target is reached within some steps and below a limit of reward."""
+    size = game.size
+    most = int(max(max(x) for x in game.reward))
+    levels = np.arange(limit + most + 1)
+    value = np.where(target, levels[:, None], 0).astype(float)
+    for _ in range(steps):
+        new = np.where(target, levels[:, None], 0).astype(float)
+        for s in np.flatnonzero(~target):
+            options = []
+            for row, earned in zip(game.rows[s], game.reward[s], strict=True):
+                ahead = value[int(earned) : int(earned) + limit + 1] @ row
+                options.append(ahead)
+            best = np.max if s in game.maximised(members) else np.min
+            new[: limit + 1, s] = best(options, axis=0)
+        if np.abs(new - value).max() < 1e-13:
+            break
+        value = new
+    assert value.shape[1] == size
+    return value[0]
 
 
 def _limit(matrix: np.ndarray) -> np.ndarray:

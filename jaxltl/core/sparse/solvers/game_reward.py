@@ -35,7 +35,9 @@ def game_reward_forever(
     low, high, rounds = np.zeros(mdp.num_states), np.full(mdp.num_states, np.inf), 0
     while True:
         rounds += 1
-        below = _answer(mdp, reward, maximizing, row, maximize=False, tolerance=half, depth=depth)
+        below = optimal_answer(
+            mdp, reward, maximizing, row, maximize=False, tolerance=half, depth=depth
+        )
         low = np.maximum(low, below.lower)
         value = below.value
         with np.errstate(invalid="ignore"):
@@ -48,7 +50,7 @@ def game_reward_forever(
         # The bound from above costs a decision process more: after 1, 2, 4, 8, ... rounds.
         if last or rounds & (rounds - 1) == 0:
             answer = np.where(maximizing, row, below.row)
-            above = _answer(
+            above = optimal_answer(
                 mdp, reward, ~maximizing, answer, maximize=True, tolerance=half, depth=depth
             )
             high = np.minimum(high, above.upper)
@@ -71,7 +73,7 @@ def game_reward_forever(
     )
 
 
-def _answer(
+def optimal_answer(
     mdp: HostMDP,
     reward: Floats,
     fixed: Booleans,
@@ -79,7 +81,7 @@ def _answer(
     *,
     maximize: bool,
     tolerance: float,
-    depth: int,
+    depth: int = 0,
 ) -> Enclosure:
     """The optimum of one player, where the states `fixed` of the other one have the rows `row`."""
     kept = ~fixed[mdp.state]

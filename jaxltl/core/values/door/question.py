@@ -27,7 +27,8 @@ class TotalReward(NamedTuple):
 
     reward: Reward
     target: Array | str | None = None
-    unreached: str = "infinite"  # or "sum": the reward of a run that never reaches the set
+    # of a run that never reaches the set: "infinite", "sum" of its rewards, or "zero"
+    unreached: str = "infinite"
 
 
 class DiscountedReward(NamedTuple):

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward
+from jaxltl.core.sparse.bounded.reward_bounded import in_units
 from jaxltl.core.sparse.interval import discounted as interval_discounted
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import RobustValues
@@ -18,6 +19,8 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import discounted, reachability as exact
 from jaxltl.core.sparse.solvers.game_reward import game_reward_forever
+from jaxltl.core.sparse.solvers.reward_if_reached import reward_if_reached
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
 from jaxltl.core.types import Solution
 from jaxltl.core.values.door.question import (
     Accuracy,
@@ -66,7 +69,14 @@ def earn(model: Model, question: Question, accuracy: Accuracy) -> Solution:
         chain = policy_chain(host, form.weights(question.policy))
         earned = chain.mean(earned, host.row_start)
         host, depth = chain.mdp, chain.depth
-    if path.target is None or path.unreached == "sum":
+    if path.target is not None and path.unreached == "zero":
+        if question.policy is not None:
+            raise ValueError(
+                'policy: unreached="zero" is solved for optimal policies; leave it out.'
+            )
+        maximizing = np.full(host.num_states, maximize)
+        enclosure = _if_reached(form, path, maximizing, requested)
+    elif path.target is None or path.unreached == "sum":
         ended, earned, row = _ended(form, host, earned, path)
         enclosure = exact.reward_forever(
             ended, earned, maximize=maximize, tolerance=requested, depth=depth
@@ -131,7 +141,7 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
     """Total rewards under intervals, and of games: ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``."""
     path, form = question.path, row_form(model)
     assert isinstance(path, TotalReward)
-    if form.interval is None and (path.target is None or path.unreached == "sum"):
+    if form.interval is None and (path.target is None or path.unreached != "infinite"):
         return _earn_in_game(form, question, accuracy.width(TOLERANCE))
     require_infinite(path)
     requested, target = accuracy.width(TOLERANCE), form.states("target", path.target)
@@ -154,12 +164,30 @@ def _earn_in_game(form: RowForm, question: Question, requested: float) -> Soluti
             "strategies; leave policy out, or restrict the model by with_allowed."
         )
     earned = nonnegative_reward(form.sparse, form.reward(path.reward), "total rewards")
-    ended, earned, row = _ended(form, form.host, earned, path)
     aims = directions(question.objective, None, question.environment)
     maximizing = np.where(form.system, aims.system, aims.environment)
-    enclosure = game_reward_forever(ended, earned, maximizing, tolerance=requested)
-    enclosure = replace(enclosure, row=row[enclosure.row])
+    if path.target is not None and path.unreached == "zero":
+        enclosure = _if_reached(form, path, maximizing, requested)
+    else:
+        ended, earned, row = _ended(form, form.host, earned, path)
+        enclosure = game_reward_forever(ended, earned, maximizing, tolerance=requested)
+        enclosure = replace(enclosure, row=row[enclosure.row])
     return solution_from_enclosure(form, enclosure, requested, relative=True)
+
+
+def _if_reached(
+    form: RowForm, path: TotalReward, maximizing: Booleans, requested: float
+) -> Enclosure:
+    """Rewards that count only if the target is reached, of chains, decision processes and games."""
+    assert path.target is not None
+    cost = transition_reward(form.sparse, form.reward(path.reward))
+    largest = float(cost.max(initial=0))
+    units, most = in_units(cost, largest)
+    target = form.states("target", path.target)
+    values = reward_if_reached(form.host, units, target, maximizing, tolerance=requested)
+    unit, error = largest / max(most, 1), 4 * float(np.finfo(np.float64).eps)
+    low, high = values.lower * unit * (1 - error), values.upper * unit * (1 + error)
+    return replace(values, value=np.clip(values.value * unit, low, high), lower=low, upper=high)
 
 
 def _ended(

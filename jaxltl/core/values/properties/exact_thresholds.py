@@ -62,7 +62,7 @@ def exact_values(
       effort: the multiple of the limits on states, transitions and work.
     """
     inner = model.mdp if isinstance(model, Game) else model
-    if not isinstance(inner, SparseMDP):
+    if not isinstance(inner, SparseMDP) or prop.unreached == "zero":
         return None
     if max(inner.num_states * 10, inner.num_transitions) > MAX_TRANSITIONS * effort:
         return None

@@ -47,8 +47,8 @@ def total_reward(
     target is not reached almost surely: for ``"max"`` under some policy, for ``"min"`` under every
     policy; without a target, where reward is earned for ever. With ``unreached="sum"`` a run that never
     reaches the target is worth the sum of its rewards, and the value is infinite where reward is
-    earned for ever (the semantics ``F`` and ``Fc`` of Chen, Forejt, Kwiatkowska, Parker and Simaitis
-    2013).
+    earned for ever; with ``unreached="zero"`` such a run is worth 0 (the semantics ``F``, ``Fc`` and
+    ``F0`` of Chen, Forejt, Kwiatkowska, Parker and Simaitis 2013).
 
     Args:
       model: any model.
@@ -57,8 +57,8 @@ def total_reward(
         Rewards of transitions must not differ within a row of intervals.
       target: ``bool[S]``, a label's name, or a Boolean formula of labels; required inside ``jit``, over
         a mesh, and of interval models.
-      unreached: the reward of a run that never reaches the target, ``"infinite"`` or ``"sum"``; the latter
-        without intervals, on the host, and in a game without a policy.
+      unreached: the reward of a run that never reaches the target, ``"infinite"``, ``"sum"`` or ``"zero"``;
+        the last two without intervals, on the host, and ``"zero"``, as both in games, without a policy.
       policy, objective, nature, environment, throw: as of :func:`reachability_probability`.
       tolerance: relative width of the enclosure; default 1e-6 in double precision, 1e-3 in single.
 
@@ -79,7 +79,7 @@ def total_reward(
       >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
       [2.0, 0.0]
     """
-    validation.choice("unreached", unreached, ("infinite", "sum"))
+    validation.choice("unreached", unreached, ("infinite", "sum", "zero"))
     path = TotalReward(reward, target, unreached)
     question = Question(path, objective, nature, environment, policy)
     return solve(model, question, Accuracy(tolerance), throw=throw)

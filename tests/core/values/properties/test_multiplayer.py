@@ -105,6 +105,8 @@ STEPS = {
     "": "3/2", "1": 2, "2": "3/2", "3": 2, "1,2": 5, "1,3": 3, "2,3": 3, "1,2,3": "inf",
 }  # fmt: skip
 COST = {"": 0, "1": 6, "2": 0, "3": 0, "1,2": 7, "1,3": 7, "2,3": 0, "1,2,3": "inf"}
+# The steps count only if the goal is reached.
+REACHED = {"": 0, "1": 0, "2": 0, "3": "2/3", "1,2": 5, "1,3": 1, "2,3": 1, "1,2,3": "inf"}
 OTHERS = {
     "": "1,2,3", "1": "2,3", "2": "1,3", "3": "1,2", "1,2": "3", "1,3": "2", "2,3": "1", "1,2,3": "",
 }  # fmt: skip
@@ -117,6 +119,10 @@ def test_total_rewards_of_every_coalition(members):
             check(
                 game(VAULT), f'<<{coalition}>> R{{"steps"}}{objective}=? [ {path} ]', STEPS[members]
             )
+        path = 'F0 "goal"'
+        check(
+            game(VAULT), f'<<{coalition}>> R{{"steps"}}{objective}=? [ {path} ]', REACHED[members]
+        )
         # Only all players together can be sure of the goal.
         reached = "inf" if members else 5
         check(game(VAULT), f'<<{coalition}>> R{{"steps"}}{objective}=? [ F "goal" ]', reached)
@@ -138,6 +144,10 @@ def test_total_rewards_of_every_coalition(members):
         ('<<1>> R{"cost"}max=? [ C<=2 ]', 3), ('<<2,3>> R{"cost"}max=? [ C<=9 ]', 0),
         ('<<1,2,3>> R{"steps"}max=? [ S ]', 1), ('<<1,2>> R{"steps"}max=? [ S ]', 0),
         ('<<>> R{"steps"}min=? [ S ]', 1), ('<<1,3>> R{"steps"}max=? [ LRA ]', 0),
+        ('<<1,2>> R{"steps"}>=4.99 [ F0 "goal" ]', True), ('<<1,2>> R{"steps"}>5.01 [ F0 "goal" ]', False),
+        ('<<1,2,3>> R{"steps"}>=1000000 [ F0 "goal" ]', True), ('<<3>> R{"steps"}>0.7 [ F0 "goal" ]', False),
+        ('<<2>> R{"cost"}max=? [ F0 "lost" ]', 0), ('<<2>> R{"steps"}<=0.1 [ F0 "goal" ]', False),
+        ('<<2>> R{"steps"}min=? [ F0 "lost" ]', 3), ("<<1>> R{\"cost\"}max=? [ F0 s=1 ]", 2),
         # Thresholds: some strategy of the coalition meets them.
         ('<<1,2>> R{"steps"}>=5 [ C ]', True), ('<<1,2>> R{"steps"}>5 [ C ]', False),
         ('<<3>> R{"steps"}<=5 [ C ]', True), ('<<3>> R{"steps"}<5 [ C ]', False),

@@ -9,7 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.types import Status
-from tests.reference_multiplayer import RandomGame, random_smg
+from tests.reference_multiplayer import RandomGame, least_if_reached, random_smg
 
 COALITIONS = [set(c) for k in range(4) for c in itertools.combinations(range(3), k)]
 
@@ -61,6 +61,39 @@ def check_game(seed: int, most: int = 8) -> int:
 @pytest.mark.parametrize("seed", range(2))
 def test_every_form_for_every_coalition(seed):
     assert check_game(seed, most=6) == 96
+
+
+def check_reached(seed: int, most: int, limit: int) -> None:
+    """Rewards that count if the target is reached, against value iteration over collected rewards."""
+    game = random_smg(seed, most)
+    target = game.label[:, 0]
+    for number, members in enumerate(COALITIONS):
+        up = (number + seed) % 2 == 0
+        players = ", ".join(f"p{i + 1}" for i in sorted(members))
+        prop = f'<<{players}>> R{{"r"}}{"max" if up else "min"}=? [ F0 "a" ]'
+        answer = jl.solve_property(game.model, prop, states=range(game.size))
+        maximisers = members if up else {0, 1, 2} - members
+        least = least_if_reached(game, target, maximisers, 4 * limit, limit)
+        assert answer.status == Status.CONVERGED, (seed, prop)
+        finite = np.isfinite(answer.lower)
+        assert (least <= answer.upper + 1e-9).all(), (seed, prop, answer.upper, least)
+        assert (least[~finite] > limit / 50).all(), (seed, prop, least)
+        assert least[finite] == pytest.approx(answer.value[finite], rel=1e-2, abs=1e-2), (
+            seed,
+            prop,
+        )
+
+
+@pytest.mark.parametrize("seed", (0, 7))
+def test_rewards_that_count_if_the_target_is_reached(seed):
+    check_reached(seed, most=4, limit=60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 40, 10))
+def test_many_rewards_that_count_if_the_target_is_reached(first):
+    for seed in range(first, first + 10):
+        check_reached(seed, most=6, limit=150)
 
 
 @pytest.mark.slow
