@@ -418,7 +418,7 @@ def mutated(rng, values, policy, sizes):
 def test_exact_values_are_accepted_and_false_claims_are_not(form, kind, tmp_path, capsys):
     rng = random.Random(f"{form} {kind}")
     accepted = refused = 0
-    for _ in range(8 if form == "interval game" else 12):
+    for _ in range(5):
         members, path, inner, solve = random_case(rng, form, kind)
         question, directions = random_question(rng, form, path, inner)
         best, attained = solve(directions)
@@ -445,7 +445,7 @@ def test_exact_values_are_accepted_and_false_claims_are_not(form, kind, tmp_path
                 true = values[0] <= best[0] if side == "lower" else values[0] >= best[0]
                 assert status == 1 or true
                 refused += status == 1
-    assert accepted > 10 and refused > 20
+    assert accepted > 4 and refused > 10
 
 
 # --- other questions --------------------------------------------------------------------------
@@ -674,7 +674,7 @@ def test_formulas(formula, form, tmp_path, capsys):
     rng = random.Random(f"{formula} {form}")
     num_q = int(AUTOMATA[formula][0])
     has_players, intervals = FORMS[form]
-    for _ in range(2 if num_q > 1 else 5):
+    for _ in range(1 if num_q > 1 else 3):
         states = random_states(rng, 2 if num_q > 1 and has_players else 3, intervals)
         owner = [rng.randint(0, 1) if has_players else 0 for _ in states]
         letters = [(rng.random() < 0.5, rng.random() < 0.5) for _ in states]

@@ -6,7 +6,7 @@ printed is compared: with the block without a language that follows, with the co
 say what is not so, see CONTRIBUTING.md:
 
 - ``<!-- not run: why -->``: it needs a cluster, another program, a file that is not there.
-- ``<!-- minutes: why -->``: it runs with ``-m slow`` only, with all of its page.
+- ``<!-- minutes: why -->``: it runs with ``-m exhaustive`` only, with all of its page.
 - ``<!-- needs: package -->``: it runs where that is installed.
 - ``<!-- alone -->``: a namespace and a test of its own, as have those that come after it.
 - ``<!-- single precision -->``: JAX's own setting, for all of the page; the tests' is double.
@@ -44,6 +44,7 @@ ALL_SLOW = (
     "docs/parameters.md",
     "docs/prepared.md",
     "docs/tasks-in-environments.md",
+    "docs/training-loops.md",
     "docs/worlds-of-the-literature.md",
 )
 INSTALLED = re.compile(r"(pip install|pytest|python -m build|git clone|cd )\b")
@@ -66,8 +67,23 @@ def chapters() -> list[Any]:
             quick = part[: part.index(slow[0])] if slow else part
             if any(runs(b) for b in quick):
                 found.append(pytest.param(name, quick, id=place))
+            begin = beginning(part)
+            if any(runs(b) and b not in quick for b in begin):
+                found.append(pytest.param(name, begin, id=f"{place}-begin", marks=pytest.mark.slow))
             if slow:
-                found.append(pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.slow))
+                whole = pytest.mark.exhaustive  # before a release
+                found.append(pytest.param(name, part, id=f"{place}-whole", marks=whole))
+    return found
+
+
+def beginning(part: list[Block], count: int = 3) -> list[Block]:
+    """The blocks of a part until so many were run, or until one takes minutes."""
+    found: list[Block] = []
+    for block in part:
+        minutes = "minutes" in block.marks or any(x in block.text for x in sum(SLOW.values(), ()))
+        if runs(block) and (minutes or sum(map(runs, found)) == count):
+            break
+        found.append(block)
     return found
 
 

@@ -22,6 +22,7 @@ LIMITS = {
 MODULE_LINES, BODY_LINES = 600, 120
 ONE_FILE = {"checker.py": 863}  # runs alone, without the package
 MEASURED = size.measure(PACKAGE)
+TREES = {path: (text, ast.parse(text)) for path, text in size.sources(PACKAGE).items()}
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -31,10 +32,10 @@ def test_the_package_keeps_to_its_limits(name):
 
 def test_modules_and_functions_are_short():
     long = []
-    for path, text in size.sources(PACKAGE).items():
+    for path, (text, tree) in TREES.items():
         if text.count("\n") > ONE_FILE.get(path.name, MODULE_LINES):
             long.append(f"{path}: {text.count(chr(10))} lines")
-        for function in size.functions(ast.parse(text)):
+        for function in size.functions(tree):
             if size.body_lines(function) > BODY_LINES:
                 long.append(f"{path}: {function.name} has {size.body_lines(function)} lines")
     assert not long
@@ -46,8 +47,8 @@ NOT_NAMES = {"found", "told", "what", "given", "near", "far", "shown", "spread"}
 def test_names_are_nouns_of_the_field():
     """Variables, parameters and fields are named for what they hold, not for where it is from."""
     wrong = []
-    for path, text in size.sources(PACKAGE).items():
-        for node in ast.walk(ast.parse(text)):
+    for path, (_, tree) in TREES.items():
+        for node in ast.walk(tree):
             stored = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
             name = node.id if stored else node.arg if isinstance(node, ast.arg) else None
             if name in NOT_NAMES:
@@ -68,8 +69,8 @@ SHARED_CLASSES = {"Problem", "Hparams", "State", "Metrics"} | {
 
 def test_a_class_name_has_one_meaning():
     places = {}
-    for path, text in size.sources(PACKAGE).items():
-        for node in ast.walk(ast.parse(text)):
+    for path, (_, tree) in TREES.items():
+        for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name.lstrip("_"), []).append(f"{path}:{node.lineno}")
     twice = {name: at for name, at in places.items() if len(at) > 1}

@@ -126,6 +126,7 @@ def test_what_tells_fingerprints_apart():
     assert one(x=nets[0]) == one(x=nets[2])
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_same_fingerprint():
     program = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"

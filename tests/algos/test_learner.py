@@ -76,12 +76,12 @@ for learner_name in LEARNERS:
 # Two ways to write a problem of one learner down, and a network that remembers, which takes
 # longest to compile, have the laws of the others; the last is tested beside its learner, too.
 MORE = ("mlirl-world", "ppo-memory")
+SLOW = ("trpo",)  # the default tests have the constrained method of the same learner
 
 
 def each(names):
-    return pytest.mark.parametrize(
-        "name", [pytest.param(x, marks=pytest.mark.exhaustive) if x in MORE else x for x in names]
-    )
+    marks = dict.fromkeys(MORE, pytest.mark.exhaustive) | dict.fromkeys(SLOW, pytest.mark.slow)
+    return pytest.mark.parametrize("name", [pytest.param(x, marks=marks.get(x, ())) for x in names])
 
 
 by_learner = each(CASES)
@@ -274,7 +274,8 @@ def test_every_learner_is_called_alike(name):
     assert set(np.asarray(metrics.status).tolist()) <= set(Status)
 
 
-@each(["mlirl-product", "rmax", "q-maximin", "cce", "ppo"])
+@pytest.mark.few(2)
+@each(["q-maximin", "cce", "rmax", "mlirl-product", "ppo"])
 def test_a_traced_hyperparameter_out_of_range_is_invalid(name):
     module, problem, hparams, *_ = case(name)
     field = "temperature" if name == "cce" else "discount"

@@ -148,9 +148,9 @@ def problem_in(place, reward="linear"):
 @pytest.mark.parametrize(
     ("place", "reward", "options"),
     [
-        ("world", "linear", {}),
-        ("world", "linear", {"policy": "soft"}),
         ("world", "network", {}),
+        pytest.param("world", "linear", {}, marks=pytest.mark.slow),
+        pytest.param("world", "linear", {"policy": "soft"}, marks=pytest.mark.slow),
         ("product", "linear", {"mu": 2.0}),
         pytest.param(
             "product", "linear", {"mu": 2.0, "policy": "soft"}, marks=pytest.mark.exhaustive
@@ -433,6 +433,7 @@ def test_trajectories_of_another_model_are_refused():
     assert back.state_shape == world.state_shape
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_by_construction_whatever_was_learned(dtype):
     """Weights that make exponentials underflow leave the best probability what it is."""

@@ -16,7 +16,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jax.tree_util import Partial
 
 import jaxltl as jl
-from jaxltl.algos import many_tasks, ppo
+from jaxltl.algos import ppo
 from tests.algos.test_learner import CASES, assert_bitwise, case, leaves, reaches
 from tests.algos.test_ppo import (
     corridor_allowed,
@@ -25,7 +25,6 @@ from tests.algos.test_ppo import (
     corridor_step,
     proximal,
 )
-from tests.several import ended, start
 from tests.support import stack
 
 LANES = 8
@@ -184,22 +183,6 @@ def test_environments_over_devices_are_the_environments(name, number):
     assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves(state.parameters))
 
 
-@pytest.mark.exhaustive
-def test_seeds_and_their_environments_over_two_axes():
-    problem, hparams = plain()
-    mesh = mesh_of(2, 2)
-    keys = jax.random.split(jax.random.key(0), 4)
-    split = replace(hparams, sharding=over(mesh))
-    found = jl.vmap_over_mesh(
-        lambda key, problem: ppo.train(key, problem, split, num_steps=3),
-        mesh,
-        "lanes",
-        in_axes=(0, None),
-    )(keys, problem)
-    expected = jax.vmap(lambda key: ppo.train(key, problem, hparams, num_steps=3))(keys)
-    assert_near(jl.models.on_host(found), expected, 1e-10)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -218,42 +201,7 @@ def test_what_cannot_be_split_is_named(change, message):
         ppo.init(jax.random.key(0), problem, hparams)
 
 
-@pytest.mark.exhaustive
-def test_stages_of_seeds_over_devices_are_those_of_vmap():
-    problem, hparams = plain()
-    keys, axes = jax.random.split(jax.random.key(0), 4), (0, None, None)
-    mesh = mesh_of(2)
-
-    def staged(init, run):
-        return many_tasks.train_in_stages(
-            keys,
-            [problem, problem],
-            hparams,
-            init=init,
-            run=run,
-            num_chunks=3,
-            num_steps=2,
-            enough=-10.0,
-        )
-
-    found = staged(*(jl.vmap_over_mesh(f, mesh, in_axes=axes) for f in (ppo.init, ppo.run)))
-    expected = staged(
-        jax.vmap(ppo.init, axes),
-        lambda *x, num_steps: jax.vmap(partial(ppo.run, num_steps=num_steps), axes)(*x),
-    )
-    assert found.stages.tolist() == expected.stages.tolist() == [0, 1, 1]
-    assert_near(jl.models.on_host(found.state), expected.state, 1e-10)
-
-
 # --- several processes ----------------------------------------------------------------------------
-
-
-@pytest.mark.exhaustive
-def test_two_processes_make_the_lanes_of_one():
-    names = (*CASES, "environments", "episodes")
-    found = ended(start(2, "-m", "tests.algos.test_over_mesh", ",".join(names)), 900)
-    assert [x.status for x in found] == [0, 0], [x.err[-2000:] for x in found]
-    assert [x.out.splitlines()[-1] for x in found] == [f"as on one: {len(names)}"] * 2
 
 
 def main(names: str, coordinator: str, process: int, processes: int) -> None:

@@ -17,7 +17,7 @@ from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.post_offices import patrol, post_offices
 from tests import reference_games
 from tests.algos.cases import LearnerCase, alternating_game
-from tests.support import as_mdp, counted_traces, lane, stack
+from tests.support import as_mdp, lane, stack
 
 
 @cache
@@ -312,23 +312,6 @@ def test_a_seldom_successor_seen_late_still_counts():
     assert found.epsilon_optimal.all(), "there is nothing to choose"
 
 
-@pytest.mark.exhaustive
-def test_a_formula_on_a_markov_decision_process():
-    """One player, a slippery walk, a task with memory and a pit that must be left alone."""
-    world = jl.gridworld("s . a\n. # .\nb . p", slip=0.1)
-    world = world.replace(initial=jax.nn.one_hot(0, world.num_states))
-    rng = np.random.default_rng(0)
-    reward = rng.random((world.num_states, world.num_actions))
-    problem = rmax.make_problem(world, "G !p & G F s", reward)
-    assert (problem.base_state != 8).all() or not problem.region[problem.base_state == 8].any()
-    hparams = settings(known_after=200, epsilon=0.2, restart=0.05)
-    learned = learn(jax.random.key(0), problem, hparams, 50_000)
-    found = rmax.evidence(learned.state, problem, hparams)
-    assert found.almost_sure
-    assert found.epsilon_optimal[found.reachable].mean() > 0.8
-    np.testing.assert_allclose(found.worst_case.value, found.played.value, atol=1e-3)
-
-
 @pytest.mark.slow
 def test_the_adversary_plays_the_minimax_answer():
     found = patrol()
@@ -392,27 +375,6 @@ def test_lanes_of_different_settings_are_as_if_alone():
             for name in ("moves", "counts", "known_at", "best", "num_updates", "step"):
                 np.testing.assert_array_equal(getattr(here, name), getattr(alone.state, name))
             np.testing.assert_allclose(here.value, alone.state.value, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_new_numbers_do_not_retrace():
-    problem, _ = random_problem(5)
-    learn(jax.random.key(0), problem, settings(known_after=3), 50)
-    with counted_traces() as traced:
-        learn(jax.random.key(1), problem, settings(known_after=9, epsilon=0.3), 70)
-    assert not traced
-
-
-@pytest.mark.exhaustive
-def test_single_precision():
-    with jax.enable_x64(False):
-        found = patrol()
-        problem = rmax.make_problem(found.game, found.accepting, found.reward)
-        learned = learn(jax.random.key(0), problem, settings(), 10_000)
-        assert learned.state.value.dtype == jnp.float32
-        evidence = rmax.evidence(learned.state, problem, settings(epsilon=1e-3))
-        mine = np.asarray(evidence.reachable & problem.game.system)
-        assert np.asarray(evidence.epsilon_optimal)[mine].sum() >= 50
 
 
 def test_how_a_run_ends():

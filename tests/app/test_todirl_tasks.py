@@ -118,6 +118,7 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
         assert sure[starts, np.asarray(model.initial_memory)[starts]].all()
 
 
+@pytest.mark.slow
 def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path):
     few = ("steps = 40", "steps = 2"), ("[task]", "[task]\nsteps_factor = 1.1")
     setup = prepared(write(*few, ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))

@@ -35,7 +35,7 @@ def test_jitted_functions_never_run_the_program_of_another_class():
     def kelvin(x):
         return x.degrees + (273.15 if isinstance(x, Celsius) else 0)
 
-    for n in range(1, 60):
+    for n in range(1, 12):
         zeros = jnp.zeros(n)
         np.testing.assert_allclose(kelvin(Celsius(zeros)), 273.15, rtol=1e-6)
         np.testing.assert_array_equal(kelvin(Kelvin(zeros)), 0)

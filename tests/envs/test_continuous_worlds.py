@@ -73,6 +73,7 @@ def test_successors(name, state, action, noise, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", CASES)
 def test_labels_and_initial_states_lie_in_the_domain(name):
     dynamics = CASES[name]().dynamics

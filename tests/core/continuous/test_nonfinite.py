@@ -47,6 +47,7 @@ POLICIES = {
 }
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize("outside", ["violates", "clip", "far"])
 @pytest.mark.parametrize("name", POLICIES)
 def test_policies_that_may_be_nan_prove_nothing(name, outside):

@@ -76,6 +76,6 @@ def test_allowed_actions_keep_a_cell_from_every_gust_and_others_do_not():
 
 
 def test_another_grid_of_actions_is_refused():
-    policy = synthesize_policy(world(CHOICES), SAFE, CHOICES[:2], cells=[40])
+    policy = synthesize_policy(world(CHOICES), SAFE, CHOICES[:2], cells=[4], max_cells=4)
     with pytest.raises(ValueError, match="2 actions that are not the grid of the dynamics"):
         shield_dynamics(policy)

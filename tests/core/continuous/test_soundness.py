@@ -161,8 +161,14 @@ GAINS = {
 
 
 @pytest.mark.filterwarnings("ignore:the step may jump")
-@pytest.mark.parametrize("noise", [uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)])
-@pytest.mark.parametrize("name", GAINS)
+@pytest.mark.parametrize(
+    ("name", "noise"),
+    [
+        pytest.param(name, noise, marks=[] if i % 2 == j and i < 5 else pytest.mark.slow)
+        for i, name in enumerate(GAINS)
+        for j, noise in enumerate((uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)))
+    ],
+)
 def test_noise_that_is_not_additive(name, noise):
     gain = GAINS[name]
     world = make_dynamics(

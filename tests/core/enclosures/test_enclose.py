@@ -158,7 +158,7 @@ def test_jit_and_vmap_give_the_same_bounds():
 
 def test_bounds_are_differentiable():
     def upper(a, b):
-        return enclose(lambda x: jnp.tanh(x) * x[0])(a, b)[1].sum()
+        return enclose(lambda x: x * x[0])(a, b)[1].sum()
 
     with jax.enable_x64(True):
         a, b = jnp.array([0.1, 0.2]), jnp.array([0.3, 0.5])

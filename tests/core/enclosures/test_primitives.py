@@ -110,7 +110,7 @@ def samples(low, high, count=9):
     return np.clip(low + share * (high - low), low, high)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_lie_inside_or_nothing_is_known(name, dtype):
     """Bounds are infinite on both sides at points with a sample that is NaN."""

@@ -69,6 +69,7 @@ def objective(game, task):
     return jl.games.gr1(game, ["a"], ["b", "!c"]) if task == GR1 else task
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("task", [*TASKS, GR1])
 def test_strategies_win_as_policies(task):
     count = {"system": 0, "environment": 0}

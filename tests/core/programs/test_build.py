@@ -261,10 +261,10 @@ def test_many_wide_levels_need_parts_and_a_larger_table(trial, monkeypatch):
     monkeypatch.setattr(local_choices, "_TRIAL", trial)  # 1: choices are soon evaluated directly
     monkeypatch.setattr(packed_states, "_FIRST", 16)
     monkeypatch.setattr(packed_states, "_PART", 7)
-    model = built("""mdp module m x : [0..40]; [] x<40 -> (x'=x+1); [s] x=40 -> true; endmodule
+    model = built("""mdp module m x : [0..20]; [] x<20 -> (x'=x+1); [s] x=20 -> true; endmodule
     module n = m [x=y] endmodule module k = m [x=z] endmodule""")
-    assert model.num_states == 41**3
-    assert model.num_rows == 3 * 40 * 41**2 + 1
+    assert model.num_states == 21**3
+    assert model.num_rows == 3 * 20 * 21**2 + 1
 
 
 EXPRESSIONS = [

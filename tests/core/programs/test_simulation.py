@@ -110,6 +110,7 @@ def test_frequencies_of_steps_are_those_of_the_built_model(text):
             assert p > 1e-4 / len(pairs), (s, a, r, count[some], draws * law[some])
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("text", "reward"), [(CHAIN, "r"), (MDP, "")])
 def test_rewards_and_labels_are_those_of_the_built_model(text, reward):
     program = read_program(text)

@@ -1,6 +1,5 @@
 """Properties of interval models: values that others published, and laws by brute force."""
 
-from dataclasses import replace
 from itertools import islice, product
 
 import numpy as np
@@ -306,29 +305,6 @@ def test_any_formula_beside_all_that_nature_may_keep_to(seed):
             below = text in PLAIN or nature == "min"
             assert not above or found.upper[0] >= best - 1e-6, (text, directions)
             assert not below or found.lower[0] <= best + 1e-6, (text, directions)
-
-
-@pytest.mark.parametrize(
-    "seed", [*range(4), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(4, 80))]
-)
-def test_rewards_beside_all_that_nature_may_keep_to(seed):
-    rng = np.random.default_rng(1000 + seed)
-    worlds = []
-    while not 2 < len(worlds) <= 16:
-        model = labelled(rng, chain=seed % 4 == 0)
-        worlds = list(islice(members(model), 17))
-    rewards = {"r": Rewards(choice=rng.integers(0, 4, model.num_rows) * 1.0)}
-    model = replace(model, nominal=replace(model.nominal, rewards=rewards))
-    worlds = [replace(world, rewards=rewards) for world in worlds]
-    for text, directions in product(('R{}=? [ F "a" ]', 'T{}=? [ F "b" ]'), BOTH):
-        policy, nature = directions[:3], directions[3:]
-        each = [float(solve_property(w, text.format(policy)).value[0]) for w in worlds]
-        best = (max if nature == "max" else min)(each)
-        if best == np.inf:
-            found = solve_property(model, text.format(directions))
-            assert found.lower.tolist() == found.upper.tolist() == [np.inf]
-        else:
-            assert_enclosed(model, text.format(directions), best, near=2e-6 * max(1, best))
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -50,6 +50,7 @@ def test_a_concrete_product_stays_concrete_inside_jit():
     np.testing.assert_allclose(value, jl.optimal_value(model, reward, 0.5).value, rtol=1e-5)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("number", [None, [3, 1, 0, 2], [1, 1, 0, 0]])
 def test_actions_inside_jit_have_the_numbers_of_those_outside(number):
     # Numbers that a state has twice are none; actions are then numbered in their order.
@@ -91,7 +92,7 @@ def test_what_no_numbers_make_right_is_raised_at_once(model, ask, match):
         jax.jit(ask)(model)
 
 
-@pytest.mark.parametrize("text", ["a & !b", "!a | b", "true", "a xor init", "a"])
+@pytest.mark.parametrize("text", ["a & !b", "a xor init"])
 def test_formulas_of_labels_are_read_inside_jit(text):
     world = WORLD.replace(label=jnp.array([[0, 1], [1, 0], [1, 1]], bool), propositions=("a", "b"))
     for model in world, jl.product(world, "F a"):

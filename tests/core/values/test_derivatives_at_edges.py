@@ -322,7 +322,7 @@ OTHERS = ["dense", "max", "min", "sweeps", "reward_max", "reward_min"]
     ("kind", "count"),
     [
         ("policy", 30),
-        ("reward", 30),
+        pytest.param("reward", 30, marks=pytest.mark.slow),
         *(pytest.param(kind, 100, marks=pytest.mark.slow) for kind in OTHERS),
         *(pytest.param(kind, 400, marks=pytest.mark.slow) for kind in ("policy", "reward")),
     ],

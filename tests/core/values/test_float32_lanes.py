@@ -18,9 +18,7 @@ WIDTH = 1e-5
 @pytest.mark.parametrize(
     ("question", "formula", "count"),
     [
-        ("optimal satisfaction", "F (a & F b)", 2),
         ("satisfaction", "!b U a", 2),
-        ("optimal value", "!b U a", 1),
         *(
             pytest.param(question, formula, 10, marks=pytest.mark.slow)
             for question in lanes.QUESTIONS

@@ -84,7 +84,13 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+# Each compiles for a second; by default one of each engine.
+USUAL = ("optimal", "reach max")
+
+
+@pytest.mark.parametrize(
+    "solver", [pytest.param(x, marks=[] if x in USUAL else pytest.mark.slow) for x in SOLVERS]
+)
 @pytest.mark.parametrize(("count", "reach"), MESHES)
 def test_solvers(count, reach, solver):
     case = Case(count, reach)
@@ -192,6 +198,7 @@ def test_components_by_sweeps_are_those_of_the_host(count):
 swept = jax.jit(components_by_sweeps, static_argnums=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "reach"), MESHES)
 def test_games_and_occupancy(count, reach):
     case = Case(count, reach)
@@ -225,6 +232,7 @@ def games_and_occupancy(game, goal, reward, policy):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "reach"), MESHES)
 def test_gradients(count, reach):
     case = Case(count, reach)

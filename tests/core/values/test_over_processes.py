@@ -14,6 +14,7 @@ from tests.core.models.mesh.test_sharded import world
 from tests.core.values.test_over_mesh import FORMULAS, SOLVERS, quantities
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "reaches"),
     [

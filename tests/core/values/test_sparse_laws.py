@@ -182,11 +182,32 @@ def assert_as_padded(found: jl.Solution, name: str, inputs: dict[str, Any]) -> N
     np.testing.assert_allclose(policy, expected.policy, atol=1e-9)
 
 
+# A second method has the enclosures of the first one, for which the padded model is compiled.
+SECOND = {
+    "optimal_value-modified_policy_iteration": "optimal_value-policy_iteration",
+    "optimal_value-value_iteration": "optimal_value-policy_iteration",
+    "soft_value-value_iteration": "soft_value-newton",
+    "minimax_value-value_iteration": "minimax_value-policy_iteration",
+    "minimax_value-strategy_iteration": "minimax_value-policy_iteration",
+}
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 def test_the_answer_is_that_of_the_padded_model(name):
     found = solved(name)
     assert found.status == (Status.UNCERTIFIED if name == "boltzmann_value" else Status.CONVERGED)
-    assert_as_padded(found, name, example().inputs)
+    if name in SECOND:
+        first = solved(SECOND[name])
+        assert (found.lower <= first.upper).all() and (first.lower <= found.upper).all()
+        np.testing.assert_allclose(found.policy, first.policy, atol=1e-6)
+    else:
+        assert_as_padded(found, name, example().inputs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SECOND)
+def test_every_method_makes_the_steps_of_the_padded_model(name):
+    assert_as_padded(solved(name), name, example().inputs)
 
 
 # Compiling derivatives takes seconds; by default each way to reduce choices occurs.
@@ -286,6 +307,7 @@ def test_every_lane_is_as_if_alone(name):
     assert_as_padded(lanes(name)["slow"], name, cases()["slow"][1])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", LANES)
 def test_what_is_not_certified_has_not_converged(name):
     for case, one in lanes(name).items():
@@ -300,6 +322,7 @@ def test_what_is_not_certified_has_not_converged(name):
         assert not np.isfinite(one.upper).any(), case
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", [n for n in LANES if "policy" in SOLVERS[n].needs])
 def test_what_is_no_policy_is_named(name):
     for case, (_, inputs) in cases().items():

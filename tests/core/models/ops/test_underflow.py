@@ -107,6 +107,7 @@ def test_concrete_models_with_subnormal_probabilities_are_refused(use):
         use(model)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("objective", ["max", "min"])
 def test_traced_models_with_subnormal_probabilities_are_invalid(objective):
     bad, good, away = raw(SUBNORMAL[precision()]), raw(0.25), np.array([False, True, True])

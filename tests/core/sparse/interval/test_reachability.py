@@ -11,8 +11,7 @@ from jaxltl.core.sparse.interval.parity import parity_against_nature
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.solvers.reachability import reachability
-from jaxltl.core.values.interval.satisfaction import _largest
-from tests.reference_intervals import chains, optima, parity, random_model, reach, reward
+from tests.reference_intervals import chains, optima, random_model, reach
 
 COUNTS = [10, pytest.param(500, marks=pytest.mark.exhaustive)]
 
@@ -54,37 +53,6 @@ def checks_out(model, found, goal, maximize, helpful):
     else:
         alone = reachability(model.resolve(p), goal, maximize=maximize)
     np.testing.assert_allclose(alone.value, found.value, atol=1e-6)
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_total_rewards(count):
-    rng = np.random.default_rng(3)
-    for _ in range(count):
-        model = random_model(rng)
-        goal = np.arange(4) == rng.integers(4)
-        cost = rng.integers(0, 3, model.mdp.num_rows).astype(float)
-        for (maximize, large), value in optima(
-            [reward(p, goal, cost[list(rows)]) for rows, p in chains(model, goal)]
-        ).items():
-            enclosed(
-                total_reward(model, cost, goal, Query(maximize, large)),
-                value,
-            )
-
-
-@pytest.mark.parametrize("count", COUNTS)
-def test_parity(count):
-    """With two to four priorities; the least probability is one minus the largest of the rest."""
-    rng = np.random.default_rng(4)
-    for _ in range(count):
-        model = random_model(rng)
-        priority = rng.integers(0, rng.integers(2, 5), 4)
-        values = optima([parity(p, priority) for _, p in chains(model, np.zeros(4, bool))])
-        for (maximize, helpful), value in values.items():
-            if maximize:
-                enclosed(_largest(model, priority, Query(True, helpful, 1e-6)), value)
-            else:
-                enclosed(_largest(model, priority + 1, Query(True, not helpful, 1e-6)), 1 - value)
 
 
 def test_nature_that_is_against_a_parity_condition_is_returned():

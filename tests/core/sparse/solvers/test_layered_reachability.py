@@ -19,7 +19,7 @@ def cases(count, seed, num_memory=4):
     for i in range(count):
         model, _ = random_product(
             rng,
-            num_states=int(rng.integers(5, 15)),
+            num_states=(5, 14)[i % 2],
             num_actions=3,
             num_successors=3,
             num_memory=num_memory,

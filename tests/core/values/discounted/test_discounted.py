@@ -106,6 +106,7 @@ def test_optimal_values_are_enclosed(cases, batch, exact_optimal, method, tolera
         assert (attained >= reference.FRACTION(solution.lower[i])).all()
 
 
+@pytest.mark.slow
 def test_values_are_enclosed_in_single_precision(cases, exact_policy, exact_optimal):
     with jax.enable_x64(False):
         mdps, policies, rewards, discounts = batch_of(cases[:SINGLE])

@@ -1,35 +1,23 @@
 """Interval models of a formula, a reward or a discount: laws, known values and messages."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 from jaxltl.core.models.construct.restrict import restrict, with_allowed
-from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.interval.robust import robust_expectation
-from jaxltl.core.values.interval.satisfaction import _solved, _Verdicts
-from jaxltl.core.values.interval.sides import directions
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
-from jaxltl.core.values.undiscounted.step_bounded import (
-    bounded_reachability,
-    cumulative_reward,
-    instantaneous_reward,
-    next_probability,
-    reward_bounded_reachability,
-)
 from jaxltl.core.values.undiscounted.total_reward import total_reward
-from tests.reference_intervals import chains, parity, random_model, reach, reward
-from tests.support import counts, nature_word
+from tests.reference_intervals import random_model
+from tests.support import nature_word
 
 DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
 TASKS = [
@@ -64,46 +52,6 @@ def around(model, width):
     """The same model with intervals around its probabilities."""
     p = np.asarray(model.probability)
     return make_interval(model, np.maximum(p - width, 0), np.minimum(p + width, 1))
-
-
-def test_points_are_the_exact_model():
-    rng = np.random.default_rng(0)
-    for i in range(20):
-        given = labelled(rng).nominal
-        model = around(given, 0.0)
-        np.testing.assert_array_equal(model.nominal.probability, given.probability)
-        task = TASKS[i % len(TASKS)]
-        for objective, nature in DIRECTIONS:
-            exact = optimal_satisfaction(given, task, objective=objective)
-            found = optimal_satisfaction(
-                model, task, objective=objective, nature=nature_word(objective, nature)
-            )
-            assert int(found.status) == Status.CONVERGED
-            np.testing.assert_allclose(found.value, exact.value, atol=2e-6)
-
-
-@pytest.mark.slow
-def test_wider_intervals_give_nature_more():
-    """Values move apart with the width, and hold the exact ones between them."""
-    rng = np.random.default_rng(1)
-    for i in range(10):
-        given = labelled(rng).nominal
-        task = TASKS[i % len(TASKS)]
-        for objective in ("max", "min"):
-            exact = optimal_satisfaction(given, task, objective=objective)
-            low = high = exact.value
-            for width in (0.05, 0.2, 1.0):
-                model = around(given, width)
-                least, most = (
-                    optimal_satisfaction(
-                        model, task, objective=objective, nature=nature_word(objective, nature)
-                    )
-                    for nature in ("min", "max")
-                )
-                assert int(least.status) == int(most.status) == Status.CONVERGED
-                assert (least.lower <= low + 1e-6).all()
-                assert (most.upper >= high - 1e-6).all()
-                low, high = least.value, most.value
 
 
 @pytest.mark.few(1)
@@ -185,34 +133,6 @@ def test_parts_of_interval_models():
         np.testing.assert_allclose(found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
 
 
-def test_policies_are_evaluated():
-    rng = np.random.default_rng(2)
-    for _ in range(10):
-        model = labelled(rng)
-        target = model.states_with_label("a")
-        for nature in ("min", "max"):
-            best = reachability_probability(model, target, nature=nature_word("max", nature))
-            own = reachability_probability(
-                model, target, policy=best.policy, nature=nature_word("max", nature)
-            )
-            np.testing.assert_allclose(own.value, best.value, atol=1e-6)
-            np.testing.assert_array_equal(own.policy, best.policy)
-            other = reachability_probability(
-                model,
-                target,
-                policy=np.zeros(4, int),
-                nature=nature_word("max", nature),
-            )
-            assert (other.lower <= best.upper + 1e-12).all()
-
-
-def test_nature_is_of_intervals():
-    model = labelled(np.random.default_rng(3))
-    target = model.states_with_label("a")
-    with pytest.raises(ValueError, match=r"nature='cooperative'.*intervals"):
-        reachability_probability(model.nominal, target, nature="cooperative")
-
-
 def test_mixed_policies():
     """A policy that mixes rows is as good as the one that its coin makes of them."""
     rng = np.random.default_rng(9)
@@ -241,123 +161,6 @@ def test_mixed_policies():
             model.nominal.replace(probability=p), target, policy=weight
         )
         np.testing.assert_allclose(again.value, high.value, atol=1e-6)
-
-
-@counts(10, 100)
-def test_games(count):
-    """Against all choices of both players and all vertices of nature's."""
-    rng = np.random.default_rng(10)
-    for _ in range(count):
-        host = random_model(rng)
-        model = labelled(rng, host)
-        system = rng.random(4) < 0.5
-        goal = np.arange(4) == rng.integers(4)
-        priority = rng.integers(0, 3, 4)
-        game = Game(model, system)
-        cost = rng.integers(0, 3, model.num_rows).astype(float)
-        worth = partial(_reach, goal), partial(_reward, goal, cost), partial(_parity, priority)
-        for nature in ("min", "max"):
-            for objective in ("max", "min"):
-                of = {"objective": objective, "nature": nature}
-                ask = {"objective": objective, "nature": nature_word(objective, nature)}
-                held(
-                    reachability_probability(game, goal, **ask),
-                    played(host, goal, system, worth[0], **of),
-                )
-                held(
-                    total_reward(game, cost, goal, **ask),
-                    played(host, goal, system, worth[1], **of),
-                )
-            yes = np.zeros(4, bool)
-            aims = directions("max", nature_word("max", nature))
-            found = _solved(host, system, aims, _Verdicts(yes, yes, priority), 1e-6)
-            held(
-                found,
-                played(host, yes, system, worth[2], objective="max", nature=nature),
-            )
-
-
-def _reach(goal, rows, p):
-    return reach(p, goal)
-
-
-def _reward(goal, cost, rows, p):
-    return reward(p, goal, cost[list(rows)])
-
-
-def _parity(priority, rows, p):
-    return parity(p, priority)
-
-
-def played(host, goal, system, worth, objective, nature):
-    """The value of a game by trying everything."""
-    of = {rows: getattr(np, nature)(worth(rows, p), 0) for rows, p in chains(host, goal)}
-    ours, theirs = (max, min) if objective == "max" else (min, max)
-    ours, theirs = (getattr(np, x.__name__) for x in (ours, theirs))
-    by: dict = {}
-    for rows, value in of.items():
-        mine = tuple(r for r, s in zip(rows, system, strict=True) if s)
-        by.setdefault(mine, []).append(value)
-    return ours([theirs(x, 0) for x in by.values()], 0)
-
-
-def held(found, value):
-    finite = np.isfinite(value)
-    assert (np.isfinite(found.upper) == finite).all()
-    low, high, value = (np.where(finite, x, 0) for x in (found.lower, found.upper, value))
-    size = np.maximum(1, value)
-    assert ((low <= value + 1e-11 * size) & (value <= high + 1e-11 * size)).all()
-    assert (high - low <= 1e-6 * size).all()
-
-
-def test_exact_games_have_values():
-    """A game on a sparse model: the environment takes the worse of two coins."""
-    coins = make_sparse(
-        [0, 2, 3, 4],
-        [0, 2, 4, 5, 6],
-        [1, 2, 1, 2, 1, 2],
-        [0.25, 0.75, 0.5, 0.5, 1, 1],
-        label=[[0], [1], [0]],
-        propositions=["a"],
-    )
-    for system, best in ((True, 0.5), (False, 0.25)):
-        game = Game(coins, np.array([system] * 3))
-        assert reachability_probability(game, "a").value[0] == pytest.approx(best)
-        found = optimal_satisfaction(game, "F G a", states=[0])
-        assert found.value[0] == pytest.approx(best)
-
-
-def test_discounted_values():
-    """Against sweeps of the operator, alone and in games; points are exact models."""
-    rng = np.random.default_rng(11)
-    for _ in range(10):
-        model = labelled(rng)
-        host = model.nominal.host
-        earned = rng.normal(size=model.num_transitions)
-        if model.num_transitions in (4, model.num_rows):
-            continue  # taken for rewards of states or choices
-        for objective, nature in DIRECTIONS:
-            value = np.zeros(4)
-            for _ in range(600):
-                ahead = earned + 0.9 * value[host.successor]
-                p = model.host.extreme_distributions(ahead, maximize=nature == "max")
-                image = model.host.sum_rows(p * ahead)
-                value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
-            found = optimal_value(
-                model, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
-            )
-            assert int(found.status) == Status.CONVERGED
-            np.testing.assert_allclose(found.value, value, atol=1e-8)
-            assert (found.lower <= value + 1e-12).all()
-            assert (value <= found.upper + 1e-12).all()
-            game = Game(model, np.ones(4, bool))
-            np.testing.assert_allclose(
-                optimal_value(
-                    game, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
-                ).value,
-                value,
-                atol=1e-7,
-            )
 
 
 COIN = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
@@ -447,20 +250,3 @@ def test_states_that_are_none(states, message):
     for of in (model, coin):
         with pytest.raises(ValueError, match=message):
             optimal_satisfaction(of, "F a", states=states)
-
-
-def test_step_bounded_functions_answer_for_intervals():
-    model = labelled(np.random.default_rng(13))
-    target, reward = model.states_with_label("a"), np.arange(4.0)
-    for nature in ("adversarial", "cooperative"):
-        ask = {"nature": nature}
-        for general, given in (
-            (next_probability, (target,)),
-            (bounded_reachability, (target, 3)),
-            (cumulative_reward, (reward, 3)),
-            (instantaneous_reward, (reward, 3)),
-            (reward_bounded_reachability, (target, reward, 3)),
-            (optimal_value, (reward, 0.9)),
-        ):
-            with pytest.raises(ValueError, match="intervals"):
-                general(model.nominal, *given, **ask)

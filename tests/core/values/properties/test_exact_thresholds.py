@@ -205,7 +205,7 @@ def require_verdicts(model, rows, cost, parse, relations):
                     assert 0 <= answer.lower[0] <= answer.value[0] <= answer.upper[0]
 
 
-SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 40))]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 40))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

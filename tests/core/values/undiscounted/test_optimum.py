@@ -32,6 +32,7 @@ def solve(model, target, objective):
     return jl.reachability_probability(model, target, objective=objective)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
 @pytest.mark.parametrize(("double", "rare"), [(False, 1e-20), (True, 1e-200)])
 def test_no_upper_bound_of_a_positive_probability_is_zero(objective, double, rare):
@@ -68,9 +69,9 @@ def walk(size):
 @pytest.mark.parametrize(
     ("kind", "size"),
     [
-        ("max", 60),
         ("policy", 200),
-        ("reward", 200),
+        pytest.param("max", 60, marks=pytest.mark.slow),
+        pytest.param("reward", 200, marks=pytest.mark.slow),
         pytest.param("policy", 3000, marks=pytest.mark.slow),
         pytest.param("reward", 3000, marks=pytest.mark.slow),
     ],

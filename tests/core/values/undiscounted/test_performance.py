@@ -185,6 +185,7 @@ def test_what_is_hardly_ever_left_is_certified_all_the_same(leaving, dtype):
     assert (found.upper >= jnp.array([0.25, 0.5])).all()
 
 
+@pytest.mark.slow
 def test_single_precision_encloses_too():
     models, policies, _ = cases("cosafe", "exit")
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, models)

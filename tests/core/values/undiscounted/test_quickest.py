@@ -126,6 +126,7 @@ def test_a_tiny_probability_is_not_given_up_for_speed():
     assert found.policy[0, 0] == 0 and found.status == Status.CONVERGED
 
 
+@pytest.mark.slow
 def test_bounds_that_do_not_meet_are_not_converged():
     """Two accepting components with different rates: Jensen's bound is not attained."""
     size = 6

@@ -5,7 +5,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.sparse.bounded import backup, reward_bounded
@@ -65,38 +64,6 @@ def test_what_rounding_takes_is_enclosed_and_no_probability_becomes_zero():
     assert bounded_reachability(model, [False, True, False], 5).value[0] == 1e-200
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_rewards_of_so_many_steps_are_what_a_loop_finds(seed):
-    rng = np.random.default_rng(seed)
-    model = random_sparse(rng, 7, chain=seed % 4 == 0)
-    mdp, matrix = model.host, model.host.matrix.toarray()
-    state, choice = rng.normal(size=7), rng.normal(size=model.num_rows)
-    entry = rng.normal(size=model.num_transitions) * (seed % 2)
-    earned = (
-        state[mdp.state]
-        + choice
-        + [
-            sum(mdp.probability[e] * entry[e] for e in range(*mdp.entry_start[r : r + 2]))
-            for r in range(mdp.num_rows)
-        ]
-    )
-    for objective, best in BEST.items():
-        total, now = np.zeros(7), state
-        for _ in range(5):
-            total = mdp.over_choices(best, earned + matrix @ total)
-            now = mdp.over_choices(best, matrix @ now)
-        reward = Rewards(state=state, choice=choice, transition=entry)
-        for found, expected in (
-            (cumulative_reward(model, reward, 5, objective=objective), total),
-            (instantaneous_reward(model, reward, 5, objective=objective), now),
-        ):
-            check(found)
-            np.testing.assert_allclose(found.value, expected, rtol=1e-10, atol=1e-12)
-            assert (found.lower <= expected + 1e-14).all()
-            assert (found.upper >= expected - 1e-14).all()
-            assert (found.upper - found.lower).max() < 1e-11
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_choices_of_all_steps_attain_the_value(seed):
     rng = np.random.default_rng(seed)
@@ -127,22 +94,6 @@ def test_nothing_more_happens_after_it_came_to_rest():
     assert found.num_steps == 3
     assert found.value.tolist() == [1, 1, 1]
     assert found.lower.tolist() == [1, 1, 1]
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_the_next_state(seed):
-    rng = np.random.default_rng(seed)
-    model = random_sparse(rng, 6, chain=seed % 3 == 0)
-    target, matrix = rng.random(6) < 0.5, model.host.matrix.toarray()
-    for objective, best in BEST.items():
-        found = check(next_probability(model, target, objective=objective))
-        expected = model.host.over_choices(best, matrix @ target)
-        np.testing.assert_allclose(found.value, expected, atol=1e-15)
-        chosen = (matrix @ target)[model.row_start[:-1] + found.policy]
-        np.testing.assert_allclose(chosen, expected, atol=1e-15)
-        sure = np.where(np.isclose(expected, 1), 1, expected)
-        assert (found.lower <= sure).all() and (sure <= found.upper).all()
-        assert (found.value[np.isclose(expected, 1)] == 1).all()
 
 
 def by_levels(model, target, stay, cost, most, best, sweeps=400):
@@ -195,14 +146,6 @@ def test_rewards_are_spent_level_by_level(seed, depth, monkeypatch):
                 image = np.bincount(model.host.row, model.probability * ahead, model.num_rows)
                 value[level] = np.where(target, 1, np.where(stay, image[row], 0))
             np.testing.assert_allclose(value[level], expected[level], atol=1e-8)
-
-
-def test_padded_models_are_taken_too():
-    model = random_sparse(np.random.default_rng(1), 6)
-    padded = to_padded(model)
-    target = np.arange(6) == 3
-    found = bounded_reachability(padded, target, 4)
-    np.testing.assert_allclose(found.value, bounded_reachability(model, target, 4).value, atol=1e-6)
 
 
 def test_what_is_wrong_is_named():
