@@ -329,6 +329,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     help="Width of the bounds: absolute for probabilities, else relative.",
 )
 @click.option("--relative", is_flag=True, help="Width relative to the value in any case.")
+@click.option("--exact", is_flag=True, help="Values as fractions, of models of moderate size.")
 @_as_json
 @click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
 @click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
@@ -355,6 +356,7 @@ def solve(
     strategy: Path | None,
     tolerance: float,
     relative: bool,
+    exact: bool,
     as_json: bool,
     constants: str | None,
     max_states: int | None,
@@ -369,8 +371,9 @@ def solve(
     'R{"time"}min=? [ C<=10 ]', 'P>=0.9 [ G !"crash" ]', or any formula of linear temporal logic in
     P; or it is a file of properties that ends in .props, .prop or .pctl. See docs/solve.md.
 
-    Values are those of the initial states. The exit status is 0 if all properties are solved, 1 if
-    some value did not converge or some threshold is undecided, 2 for errors of usage.
+    Values are those of the initial states; of several properties a line each is repeated at the end.
+    The exit status is 0 if all properties are solved, 1 if some value did not converge or some
+    threshold is undecided, 2 if one was refused, and for other errors of usage. All are tried.
 
     With --mesh the model is distributed over devices, also over those of several processes, each of
     which is started with the same arguments; see docs/devices.md.
@@ -381,6 +384,7 @@ def solve(
         ("--strategy", strategy, False),
         ("--relative", relative or None, False),
         ("--certificate", certificate, False),
+        ("--exact", exact or None, False),
         ("--checkpoint", checkpoint, True),
     )
     for option, value, with_mesh in options:
@@ -391,10 +395,9 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (program is None or strategy or relative or certificate):
-        raise ValueError(
-            "--method partial is for programs, without --strategy, --relative and --certificate."
-        )
+    if method == "partial" and (program is None or strategy or relative or certificate or exact):
+        others = "--strategy, --relative, --exact and --certificate"
+        raise ValueError(f"--method partial is for programs, without {others}.")
     from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.
@@ -408,7 +411,7 @@ def solve(
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            answers = solving.solve(model, questions, tolerance, relative=relative)
+            answers = solving.solve(model, questions, tolerance, relative=relative, exact=exact)
         else:
             from jaxltl.app import solve_on_mesh
 
@@ -417,10 +420,7 @@ def solve(
             solver.agree(list(properties))
             answers = solver.solve(questions)
         if group.is_first and "states" in entry:
-            click.echo(
-                "{kind} of {states} states, {choices} choices, {transitions} transitions, "
-                "read in {seconds:.3f} s".format(**entry)
-            )
+            click.echo(solving.model_text(entry))
         results = []
         for result in answers:
             results.append(result)
@@ -436,11 +436,11 @@ def solve(
             records = write_certificates(certificate.parent, answered, certificate.name)
             click.echo("\n".join(["", *certificate_lines(records, certificate.parent)]))
             proofs = {"certificates": records}
-    if not group.is_first:
-        as_json = False
-    if as_json:
+    if as_json and group.is_first:
         entries = [solving.result_entry(r) for r in results]
         _print_json({"model": entry, "results": entries, **proofs})
+    elif group.is_first and len(results) > 1:
+        click.echo(f"\n{solving.summary(results)}")
     if status := max(result.exit_status for result in results):
         raise SystemExit(status)
 

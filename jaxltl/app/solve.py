@@ -21,7 +21,8 @@ from jaxltl.app.reports.certificate import Certifiable
 from jaxltl.app.wording import Record
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.logic import Definitions, Property, parse_properties, program_definitions
+from jaxltl.core.logic import Definitions, Property, program_definitions
+from jaxltl.core.logic.properties import parse_each
 from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
@@ -86,11 +87,16 @@ def parse_queries(
     for argument in arguments:
         place, text = "", argument
         if argument.lower().endswith(PROPERTY_FILES):
-            place, text = f"{argument}: ", _text_of(Path(argument))
-        try:
-            queries += [PropertyQuery(p.text, p) for p in parse_properties(text, definitions)]
-        except ValueError as error:
-            queries.append(PropertyQuery(argument, error=f"{place}{error}"))
+            try:
+                place, text = f"{argument}: ", _text_of(Path(argument))
+            except ValueError as error:
+                queries.append(PropertyQuery(argument, error=str(error)))
+                continue
+        for one in parse_each(text, definitions):
+            if isinstance(one, Property):
+                queries.append(PropertyQuery(one.text, one))
+            else:
+                queries.append(PropertyQuery(one.text, error=f"{place}{one.error}"))
     return queries
 
 
@@ -186,13 +192,14 @@ def solve(
     tolerance: float,
     max_states: int | None = None,
     relative: bool = False,
+    exact: bool = False,
 ) -> Iterator[PropertyResult]:
     """Yields the result of each property; of a program, some states are explored for each."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
     def answer(prop: Property) -> AnyAnswer:
         if not isinstance(model, Program):
-            return solve_property(model, prop, tolerance=tolerance, relative=relative)
+            return solve_property(model, prop, tolerance=tolerance, relative=relative, exact=exact)
         from jaxltl.core.programs.build import MAX_STATES
         from jaxltl.core.programs.partial import solve_program
 
@@ -252,6 +259,12 @@ def model_entry(model: SourceModel | POMDP, seconds: float) -> Record:
     }
 
 
+def model_text(entry: Record) -> str:
+    """The model in one line."""
+    sizes = "{states} states, {choices} choices, {transitions} transitions".format(**entry)
+    return "{kind} of {sizes}, read in {seconds:.3f} s".format(sizes=sizes, **entry)
+
+
 def result_entry(result: PropertyResult) -> Record:
     """Answer to a property, as a JSON object."""
     answer = result.answer
@@ -266,6 +279,8 @@ def result_entry(result: PropertyResult) -> Record:
             **{key: _over_states(getattr(answer, key).tolist()) for key in ("lower", "upper")},
             "method": answer.method,
         }
+        if answer.exact is not None:
+            entry["exact"] = _over_states([str(x) for x in answer.exact])
         if answer.states.size > 1:
             entry["states"] = answer.states.tolist()
     elif answer is not None:
@@ -327,6 +342,23 @@ def certifiable(model: SourceModel | POMDP, result: PropertyResult) -> Certifiab
     text = result.query.text if result.query.parsed is None else result.query.parsed.text
     reason = "" if isinstance(result.answer, Answer) else f"{text} has no answer of one number"
     return Certifiable(model, None, text, reason=reason)
+
+
+def summary(results: Sequence[PropertyResult]) -> str:
+    """One line for each property: its name or text, and its value."""
+    lines = []
+    for result in results:
+        prop, entry = result.query.parsed, result_entry(result)
+        name = f'"{prop.name}": ' if prop is not None and prop.name else ""
+        value = (
+            entry["value"]
+            if isinstance(entry["value"], bool)
+            else entry.get("exact", entry["value"])
+        )
+        value_text = "refused" if result.answer is None else json.dumps(value).replace('"', "")
+        status = "" if result.status in ("CONVERGED", "INVALID") else f" ({result.status})"
+        lines.append(f"{name}{' '.join(result.query.text.split())}: {value_text}{status}")
+    return "\n".join(lines)
 
 
 # --- strategies -------------------------------------------------------------------------------

@@ -150,6 +150,29 @@ def test_mistakes_do_not_stop_the_others(model_file):
     assert "'steps', 'stake'" in found[4]["error"]
 
 
+def test_a_line_for_each_property_stands_at_the_end(tmp_path):
+    model, path = tmp_path / "coin.prism", tmp_path / "all.props"
+    model.write_text(
+        """dtmc module m x : [0..2]; [] x=0 -> 0.1:(x'=0) + 0.3:(x'=1) + 0.6:(x'=2);
+        [] x>0 -> true; endmodule"""
+    )
+    path.write_text(
+        '"win": P=? [ F x=1 ]\nP=? [ Y x=1 ]\n"sum": "win" + 1/3\nP>=1/3 [ F\n  x=1 ]\nE [ F x=2 ]'
+    )
+    done = run(model, path, "--exact", "--json")
+    assert done.exit_code == 2 and "\n  exactly 1/3\n" in done.stdout
+    assert json.loads(done.stdout.splitlines()[-1])["results"][2]["exact"] == "2/3"
+    done = run(model, path, "--exact")
+    assert done.exit_code == 2
+    assert [line.rsplit(": ", 1) for line in done.stdout.splitlines()[-5:]] == [
+        ['"win": P=? [ F x=1 ]', "1/3"],
+        ["P=? [ Y x=1 ]", "refused"],
+        ['"sum": "win" + 1/3', "2/3"],
+        ["P>=1/3 [ F x=1 ]", "true"],
+        ["E [ F x=2 ]", "true"],
+    ]
+
+
 def test_nothing_to_solve_is_said_before_the_model_is_read(tmp_path):
     done = run(tmp_path / "absent.umb", "P=? [ F ")
     assert done.exit_code == 2 and "expected a label" in done.output

@@ -36,6 +36,10 @@ class LanguageError(ValueError):
         self.place, self.message = place, message
 
 
+class _UndefinedValue(LanguageError):
+    """An operation on values for which it is not defined."""
+
+
 @dataclass(frozen=True)
 class Source:
     """A text and the name under which errors mention it."""
@@ -213,10 +217,33 @@ def substitute(
     elif not expression.operands:
         result = expression
     else:
-        parts = tuple([substitute(x, names, memory) for x in expression.operands])
-        result = _simplified(expression, parts)
+        result = _folded_node(expression, lambda x: substitute(x, names, memory))
     memory[id(expression)] = result
     return result
+
+
+DECIDING = {"&": False, "|": True, "=>": False}  # what follows such an operand may be undefined
+
+
+def _folded_node(e: Expression, fold: Callable[[Expression], Expression]) -> Expression:
+    """The node after its operands are folded; those that do not count may be undefined."""
+    parts: list[Expression] = []
+    truth: Value | str | None = None  # of the first operand that decides, or of a condition
+    for i, x in enumerate(e.operands):
+        chosen = e.operator == "?:" and i > 0 and truth is (i == 1)
+        try:
+            parts.append(fold(x))
+        except _UndefinedValue:
+            if truth is None or chosen:
+                raise
+            continue
+        is_first = i == 0 and e.operator in ("?:", "=>")
+        if parts[-1].is_literal and (is_first or e.operator in ("&", "|")):
+            value = parts[-1].value
+            truth = value if value is DECIDING.get(e.operator, value) else truth
+    if len(parts) < len(e.operands):
+        return parts[1] if e.operator == "?:" else literal(e.operator != "&", e.place)
+    return _simplified(e, tuple(parts))
 
 
 def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
@@ -235,11 +262,15 @@ def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
         if len(rest) < 2:
             return rest[0] if rest else literal(neutral, e.place)
         parts = tuple(rest)
+    elif (
+        operator == "?:"
+        and isinstance(parts[0].value, bool)
+        and not all(x.is_literal for x in parts)
+    ):
+        return parts[1] if parts[0].value else parts[2]
     elif all(x.is_literal for x in parts):
         _node_type(e, [value_type(x.value) for x in parts], {})
         return literal(apply(operator, [x.value for x in parts], e.place), e.place)
-    elif operator == "?:" and isinstance(parts[0].value, bool):
-        return parts[1] if parts[0].value else parts[2]
     if len(parts) == len(e.operands) and all(map(op.is_, parts, e.operands)):
         return e
     return Expression(operator, parts, e.value, e.place)
@@ -280,7 +311,9 @@ def apply(operator: str, values: list[Any], place: int = -1) -> Value:
         result: Value = SCALAR[operator](*values)
     except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
         arguments = ", ".join(str(x) for x in values)
-        raise LanguageError(place, f"{operator} of {arguments} is not defined: {error}.") from None
+        raise _UndefinedValue(
+            place, f"{operator} of {arguments} is not defined: {error}."
+        ) from None
     if isinstance(result, int) and not isinstance(result, bool) and abs(result) > MAX_INTEGER:
         raise LanguageError(place, f"an integer of {operator} is larger than 2^53.")
     return result

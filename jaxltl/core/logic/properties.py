@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+from jaxltl.core.language.exact import is_inexact
 from jaxltl.core.language.expressions import FUNCTIONS, Expression
 from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
 from jaxltl.core.logic.comparisons import Comparison, Definitions
@@ -64,14 +65,31 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
       >>> print(*(q.direction for q in parse_properties('P>=0.9 [ X "a" ]; P<0.5 [ F<=3 "a" ]')))
       min max
     """
+    items = parse_each(text, definitions)
+    for item in items:
+        if isinstance(item, MalformedProperty):
+            raise ValueError(item.error)
+    return tuple(item for item in items if isinstance(item, Property))
+
+
+class MalformedProperty(NamedTuple):
+    """A part of a text that is no property."""
+
+    text: str
+    error: str  # with line and column
+
+
+def parse_each(
+    text: str, definitions: Definitions | None = None
+) -> tuple[Property | MalformedProperty, ...]:
+    """The properties in a text, and each malformed one with its error; as :func:`parse_properties`."""
     if not isinstance(text, str):
         raise ValueError(f"parse_properties: expected text, got {type(text).__name__} {text!r}.")
     try:
-        return _Parser(text, definitions or Definitions()).properties()
+        return tuple(_Parser(text, definitions or Definitions()).items())
     except RecursionError:
-        raise ValueError(
-            "property: parentheses or operators are nested too deeply; split the formula."
-        ) from None
+        error = "property: parentheses or operators are nested too deeply; split the formula."
+        return (MalformedProperty(text, error),)
 
 
 def parse_property(text: str, definitions: Definitions | None = None) -> Property:
@@ -99,6 +117,8 @@ def parse_property(text: str, definitions: Definitions | None = None) -> Propert
 
 _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
 _SIGNS = {"&": "forall", "|": "exists", "+": "sum"}  # of filters
+_DECLARE = ("const", "label", "formula")
+_ITEMS = (*_DECLARE, "E", "A", "filter", "multi")
 _BEGINS = ("<<", "(", "!", "-")
 _CONTINUES = (*AFTER_OPERAND, "&", "|", "=>", "<=>")
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
@@ -111,22 +131,76 @@ class _Parser(PathParser):
         super().__init__(text, known)
         self.memory: dict[tuple[str, int], tuple[Property | ValueError, int]] = {}
 
-    def properties(self) -> tuple[Property, ...]:
-        properties = []
+    def items(self) -> list[Property | MalformedProperty]:
+        """The properties, and the malformed parts."""
+        items: list[Property | MalformedProperty] = []
+        declared = self.declared()
         while self.token.kind != "end":
             if self.accept(";"):
                 continue
-            if self.token.text in ("const", "label", "formula") and self.token.kind == "word":
-                self.declaration()
-                continue
-            name, before = None, self.place
-            if self.token.kind == "quoted":
-                name = self.quoted()
-                if not self.accept(":"):  # it is a label
-                    name, self.place = None, before
-            properties.append(replace(self.outermost(), name=name))
-        self.require(bool(properties), 'a property, such as Pmax=? [ F "goal" ]')
-        return tuple(properties)
+            place, start, name = self.place, self.token, None
+            try:
+                if place in declared:
+                    self.place, error = declared[place]
+                    if error is not None:
+                        raise error
+                    continue
+                if start.kind == "quoted" and self.tokens[place + 1].text == ":":
+                    name, _ = self.quoted(), self.take()
+                prop = self.outermost()
+                follows = self.token.kind != "sign" or self.token.text in (";", *_BEGINS)
+                self.require(follows, 'a property, such as Pmax=? [ F "goal" ]')
+                items.append(replace(prop, name=name))
+            except ValueError as error:
+                self.place = self.next_item(place)
+                items.append(MalformedProperty(self.written(start), str(error)))
+        if not items:
+            items.append(
+                MalformedProperty(self.text, str(self.error('a property, such as P=? [ F "a" ]')))
+            )
+        return items
+
+    def declared(self) -> dict[int, tuple[int, ValueError | None]]:
+        """The end of each declaration by its place, or its error; they may stand in any order."""
+        waiting = [
+            i
+            for i, token in enumerate(self.tokens[:-1])
+            if token.kind == "word"
+            and token.text in _DECLARE
+            and self.tokens[i + 1].kind in ("word", "quoted")
+        ]
+        done: dict[int, tuple[int, ValueError | None]] = {}
+        before = -1
+        while len(done) > before:
+            before = len([x for x in done.values() if x[1] is None])
+            for place in [x for x in waiting if done.get(x, (0, ValueError))[1] is not None]:
+                self.place = place
+                try:
+                    self.declaration()
+                    done[place] = self.place, None
+                except ValueError as error:
+                    done[place] = self.next_item(place), error
+            if len([x for x in done.values() if x[1] is None]) == before:
+                break
+        self.place = 0
+        self.memory.clear()
+        return done
+
+    def next_item(self, place: int) -> int:
+        """The place of the next property or declaration: after a semicolon, or on a line of its own."""
+        for i in range(place + 1, len(self.tokens)):
+            before, token = self.tokens[i - 1], self.tokens[i]
+            if before.text == ";" and before.kind == "sign":
+                return i
+            starts = token.kind == "quoted" and self.tokens[min(i + 1, len(self.tokens) - 1)].text
+            operator = token.kind == "word" and (
+                OPERATOR.fullmatch(token.text) or token.text in _ITEMS
+            )
+            if "\n" in self.text[before.end : token.start] and (
+                starts == ":" or operator or token.text == "<<"
+            ):
+                return i
+        return len(self.tokens) - 1
 
     def remembered(self, read: Callable[[], Property]) -> Property:
         """The result of a method at this place, which is read once however often it is tried."""
@@ -161,8 +235,7 @@ class _Parser(PathParser):
             self.place = before
             try:
                 prop = read()
-                # A variable alone may be a number.
-                if read == self.state_property and _is_variable(prop):
+                if read == self.state_property and _is_expression(prop):
                     continue
                 if self.token.text not in _CONTINUES:
                     return prop
@@ -391,9 +464,11 @@ class _Parser(PathParser):
         return path
 
 
-def _is_variable(prop: Property) -> bool:
-    meaning = prop.definitions[0][1] if len(prop.definitions) == 1 else None
-    return isinstance(meaning, Comparison) and meaning.expression.operator == "name"
+def _is_expression(prop: Property) -> bool:
+    """True for a variable alone, which may be a number, and where operands may be undefined."""
+    meanings = [x.expression for _, x in prop.definitions if isinstance(x, Comparison)]
+    is_variable = len(prop.definitions) == 1 and any(x.operator == "name" for x in meanings)
+    return is_variable or (len(prop.definitions) > 1 and any(map(is_inexact, meanings)))
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Conditional | Earned]] = {

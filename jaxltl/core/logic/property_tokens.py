@@ -48,6 +48,7 @@ _TOKEN = re.compile(
   | (?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
   | (?P<sign><=>|<<|>>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*%^'])
+  | (?P<unknown>.)
 """,
     re.VERBOSE,
 )
@@ -57,10 +58,7 @@ def _tokens(text: str) -> list[Token]:
     tokens, place = [], 0
     while place < len(text):
         match = _TOKEN.match(text, place)
-        if match is None:
-            hint = ". The quote is never closed" if text[place] == '"' else ""
-            wanted = f"a property's signs and names{hint}"
-            raise ValueError(pointed("property", text, place, repr(text[place]), wanted))
+        assert match is not None
         kind = str(match.lastgroup)
         # GF"a" is G F "a".
         pieces = match[0] if re.fullmatch("[XFG]{2,}", match[0]) else [match[0]]
@@ -91,6 +89,9 @@ class TokenStream:
 
     def error(self, wanted: str, token: Token | None = None) -> ValueError:
         token = token or self.token
+        if token.kind == "unknown":
+            hint = ". The quote is never closed" if token.text == '"' else ""
+            wanted = f"a property's signs and names{hint}"
         actual = "the end" if token.kind == "end" else repr(token.text)
         return ValueError(pointed("property", self.text, token.start, actual, wanted))
 
@@ -258,6 +259,7 @@ class TokenStream:
     def expression(self, level: int) -> Expression:
         """An expression with constants and formulas substituted."""
         try:
+            self.require(self.token.kind != "unknown", "an expression")
             parser = self.operands()
             self.tree = tree = parser.expression(level)
             tree = substitute(tree, {**self.names, **self.meanings})

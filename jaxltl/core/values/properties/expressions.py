@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxltl.core.language.exact import exact_tree
 from jaxltl.core.language.expressions import (
+    DECIDING,
     Expression,
     LanguageError,
     Value,
@@ -103,7 +104,17 @@ def _bounds(e: Expression, names: Mapping[str, Bounds], memory: dict[int, Bounds
         assert e.value is not None and not isinstance(e.value, str)
         result = e.value, e.value
     else:
-        result = _applied(e, [_bounds(x, names, memory) for x in e.operands])
+        parts: list[Bounds] = []
+        for x in e.operands:
+            parts.append(_bounds(x, names, memory))
+            low, high = parts[-1]
+            sure = low == high and isinstance(low, bool)
+            if sure and e.operator == "?:" and len(parts) == 1:
+                return _bounds(e.operands[1 if low else 2], names, memory)
+            if sure and low is DECIDING.get(e.operator) and (e.operator != "=>" or len(parts) == 1):
+                truth = e.operator != "&"
+                return truth, truth
+        result = _applied(e, parts)
     memory[id(e)] = result
     return result
 
@@ -115,10 +126,7 @@ def _applied(e: Expression, parts: list[Bounds]) -> Bounds:
         return value, value
     operator = e.operator
     if operator == "?:":
-        (low, high), *cases = parts
-        if low == high:
-            return cases[0] if low else cases[1]
-        return _hull([x for case in cases for x in case])
+        return _hull([x for case in parts[1:] for x in case])
     if operator in ("=", "!="):
         (a, b), (c, d) = parts
         return (False, True) if a <= d and c <= b else (operator == "!=", operator == "!=")

@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.comparisons import program_definitions
-from jaxltl.core.logic.properties import parse_properties
+from jaxltl.core.logic.properties import MalformedProperty, parse_each, parse_properties
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
 
@@ -261,6 +261,15 @@ EXPRESSIONS = {
         "P=? [ F d > filter(max, d) - 2 ]": 1 / 3,
         "P=? [ F filter(exists, d=7) ]": 0,
         "P=? [ F P=? [ X s=7 ] = filter(max, P=? [ X s=7 ], s<7) ]": 1,
+        "yesOr; const bool yesOr = c=0 | pow(2,c-1)>0; const int c = 0;": True,
+        "const int c = 0; c!=0 & pow(2,c-1)>0": False,
+        "const int c = 0; c!=0 => pow(2,c-1)>0": True,
+        "const int c = 0; c>0 ? pow(2,c-1) : 0": 0,
+        "filter(forall, s=0 | pow(2,s-1)>0)": True,
+        "filter(exists, s!=0 & pow(2,s-1)>64)": False,
+        "filter(sum, s>0 ? pow(2,s-1) : 0)": 447,
+        "const int y = z; const int z = 3; P=? [ F d=y ]": 1 / 6,
+        "P=? [ F d=y ]; const int y = 3;": 1 / 6,
         "const int k; P=? [ F d=k ]": 1 / 6,
         "const int k; const int j = k - 1; P=? [ F d=j ] + k": 6 + 1 / 6,
         "const double q = 1/3; q * 3 = 1": True,
@@ -393,3 +402,97 @@ GROUPS = {
 def test_values_by_hand(models, group, name):
     for text, expected in GROUPS[group].get(name, {}).items():
         check(models, name, text, expected)
+
+
+REFUSED = {
+    "filter(forall, pow(2,s-1)>0)": "exponent of an integer is negative",
+    "const int c = 0; pow(2,c-1)": "exponent of an integer is negative",
+    "const int y = y; y": "column 11.*an expression of constants",
+    '"a": "b" + 1; "b": "a"; 1': "depends on itself",
+    'R{"flips"}=? [ G s=1 ]': "column 16.*a prefix satisfies",
+    'R{"flips"}=? [ s=0 W s=1 ]': "column 16.*a prefix satisfies",
+    "P=? [ F P=? [ F d=6 ] ]": "a nested property with a threshold",
+    "P=? [ F d ]": "d is a number",
+    "filter(max, s=0)": "column 13.*a number",
+    "filter(argmax, true)": "column 16.*a number",
+    "filter(forall, P=? [ X s=1 ])": "column 16.*a threshold or a state formula",
+    "filter(min, P=? [ F d=6 ], s>7)": "no state satisfies",
+    "filter(state, s)": "13 states satisfy",
+    "P=? [ F d=6 {s=2}{sum} ]": "column 19.*min or max",
+    "E [ F d=6 ] + 1": "is a Boolean",
+    "filter(range, d) + 1": "several results",
+    "true + 1": "true is a Boolean",
+    "1 +": "the end",
+    "(s": "the end",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_mistakes_are_one_line_with_a_place_or_the_operand(models, text):
+    with pytest.raises(ValueError, match=REFUSED[text]):
+        model, known = models["die"]
+        for prop in parse_properties(text, known):
+            solve_property(model, prop)
+
+
+EXACT = {
+    "P=? [ F d=6 ]": "1/6",
+    "P=? [ G F d=6 ]": "1/6",
+    "P=? [ F<=3 d=6 ]": "1/8",
+    'R{"flips"}=? [ F s=7 ]': "11/3",
+    'R{"flips"}=? [ X X F s=7 ]': "11/3",
+    "S=? [ d=3 ]": "1/6",
+    "P=? [ F d=6 ] + 1/3": "1/2",
+    "P=? [ F d=6 ] * 0.1": "1/60",
+    "filter(sum, P=? [ F d=6 ], s>3)": "5/3",
+    "filter(avg, P=? [ F d=6 ], s<3)": "1/6",
+    "filter(max, P=? [ F d=6 ], s<7)": "2/3",
+    "filter(range, P=? [ F d=6 ], s<3)": "0 1/3",
+    "filter(count, P>=1/3 [ F d=6 ])": "3",
+    "ceil(P=? [ F d=6 ])": "1",
+}
+
+
+@pytest.mark.parametrize("text", EXACT)
+def test_exact_values_are_fractions(models, text):
+    found = answer(models, "die", text, exact=True)
+    assert " ".join(map(str, found.exact)) == EXACT[text]
+    assert found.status.name == "CONVERGED"
+    for value, lower, upper in zip(found.exact, found.lower, found.upper, strict=True):
+        assert lower <= value <= upper and upper - lower <= 1e-15 * max(1, abs(value))
+
+
+def test_exact_answers_are_refused_for_large_models(models):
+    text = "dtmc module m x : [0..20000]; [] x<20000 -> 0.5:(x'=x+1) + 0.5:(x'=0); [] x=20000 -> true; endmodule"
+    large = build_model(read_program(text))
+    with pytest.raises(ValueError, match="exact=True is for models of moderate size"):
+        solve_property(large, "P=? [ F x=20000 ]", exact=True)
+
+
+def test_a_malformed_property_does_not_stop_the_others(models):
+    text = """P=? [ F s=1 ];
+    P=? [ F x# ];
+    P=? [ G s=1
+    "q": P=? [ X s=1 ]
+    const int k = j;
+    filter(min, P=? [ F s=1 ])
+    P=? [ F s=1 ]]
+    T=? [ F s=1 ]"""
+    items = parse_each(text, models["die"][1])
+    assert [isinstance(x, MalformedProperty) for x in items] == [
+        False,
+        True,
+        True,
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert [x.error.split(":")[1] for x in items if isinstance(x, MalformedProperty)] == [
+        " line 2, column 13",
+        " line 4, column 5",
+        " line 5, column 15",
+        " line 7, column 18",
+    ]
+    assert items[3].name == "q" and items[-1].operator == "T"
