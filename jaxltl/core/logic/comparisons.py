@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,9 @@ from jaxltl.core.language.resolve import constant_value
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
 
+if TYPE_CHECKING:
+    from jaxltl.core.logic.property import Property
+
 
 @brief(fields=("text",))
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Comparison:
 
     text: str
     expression: Expression
-    definitions: tuple[tuple[str, Any], ...] = ()
+    definitions: tuple[tuple[str, Comparison | Property], ...] = ()
 
     @property
     def is_number(self) -> bool:

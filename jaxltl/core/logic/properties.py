@@ -303,10 +303,11 @@ class _Parser(PathParser):
             fields["unreached"] = "zero" if variant == "F0" else "sum"
             content = _Parser.eventual_state
         fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
-        states = self.state_filter() if self.accept("{") else {}
+        if self.accept("{"):
+            fields["aggregate"], fields["among"], more = self.state_filter()
+            fields["definitions"] += more
         self.expect("]", " or an operator")
-        fields["definitions"] += states.pop("definitions", ())
-        return Property(self.written(start), **fields, **states)
+        return Property(self.written(start), **fields)
 
     def coalition(self) -> tuple[str, ...]:
         """The players of a coalition, and the sign after it."""
@@ -338,7 +339,7 @@ class _Parser(PathParser):
             definitions=defined,
         )
 
-    def state_filter(self) -> dict[str, Any]:
+    def state_filter(self) -> tuple[str, Formula, tuple[tuple[str, Comparison | Property], ...]]:
         """States and aggregates after a path, ``{states}{min}{max}``, and their filter."""
         among, defined = self.scoped(self.state_content)
         self.expect("}", " or an operator")
@@ -347,7 +348,7 @@ class _Parser(PathParser):
             kinds.append(self.one_of(("min", "max"), "min or max"))
             self.expect("}")
         aggregate = "range" if len(set(kinds)) == 2 else kinds[0] if kinds else "state"
-        return {"aggregate": aggregate, "among": among, "definitions": defined}
+        return aggregate, among, defined
 
     def multi(self, start: Token) -> Property:
         self.expect("(")
