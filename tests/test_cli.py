@@ -798,3 +798,15 @@ def test_the_table_and_the_pictures_of_section_6_7(patrolled):
 
 def test_seeds_are_for_experiments_that_repeat_themselves():
     assert "reproduce mlirl has no seeds" in failure("reproduce", "mlirl", "--seeds", 2)
+
+
+def test_a_mistake_in_a_file_is_told_before_jax_is_imported(tmp_path):
+    text = (Path(__file__).parent.parent / "examples" / "two_goals.toml").read_text()
+    (tmp_path / "wrong.toml").write_text(text.replace("\nformula", "\nformla"))
+    code = (
+        "import sys\nfrom jaxltl.__main__ import run\nsys.argv = ['jaxltl', 'learn', 'wrong.toml']\n"
+        "try:\n    run()\nexcept SystemExit as end:\n    print(end.code, 'jax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert "did you mean 'formula'" in done.stderr
+    assert done.stdout.splitlines()[-1] == "2 False", done.stdout

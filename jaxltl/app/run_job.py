@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from jaxltl.app.reports.page import Part, Report
 
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
-_JOBS = {
-    "environment": "jaxltl.app.learn_environment",
-    "grounding": "jaxltl.app.learn_grounding",
-    "todirl": "jaxltl.app.learn_todirl",
-    "mlirl": "jaxltl.app.learn",
+_JOBS = {  # the module of each kind of job, and that of its task file
+    "environment": ("learn_environment", "task_environment", "EnvironmentFile"),
+    "grounding": ("learn_grounding", "task_grounding", "GroundingFile"),
+    "todirl": ("learn_todirl", "task_todirl", "TodirlFile"),
+    "mlirl": ("learn", "task_mlirl", "MlirlFile"),
 }
 
 Drawn = Callable[[], bytes]  # waits for a picture
@@ -72,10 +72,12 @@ class Console:
 
 
 def job_of(task_file: Path) -> SomeJob:
-    """The kind of job that a task file describes."""
+    """The kind of job that a task file describes; mistakes in its keys come before slow imports."""
     from jaxltl.app.files.task import kind_of
 
-    return cast("SomeJob", importlib.import_module(_JOBS[kind_of(task_file)]))
+    job, module, file = _JOBS[kind_of(task_file)]
+    getattr(importlib.import_module(f"jaxltl.app.files.{module}"), file).read(task_file)
+    return cast("SomeJob", importlib.import_module(f"jaxltl.app.{job}"))
 
 
 def _precision(job: SomeJob) -> contextlib.AbstractContextManager[None]:

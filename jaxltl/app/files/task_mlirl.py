@@ -31,7 +31,6 @@ from jaxltl.app.files.task import (
     SyntheticTable,
     TaskFile,
 )
-from jaxltl.io.prism.explicit import files_beside
 
 Initial = Annotated[
     Text | StateNames, Meta("a text; of a log, the name of a state or a list of names")
@@ -225,6 +224,8 @@ class MlirlFile(TaskFile):
             x for x in (world.model, world.transitions, world.labels, demonstrations.file) if x
         ]
         if world.model is not None:  # PRISM keeps labels in another file
+            from jaxltl.io.prism.explicit import files_beside  # imports JAX
+
             beside = files_beside(self.path.parent / world.model)
             named += [str(x.absolute()) for x in beside]
         return named
