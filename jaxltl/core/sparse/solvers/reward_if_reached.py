@@ -47,10 +47,10 @@ def reward_if_reached(
     problem = _Problem.make(mdp, units, target, maximizing)
     levels, most = max(_FIRST_LEVELS, 2 * int(units.max(initial=0))), _MAX_LEVELS
     most = min(most, _MAX_VALUES // mdp.num_states)
-    low, high, row, rounds = np.zeros(0), np.full(mdp.num_states, np.inf), mdp.row_start[:-1], 0
+    low, high, rounds = np.zeros(mdp.num_states), np.full(mdp.num_states, np.inf), 0
     while True:
-        near, far, row = problem.by_levels(levels)
-        low, high = (near, far) if not rounds else (np.maximum(low, near), np.minimum(high, far))
+        below, above, row = problem.by_levels(levels)
+        low, high = np.maximum(low, below), np.minimum(high, above)
         rounds += levels
         with np.errstate(invalid="ignore"):
             narrow = (low == high) | (high - low <= tolerance * low)

@@ -214,6 +214,44 @@ def test_nested_coalitions_and_filters(text, value):
     check(game(VAULT), text, value)
 
 
+# The chances of player 1 end with player 2, who may linger, or with player 3.
+RELAY = """smg
+player p1 first endplayer player p2 second endplayer player p3 third endplayer
+global s : [0..3];
+module first [] s=0 -> 0.3 : true + 0.7 : (s'=1); [] s=0 -> 0.5 : (s'=1) + 0.5 : (s'=2); [] s=3 -> true; endmodule
+module second [] s=1 -> true; [] s=1 -> (s'=2); endmodule
+module third [] s=2 -> (s'=1); [] s=2 -> (s'=3); endmodule
+label "end" = s=3;
+rewards "r" true : s; endrewards
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('<<1,3>> Pmax=? [ F "end" ]', "1/2"), ('<<1,2>> Pmax=? [ F "end" ]', 0),
+        ('<<2,3>> Pmax=? [ F "end" ]', 1), ('<<2,3>> P>=1 [ F "end" ]', True),
+        ('<<1,3>> R{"r"}max=? [ F "end" ]', "inf"), ('<<2,3>> R{"r"}min=? [ F "end" ]', 3),
+        ('<<1,3>> R{"r"}max=? [ F0 "end" ]', 1), ('<<3>> R{"r"}max=? [ F0 "end" ]', 0),
+        ('<<1,2>> R{"r"}max=? [ F0 "end" ]', 0), ('<<*>> R{"r"}max=? [ F0 "end" ]', "inf"),
+        ('<<1>> R{"r"}max=? [ Fc "end" ]', 3), ('<<2,3>> R{"r"}min=? [ Fc "end" ]', 3),
+        ('<<1,2,3>> R{"r"}min=? [ Fc "end" ]', "5/2"), ('<<3>> R{"r"}max=? [ Fc "end" ]', "inf"),
+        ('filter(forall, <<1,3>> P>=0.5 [ F "end" ] <=> s!=1)', True),
+        ('filter(forall, <<1,3>> R{"r"}<=2 [ F "end" ] <=> s>1)', True),
+        ('filter(forall, <<3>> R{"r"}>=2 [ Fc "end" ] <=> s<3)', True),
+        # Rewards until a co-safe formula is satisfied.
+        ('<<1>> R{"r"}max=? [ (F s=1) & (F s=2) ]', "3/2"), ('<<2,3>> R{"r"}min=? [ (F s=1) & (F s=2) ]', "3/2"),
+        ('<<2,3>> R{"r"}min=? [ X X s=2 ]', "inf"), ('<<1,2,3>> R{"r"}min=? [ X F s>0 ]', 0),
+        ('<<1,3>> R{"r"}min=? [ s=0 | X true ]', 0), ('<<2>> R{"r"}max=? [ F X s=2 ]', "inf"),
+        ('<<1>> R{"r"}max=? [ S ]', 1), ('<<1,2>> R{"r"}min=? [ S ]', 1), ('<<1,2>> R{"r"}max=? [ S ]', "3/2"),
+        ('<<3>> LRAmax=? [ s=1 ]', "1/2"), ('<<2>> LRAmax=? [ s=1 ]', "1/2"), ('<<1>> Tmin=? [ F s>0 ]', 1),
+        ('<<>> Tmin=? [ F s>0 ]', "10/7"), ('<<1>> Tmax=? [ F s>0 ]', "10/7"),
+    ],
+)  # fmt: skip
+def test_a_game_of_modules(text, value):
+    check(game(RELAY), text, value)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
