@@ -134,7 +134,10 @@ def write_certificate(
             side = "lower" if problem.directions[1] == "min" else "upper"
             problem = replace(problem, sides=(side,))
         contents = contents_of(problem.model, problem.question, text, guarantee)
-        file = checker.CertificateFile(contents)
+        try:
+            file = checker.CertificateFile(contents)
+        except checker.Refusal as error:
+            raise ValueError(f"the checker refuses the model or the question: {error}.") from None
         if induced is not None:
             problem, arrays = induced
             for name, (values, shape) in arrays.items():

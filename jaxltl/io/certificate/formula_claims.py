@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from jaxltl import checker
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import product
-from jaxltl.core.models.protocols import LabelledModel
+from jaxltl.core.models.protocols import Array, LabelledModel
 from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -38,7 +39,7 @@ def formula_claims(
     """
     num_states, memory = problem.shape[0], int(np.prod(problem.shape[1:]))
     size, states = len(automaton.delta), problem.host.num_states
-    joint: Any = product(cast(LabelledModel, problem.model), automaton, label_on="exit")
+    joint = cast(Game, product(cast(LabelledModel, problem.model), automaton, label_on="exit"))
     form = row_form(joint)
     state, q = (x.ravel() for x in np.indices((states, size)))
     world, m = np.divmod(problem.node[state], memory)
@@ -62,7 +63,7 @@ def formula_claims(
             if ours != problem.objective:
                 # The environment is the system of the game with swapped players.
                 nature = _OTHER.get(problem.nature or "")
-                swapped = replace(joint, system=~np.asarray(joint.system))
+                swapped = replace(joint, system=cast(Array, ~np.asarray(joint.system)))
                 answer = optimal_satisfaction(swapped, objective=ours, nature=nature)
             policy = np.zeros(int(np.prod(whole.shape)), np.int64)
             policy[whole.node] = _rows(whole, answer) - form.host.row_start[:-1]
