@@ -76,7 +76,7 @@ for learner_name in LEARNERS:
 # Two ways to write a problem of one learner down, and a network that remembers, which takes
 # longest to compile, have the laws of the others; the last is tested beside its learner, too.
 MORE = ("mlirl-world", "ppo-memory")
-SLOW = ("trpo",)  # the default tests have the constrained method of the same learner
+SLOW = ("trpo", "q-generalized")  # the default tests have another method of each learner
 
 
 def each(names):

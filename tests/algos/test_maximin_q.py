@@ -166,16 +166,6 @@ def test_one_chain_takes_as_many_moves_as_a_plain_loop():
     assert len(set(metrics.residual[:, 3].tolist())) > 1, "seeds differ"
 
 
-@pytest.mark.exhaustive
-def test_the_largest_published_example_is_learned():
-    problem = exact_problem(10)
-    hparams = maximin_q.Hparams(discount=0.9, num_chains=8192)
-    state, metrics = train(problem, hparams, 60)
-    first = int(np.argmax(np.asarray(metrics.error) < 1e-3))
-    assert 1.5e7 < metrics.moves[first] < 3e7, "2.2e7 in a sequential loop"
-    assert state.violations == 0
-
-
 def test_restarts_reach_states_without_predecessors():
     safe = safe_robots(3)
     everywhere = np.full(safe.part.num_states, 1 / safe.part.num_states)
@@ -348,15 +338,6 @@ def test_epsilon_decays_to_its_least():
     after, _ = maximin_q.run(state, problem, hparams, num_steps=40)
     made = np.asarray(after.visits - state.visits)
     assert made[np.arange(8), policy].sum() == made.sum(), "2 ** -40 is never"
-
-
-@pytest.mark.exhaustive
-def test_an_adversary_teaches_maximin_too():
-    problem = exact_problem(3, method="maximin")
-    hparams = maximin_q.Hparams(discount=0.9, num_chains=256, epsilon=0.5, environment_epsilon=0.5)
-    state, metrics = train(problem, hparams, 300)
-    assert metrics.error[-1] < 1e-3
-    assert state.violations == 0
 
 
 def test_unknown_answers_may_count_or_not():

@@ -154,11 +154,6 @@ def test_a_weight_is_of_the_probability_of_the_task():
         todirl.objective(None, None, todirl.Hparams(discount=0.9, mu=1.0, horizon=5))
 
 
-@pytest.mark.exhaustive
-def test_a_weight_is_of_the_probability_of_the_task_in_each_world():
-    check_weighed((0, 1), [1.0, 0.5])
-
-
 def test_the_gradient_is_that_of_the_dense_sensitivity():
     """(3.6) and (3.7), one linear system for each parameter, on the copied-out product."""
     problem = small()
@@ -312,21 +307,6 @@ def test_learning_stops_at_the_best_held_out_likelihood():
         np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.exhaustive
-def test_several_worlds_are_the_sum_of_each():
-    both = small((0, 1), weight=[1.0, 0.25])
-    hparams = todirl.Hparams(discount=0.9, l2=0.0, tolerance=1e-12)
-    found = parameters(small())
-    whole = evaluate(found, both, hparams)
-    second = evaluate(found, both.replace(weight=jnp.array([0.0, 1.0])), hparams)
-    first = evaluate(found, small(), hparams)
-    expected = first.neg_log_likelihood + 0.25 * second.neg_log_likelihood
-    np.testing.assert_allclose(whole.neg_log_likelihood, expected, rtol=1e-10)
-    np.testing.assert_allclose(whole.per_pair, expected / (8 + 0.25 * 7), rtol=1e-10)
-    alone = plan(both.network, found, lazy(1), both.observation[1], hparams)
-    np.testing.assert_allclose(whole.value[1], alone.value, rtol=1e-10)
-
-
 def test_counts_follow_the_memory_and_the_time():
     problem = small(horizon=5)
     timed = np.zeros((5, 6, NUM_MEMORY, 4))
@@ -357,16 +337,6 @@ def test_a_long_horizon_begins_with_the_stationary_policy():
     np.testing.assert_allclose(timed.policy[0], stationary.policy, atol=1e-12)
     last = jax.nn.softmax(todirl.reward(*place), axis=-1)
     np.testing.assert_allclose(timed.policy[-1], last, atol=1e-12)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("optimizer", ["adam", "sgd", "rmsprop", "lbfgs"])
-def test_every_optimiser_makes_progress(optimizer):
-    problem = small()
-    hparams = todirl.Hparams(discount=0.9, learning_rate=0.01, optimizer=optimizer)
-    _, metrics = todirl.train(jax.random.key(1), problem, hparams, num_steps=8)
-    assert metrics.loss[-1] < metrics.loss[0] - 0.1
-    assert (metrics.error < 1e-9).all()
 
 
 # --- bad input ---------------------------------------------------------------------------------

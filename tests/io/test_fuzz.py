@@ -9,10 +9,3 @@ from tests.io.fuzz import READERS, try_damaged
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files(name, tmp_path):
     assert try_damaged(name, 300, 0, tmp_path) < 300
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", range(1, 11))
-@pytest.mark.parametrize("name", READERS)
-def test_many_damaged_files(name, seed, tmp_path):
-    try_damaged(name, 10**5 // len(READERS) + 1, seed, tmp_path)

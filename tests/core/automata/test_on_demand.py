@@ -94,6 +94,7 @@ FAMILIES = [
 ]
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(("text", "states"), FAMILIES)
 def test_sizes_of_families(text, states):
     rng = random.Random(text)

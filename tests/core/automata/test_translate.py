@@ -340,12 +340,6 @@ def test_random_formulas_of_all_of_the_logic(seed):
     assert set(kinds) == {"cosafe", "safety", "buchi", "parity"} and 0.2 < mean < 0.8
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", range(1000, 1050))
-def test_many_random_formulas_of_all_of_the_logic(seed):
-    check_random_formulas(seed, 100)
-
-
 # Dwyer, Avrunin & Corbett 1999, with q the start and r the end of the scope: what is to hold,
 # the acceptance, and the number of states.
 PATTERNS = [

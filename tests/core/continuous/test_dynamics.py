@@ -111,6 +111,7 @@ def test_initial_states_are_uniform_in_the_boxes():
     assert abs(share - 0.5 / (0.5 + 0.125)) < 0.03
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("wide", [False, True])
 def test_both_precisions(wide):
     with jax.enable_x64(wide):

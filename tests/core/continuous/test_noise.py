@@ -130,6 +130,7 @@ def test_probability_bounds_hold_in_extended_precision(name):
             assert mpmath.mpf(least) <= p <= mpmath.mpf(most)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", CASES)
 def test_probability_bounds_hold_and_are_attained_on_dense_grids_of_shifts(name):
     made, _ = CASES[name]

@@ -324,12 +324,6 @@ def test_simulated_runs_of_random_worlds_lie_inside():
     assert tight > 0.5  # the bounds say something
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("block", range(20))
-def test_many_simulated_runs_of_random_worlds_lie_inside(block):
-    check_triples(range(10 * block, 10 * (block + 1)), 100_000)
-
-
 # --- leaving the domain ---------------------------------------------------------------------------
 
 # Of each class; the labels of some worlds satisfy or violate some of them whatever the run does.

@@ -239,12 +239,6 @@ def test_what_is_best_by_the_reward_is_best_by_the_formula(name):
     check_optimal(name, 60)
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", EXACT)
-def test_what_is_best_by_the_reward_is_best_by_the_formula_in_300_products(name):
-    check_optimal(name, 300)
-
-
 SHAPED = {
     "reach": {"discount": 0.9},
     "keep": {"discount": 0.9},
@@ -286,12 +280,6 @@ def check_shaping(name, count):
 @pytest.mark.parametrize("name", SHAPED)
 def test_shaping_changes_no_best_policy(name):
     check_shaping(name, 40)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", SHAPED)
-def test_shaping_changes_no_best_policy_in_300_products(name):
-    check_shaping(name, 300)
 
 
 def test_distances_in_the_automaton():

@@ -95,7 +95,6 @@ def check_batch(seed, kind, shape, count):
 
 
 PARITY_LIKE = ("safety", "reach", "buchi", "cobuchi", "parity")
-SHAPES = [(7, 2, 2), (5, 3, 2), (4, 2, 3), (1, 2, 1)]
 
 
 @pytest.mark.few(3)
@@ -109,19 +108,6 @@ def test_regions_equal_all_pairs_of_strategies(kind, count):
 @pytest.mark.parametrize("kind", ["gr1", "generalized"])
 def test_regions_with_memory_equal_parity_written_out(kind, count):
     check_batch(1, kind, (3, 2, 2), count)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("kind", PARITY_LIKE)
-def test_regions_equal_all_pairs_of_strategies_in_thousands_of_games(kind, shape):
-    check_batch(10 + sum(shape), kind, shape, count=1250)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", ["gr1", "generalized"])
-def test_regions_with_memory_equal_parity_in_a_thousand_games(kind):
-    check_batch(2, kind, (3, 2, 2), count=1000)
 
 
 # --- the host, compiled code and representations ----------------------------------------------

@@ -169,6 +169,7 @@ def test_policies_with_a_horizon_follow_time():
     assert policy.has_horizon and found == [0, 1, 0, 0]
 
 
+@pytest.mark.few(1)
 def test_rollouts_of_the_world_are_those_of_the_product(model):
     table, key = random_policy(model), jax.random.key(4)
     policy = jl.project_policy(model, table)

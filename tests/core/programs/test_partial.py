@@ -54,7 +54,7 @@ def small(monkeypatch):
         yield
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", ["dtmc", "mdp"])
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_enclose_the_answer_of_the_whole_model_and_only_narrow(seed, kind):

@@ -15,7 +15,6 @@ from jaxltl.core.statistics.confidence_sets import (
 )
 
 METHODS = ("clopper-pearson", "hoeffding", "weissman", "anytime")
-FIXED = METHODS[:3]
 
 
 def all_counts(total, width):
@@ -241,15 +240,6 @@ def test_all_claims_hold_at_once():
     for method in METHODS:
         found = sum(simulated(rng, method, 0.8, method == "anytime") for _ in range(200))
         assert found >= 160, "three standard deviations above what is promised"
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
-def test_how_often_all_claims_hold(method, confidence):
-    rng = np.random.default_rng(2)
-    found = sum(simulated(rng, method, confidence, method == "anytime") for _ in range(2000))
-    assert found >= 2000 * confidence
 
 
 def test_many_rows_at_once():

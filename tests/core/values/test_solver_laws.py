@@ -529,7 +529,9 @@ DERIVATIVES = [
         name,
         kind,
         marks=[]
-        if kind == SOLVERS[name].kinds[0] or name == "policy_value"
+        if kind == SOLVERS[name].kinds[0] and name != "reachability-min"
+        else pytest.mark.slow
+        if name in ("policy_value", "reachability-min")
         else pytest.mark.exhaustive,
     )
     for name, kind in PAIRS

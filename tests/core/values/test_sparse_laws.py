@@ -19,6 +19,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.soft import boltzmann_expansion, soft_policy_adjoint
+from tests.core.values.test_solver_laws import DISCOUNTED, Solver, game_of
 from tests.sparse_models import exact_solve, random_sparse
 from tests.support import (
     assert_encloses,
@@ -29,74 +30,30 @@ from tests.support import (
 )
 
 COUNT = 9
-SYSTEM = np.arange(COUNT) % 2 == 0
 
 
-class Solver(NamedTuple):
-    """A solver as ``solve(model, inputs)``; what it needs besides, and what its policy is."""
-
-    solve: Callable[..., jl.Solution]
-    needs: tuple[str, ...]
-    stochastic: bool = True
-
-
-def game(model):
-    return jl.Game(model, jnp.asarray(SYSTEM))
+def adversarial(model, x, **options):
+    """The worst case of an environment whose policy is known too."""
+    return jl.values.strategy_value(
+        game_of(model), x["policy"], x["reward"], x["discount"], environment=x["policy"], **options
+    )
 
 
 SOLVERS = {
-    "policy_value": Solver(
-        lambda m, x: jl.policy_value(m, x["policy"], x["reward"], x["discount"]),
-        ("reward", "discount", "policy"),
-    ),
-    **{
-        f"optimal_value-{method}": Solver(
-            lambda m, x, method=method: jl.optimal_value(
-                m, x["reward"], x["discount"], method=method
-            ),
-            ("reward", "discount"),
-            False,
-        )
-        for method in ("policy_iteration", "modified_policy_iteration", "value_iteration")
-    },
-    **{
-        f"soft_value-{method}": Solver(
-            lambda m, x, method=method: jl.soft_value(m, x["reward"], x["discount"], method=method),
-            ("reward", "discount"),
-        )
-        for method in ("newton", "value_iteration")
-    },
-    "boltzmann_value": Solver(
-        lambda m, x: jl.values.boltzmann_value(m, x["reward"], x["discount"]),
-        ("reward", "discount"),
-    ),
+    **DISCOUNTED,
     "boltzmann_value-newton": Solver(
-        lambda m, x: jl.values.boltzmann_value(m, x["reward"], x["discount"] / 3, method="newton"),
+        lambda m, x, **o: jl.values.boltzmann_value(
+            m, x["reward"], x["discount"] / 3, method="newton", **o
+        ),
         ("reward", "discount"),
     ),
-    "occupancy_measure": Solver(
-        lambda m, x: jl.occupancy_measure(m, x["policy"], x["discount"]), ("discount", "policy")
-    ),
-    **{
-        f"minimax_value-{method}": Solver(
-            lambda m, x, method=method: jl.minimax_value(
-                game(m), x["reward"], x["discount"], method=method, allowed=x["allowed"]
-            ),
-            ("reward", "discount"),
-            False,
-        )
-        for method in ("policy_iteration", "value_iteration", "strategy_iteration")
-    },
-    "strategy_value": Solver(
-        lambda m, x: jl.values.strategy_value(game(m), x["policy"], x["reward"], x["discount"]),
-        ("reward", "discount", "policy"),
-    ),
-    "strategy_value-environment": Solver(
-        lambda m, x: jl.values.strategy_value(
-            game(m), x["policy"], x["reward"], x["discount"], environment=x["policy"]
+    "minimax_value-allowed": Solver(
+        lambda m, x, **o: jl.minimax_value(
+            game_of(m), x["reward"], x["discount"], allowed=x["allowed"], **o
         ),
-        ("reward", "discount", "policy"),
+        ("reward", "discount"),
     ),
+    "strategy_value-environment": Solver(adversarial, ("reward", "discount", "policy")),
 }
 
 
@@ -485,13 +442,13 @@ def test_the_environment_may_move_for_nothing():
         case = Example(model, padded, {}, action)
         reward = rng.normal(size=model.num_rows)
         try:
-            expected = jl.minimax_value(game(padded), case.wide(reward), 0.8, per="system_move")
+            expected = jl.minimax_value(game_of(padded), case.wide(reward), 0.8, per="system_move")
         except ValueError as error:
             with pytest.raises(ValueError, match="the environment can move for ever"):
-                jl.minimax_value(game(model), reward, 0.8, per="system_move")
+                jl.minimax_value(game_of(model), reward, 0.8, per="system_move")
             assert "for ever" in str(error)
             continue
-        found = jl.minimax_value(game(model), reward, 0.8, per="system_move")
+        found = jl.minimax_value(game_of(model), reward, 0.8, per="system_move")
         assert_solutions_agree(found, expected, 1e-10)
         return
     raise AssertionError("no such model was found")

@@ -58,7 +58,7 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(*map(np.asarray, numbers))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_lanes_are_as_if_alone(number, double):

@@ -124,6 +124,7 @@ def test_traced_models_with_subnormal_probabilities_are_invalid(objective):
     assert all(status == Status.INVALID for status in statuses(bad))
 
 
+@pytest.mark.few(1)
 def test_sparse_models_that_enter_jit_in_lower_precision_are_invalid():
     solve = jax.jit(lambda m: policy_value(m, jnp.zeros(3, int), jnp.ones(3), 0.5).status)
     assert int(solve(sparse(0.25))) == Status.CONVERGED
@@ -150,6 +151,7 @@ def test_subnormal_numbers_are_found_by_their_bits(dtype):
     assert jax.jit(is_subnormal)(x).tolist() == expected
 
 
+@pytest.mark.few(1)
 def test_policies_with_subnormal_weights_are_refused():
     model = from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [0, 1.0]]])
     tiny, target = SUBNORMAL[precision()], np.array([False, True])

@@ -145,6 +145,7 @@ def test_bounds_are_narrow_without_any_one_method(disabled, monkeypatch):
             assert found.lower[start] <= found.value[start] <= found.upper[start]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "size, battery", [(12, 24), (10, 35), pytest.param(20, 60, marks=pytest.mark.slow)]
 )
@@ -178,6 +179,7 @@ def random_rows(rng, size, rare):
     return CostRows(sparse.csr_array(matrix), cost, leaving, owner)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("rare", [0.5, 1e-3, 1e-8, 1e-15])
 def test_bounds_of_rows_that_rarely_leave(rare):
     """Bounds from any values enclose each policy's, however few runs end; from good ones, closely."""

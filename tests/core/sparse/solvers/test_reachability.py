@@ -294,20 +294,6 @@ def test_runs_that_hardly_ever_end(length):
     assert worst_width(found, relative=True) <= 1e-6
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", range(20))
-def test_many(seed):
-    for rng, host, target, stay in cases(100, seed=100 + seed):
-        cost = rng.integers(0, 4, host.num_rows) * (rng.random(host.num_rows) < 0.7) / 4
-        probability, reward = probabilities(host, target, stay), rewards(host, target, cost)
-        for maximize in (True, False):
-            found = reachability(host, target, maximize=maximize, stay=stay)
-            encloses(found, best_of(probability, maximize=maximize), maximize=maximize)
-            attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
-            found = total_reward(host, cost, target, maximize=maximize)
-            encloses(found, best_of(reward, maximize=maximize), maximize=maximize)
-
-
 def chain_of_rows(rows):
     """A chain from lists of successors and probabilities."""
     starts = np.concatenate([[0], np.cumsum([len(t) for t, _ in rows])])

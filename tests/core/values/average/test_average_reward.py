@@ -62,6 +62,7 @@ def exact_optimum(model, reward, best):
     return [best(x) for x in zip(*values, strict=True)]
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize("seed", range(30))
 def test_bounds_enclose_the_best_of_all_policies(seed):
     rng = np.random.default_rng(seed)

@@ -398,6 +398,7 @@ def test_soft_newton_passes_linear_systems_that_single_precision_does_not_solve(
     assert jnp.max(found.upper - found.lower) < 0.02
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("place", ["inside", "float32", "argument"])
 def test_single_precision_means_the_discount_as_given(place):
     """Inside ``jit``; a number of Python that ``jit`` itself rounds leaves wider bounds."""

@@ -248,6 +248,7 @@ def test_what_does_not_fit_is_named():
         optimality_gap(table, TASKS[1], np.full((count, 3, A), 0.5))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("sampled", [True, False])
 def test_a_learned_agent_is_tabulated_as_it_acts(sampled):
     """Of a PPO agent in the environment of its task: its probabilities, or its likeliest actions."""

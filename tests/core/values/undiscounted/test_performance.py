@@ -113,33 +113,12 @@ def test_elimination_agrees(acceptance, label_on, monkeypatch):
     assert_correct(tp.task_performances(some, chosen), some, exact[::4])
 
 
-@pytest.mark.exhaustive
-def test_the_methods_agree_and_one_is_a_lane():
-    models, policies, _ = cases("cosafe", "exit")
-    batch = tp.task_performances(models, policies, batch=7)
-    for i in (0, 5):
-        blocks = tp.task_performance(lane(models, i), policies[i])
-        general = tp.task_performance(lane(models, i), policies[i], method="general")
-        np.testing.assert_allclose(blocks.value, batch.value[i], atol=1e-12)
-        np.testing.assert_allclose(general.value, blocks.value, atol=1e-9)
-        assert float(general.lower) <= float(blocks.mean) <= float(general.upper)
-
-
 def test_new_numbers_do_not_retrace():
     models, policies, _ = cases("cosafe", "exit")
     tp.task_performances(models, policies)
     with counted_traces() as traced:
         tp.task_performances(jax.tree.map(lambda x: x[::-1], models), policies[::-1])
     assert not [name for name in traced if "performance" in name or name == "_batched"]
-
-
-@pytest.mark.exhaustive
-def test_any_task_has_a_performance():
-    model = jl.product(jl.gridworld(". g\n. b", slip=0.1, absorbing=["b"]), "G F g")
-    policy = jnp.full((*model.state_shape, 4), 0.25)
-    found = tp.task_performance(model, policy)
-    expected = jl.satisfaction_probability(model, policy)
-    np.testing.assert_allclose(found.mean, jnp.sum(model.initial * expected.value), atol=1e-9)
 
 
 def test_unknown_methods_are_refused():

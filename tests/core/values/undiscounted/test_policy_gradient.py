@@ -9,6 +9,7 @@ from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
 from tests.algos.test_guaranteed import A, Q, S, random_automaton, random_world
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", ["cosafe", "safety", "buchi", "parity"])
 def test_probability_and_slope_agree_with_certified_values(kind):
     rng, between = np.random.default_rng(7), 0

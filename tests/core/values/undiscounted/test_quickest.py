@@ -84,6 +84,7 @@ def require_quickest(world, formula):
     np.testing.assert_allclose(own.value, steps, rtol=digits)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("double", [False, True])
 def test_quickest_policies_take_the_least_steps_of_optimal_ones(double):
     with jax.enable_x64(double):

@@ -128,7 +128,7 @@ TASKS = ("F g", "G !r", "G F g & G F y", "F G g & F y")
 
 
 # By default each task and each objective occurs.
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("task", "objective"),
     [

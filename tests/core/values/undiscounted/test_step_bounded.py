@@ -108,6 +108,7 @@ def by_levels(model, target, stay, cost, most, best, sweeps=400):
     return found
 
 
+@pytest.mark.few(12)
 @pytest.mark.parametrize("depth", [1, 64, None])
 @pytest.mark.parametrize("seed", range(16))
 def test_rewards_are_spent_level_by_level(seed, depth, monkeypatch):
@@ -251,6 +252,7 @@ def test_average_growth_bounds_a_huge_sum():
     assert (found.upper - found.lower <= 1e-6 * found.value).all()
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("seed", range(24))
 def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
     rng = np.random.default_rng(seed)
