@@ -29,7 +29,7 @@ Example: a policy of the state and the automaton state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ from flax import linen as nn
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.actor_critic import summed_layers
 from jaxltl.algos.common.learner import Best, stop_early
+from jaxltl.algos.common.networks import NetworkLike, as_network
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
@@ -115,7 +116,7 @@ class Problem:
     available: jax.Array
     counts: jax.Array
     held_out: jax.Array
-    network: nn.Module = struct.field(pytree_node=False, default=ConvolutionalPolicy())
+    network: NetworkLike = struct.field(pytree_node=False, default=ConvolutionalPolicy())
 
 
 @struct.dataclass
@@ -175,7 +176,7 @@ def make_problem(
     demonstrations: Trajectories | Sequence[Trajectories],
     *,
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
-    network: nn.Module | None = None,
+    network: NetworkLike | Callable[..., PyTree] | None = None,
 ) -> Problem:
     """A checked :class:`Problem` with arrays stacked over W worlds, on the host.
 
@@ -185,8 +186,8 @@ def make_problem(
       demonstrations: in the world (not in the product), or one for each world.
       held_out: share of each world's trajectories, the last ones, or other trajectories, for early
         stopping; None or 0: no early stopping.
-      network: the policy; default :class:`ConvolutionalPolicy` with the models' number of
-        actions.
+      network: the policy, of :func:`~jaxltl.algos.common.networks.as_network`; default
+        :class:`ConvolutionalPolicy` with the models' number of actions.
 
     Raises:
       ValueError: worlds of different shapes, observations or scores of a wrong shape, or
@@ -194,13 +195,14 @@ def make_problem(
     """
     models = stack_models(models)
     observation = stack_observations(models, observation)
+    network = ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network
     counts, other = training_counts(models, demonstrations, held_out)
     problem = Problem(
         observation=observation,
         available=jnp.asarray(models.mdp.available),
         counts=counts,
         held_out=other,
-        network=ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network,
+        network=as_network(network),
     )
     height_width_channels = getattr(problem.network, "observation_shape", None)
     size = problem.observation.shape[-1]
@@ -226,7 +228,7 @@ def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
 
 
 def policy_in_world(
-    network: nn.Module, parameters: PyTree, model: Product, observation: jax.Array
+    network: NetworkLike, parameters: PyTree, model: Product, observation: jax.Array
 ) -> jax.Array:
     """The policy ``float[S, Q, A]`` in any world, zero at unavailable actions.
 
@@ -234,7 +236,7 @@ def policy_in_world(
     `observation` ``float[S, O]``. Differentiable in the parameters.
     """
     memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
-    scores: PyTree = network.apply(parameters, observation[:, None], memory)
+    scores: PyTree = as_network(network).apply(parameters, observation[:, None], memory)
     return jax.nn.softmax(jnp.where(model.available, scores, -jnp.inf), axis=-1)
 
 

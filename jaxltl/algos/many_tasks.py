@@ -57,6 +57,7 @@ from numpy.typing import ArrayLike
 from jaxltl.algos.common import action_distributions
 from jaxltl.algos.common.actor_critic import action_parameters, dense
 from jaxltl.algos.common.moments import normalized
+from jaxltl.algos.common.networks import NetworkLike, as_network
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import struct, validation
 from jaxltl.core.automata import Automaton, sequences, to_automaton
@@ -269,14 +270,15 @@ def sequence_policy(
     return jax.nn.softmax(actions[jnp.argmax(values)])
 
 
-def trained(network: nn.Module, parameters: PyTree, moments: PyTree = None) -> Partial:
+def trained(
+    network: NetworkLike | Callable[..., PyTree], parameters: PyTree, moments: PyTree = None
+) -> Partial:
     """A function ``observation -> (parameters of the action, value)``: a network with parameters.
 
     A pytree of the `network` without memory, its `parameters`, such as ``state.parameters`` of PPO, and
     the `moments` by which observations were normalised in training, ``state.moments``; None: not.
     """
-    validation.instance("network", network, nn.Module, "a flax.linen.Module")
-    return Partial(_applied, struct.Static(network), parameters, moments)
+    return Partial(_applied, struct.Static(as_network(network)), parameters, moments)
 
 
 def _applied(

@@ -35,7 +35,7 @@ Example: a reward of the state, and the policy that it gives in another world.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -47,6 +47,7 @@ from jax import lax
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.actor_critic import summed_layers
 from jaxltl.algos.common.learner import Best, stop_early
+from jaxltl.algos.common.networks import NetworkLike, as_network
 from jaxltl.algos.common.settings import COUNT, Number, RunState, require_output, static, traced
 from jaxltl.core import struct
 from jaxltl.core.array_types import Key, PyTree
@@ -127,7 +128,7 @@ class Problem:
     held_out: jax.Array
     weight: jax.Array
     predecessors: PredecessorTable | None = None
-    network: nn.Module = struct.field(pytree_node=False, default=RewardNetwork())
+    network: NetworkLike = struct.field(pytree_node=False, default=RewardNetwork())
 
     @property
     def horizon(self) -> int | None:
@@ -171,7 +172,7 @@ def make_problem(
     demonstrations: Trajectories | Sequence[Trajectories],
     *,
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
-    network: nn.Module | None = None,
+    network: NetworkLike | Callable[..., PyTree] | None = None,
     weight: PyTree = None,
     horizon: int | None = None,
     allowed: PyTree = None,
@@ -184,7 +185,8 @@ def make_problem(
       demonstrations: in the world (not in the product), or one for each world.
       held_out: share of each world's trajectories, the last ones, or other trajectories, for early
         stopping; None or 0: no early stopping.
-      network: the reward; default :class:`RewardNetwork`.
+      network: the reward, of :func:`~jaxltl.algos.common.networks.as_network`; default
+        :class:`RewardNetwork`.
       weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
       horizon: count pairs by time, for ``Hparams.horizon``.
       allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies; default all.
@@ -202,7 +204,7 @@ def make_problem(
     counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
     weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
     require_shape("weight", weight, (num_worlds,))
-    network = RewardNetwork() if network is None else network
+    network = RewardNetwork() if network is None else as_network(network)
     inputs = _network_inputs(model, observation[0])
     require_output(
         "the network's reward has",
@@ -452,7 +454,7 @@ def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
 
 
 @partial(jax.jit, static_argnums=0)
-def _draw(network: nn.Module, key: Key, inputs: tuple[jax.Array, ...]) -> PyTree:
+def _draw(network: NetworkLike, key: Key, inputs: tuple[jax.Array, ...]) -> PyTree:
     return network.init(key, *inputs)
 
 
@@ -497,7 +499,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
 
 def reward(
-    network: nn.Module, parameters: PyTree, model: Product, observation: jax.Array
+    network: NetworkLike, parameters: PyTree, model: Product, observation: jax.Array
 ) -> jax.Array:
     """The reward ``float[S, Q, A]`` of a `network` with `parameters` in a `model`, a product.
 
@@ -511,11 +513,12 @@ def reward(
     >>> reward(Late(), {}, product(world, "F g"), jnp.eye(2)).shape
     (2, 2, 1)
     """
-    return jnp.asarray(network.apply(parameters, *_network_inputs(model, observation)))
+    inputs = _network_inputs(model, observation)
+    return jnp.asarray(as_network(network).apply(parameters, *inputs))
 
 
 def plan(
-    network: nn.Module,
+    network: NetworkLike,
     parameters: PyTree,
     model: Product,
     observation: jax.Array,

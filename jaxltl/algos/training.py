@@ -30,7 +30,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,19 @@ from jaxltl.core.models.mesh.cores import num_cores
 from jaxltl.core.models.ops.array_namespace import enable_x64
 from jaxltl.core.pretty_print import brief
 
+
+class HasSteps(Protocol):
+    """What is called of a :class:`~jaxltl.algos.common.learner.Learner`."""
+
+    @property
+    def init(self) -> Callable[..., PyTree]:
+        """The state before the first step."""
+
+    @property
+    def step(self) -> Callable[..., tuple[PyTree, PyTree]]:
+        """The next state, and metrics."""
+
+
 Callback = Callable[[PyTree, PyTree], object]
 
 
@@ -53,7 +66,7 @@ Callback = Callable[[PyTree, PyTree], object]
 
 
 def train(
-    learner: Any,
+    learner: HasSteps,
     start: Key | PyTree,
     problem: PyTree,
     hparams: PyTree,
@@ -145,7 +158,7 @@ def _positive(name: str, value: object) -> int:
     return validation.integer(name, value, least=1)
 
 
-def _first_state(learner: Any, start: PyTree, problem: PyTree, hparams: PyTree) -> PyTree:
+def _first_state(learner: HasSteps, start: PyTree, problem: PyTree, hparams: PyTree) -> PyTree:
     """The state of `start`, a key or a state, on concrete arrays."""
     _require_learner(learner)
     _require_concrete(start=start, problem=problem, hparams=hparams)
@@ -160,7 +173,7 @@ def _first_state(learner: Any, start: PyTree, problem: PyTree, hparams: PyTree) 
     return state
 
 
-def _require_learner(learner: Any) -> None:
+def _require_learner(learner: HasSteps) -> None:
     lacking = [x for x in ("init", "step") if not callable(getattr(learner, x, None))]
     if lacking:
         raise ValueError(
@@ -175,7 +188,7 @@ def _require_concrete(**trees: PyTree) -> None:
             raise ValueError(f"{name} is traced; inside jit and vmap call the learner's own train.")
 
 
-def _no_rows(learner: Any, *arguments: PyTree) -> PyTree:
+def _no_rows(learner: HasSteps, *arguments: PyTree) -> PyTree:
     """Metrics without a row."""
     _, metrics = jax.eval_shape(jax.jit(learner.step), *arguments)
     return jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), metrics)
@@ -212,7 +225,7 @@ class Sweep:
       | 0.1 | 2 | 1.5 ± 0.7071 |
     """
 
-    settings: tuple[dict[str, Any], ...]
+    settings: tuple[dict[str, PyTree], ...]
     hparams: tuple[PyTree, ...]
     states: tuple[tuple[PyTree, ...], ...]
     metrics: PyTree
@@ -226,7 +239,7 @@ class Sweep:
             for setting in self.settings
         )
 
-    def summary(self, *names: str, last: int = 1) -> list[dict[str, Any]]:
+    def summary(self, *names: str, last: int = 1) -> list[dict[str, PyTree]]:
         """Mean and standard deviation over seeds, a dict for each setting, as for a data frame.
 
         Args:
@@ -241,7 +254,7 @@ class Sweep:
           ValueError: an unknown name.
         """
         metrics = self.metrics if isinstance(self.metrics, Mapping) else vars(self.metrics)
-        rows: list[dict[str, Any]] = [dict(setting) for setting in self.settings]
+        rows: list[dict[str, PyTree]] = [dict(setting) for setting in self.settings]
         last = _positive("last", last)
         for name in names:
             validation.choice("name of a metric", name, list(metrics))
@@ -281,15 +294,15 @@ def _text(value: object) -> str:
 
 
 def sweep(
-    learner: Any,
+    learner: HasSteps,
     keys: Key,
     problem: PyTree,
     hparams: PyTree,
-    over: Mapping[str, Iterable[Any]] | Sequence[Mapping[str, Any]] = (),
+    over: Mapping[str, Iterable[PyTree]] | Sequence[Mapping[str, PyTree]] = (),
     *,
     num_steps: int,
     max_rows: int = 1000,
-    callback: Callable[[dict[str, Any], int, PyTree], object] | None = None,
+    callback: Callable[[dict[str, PyTree], int, PyTree], object] | None = None,
 ) -> Sweep:
     """Runs of a learner for all seeds and settings, on all cores, each bit for bit the run by itself.
 
@@ -325,6 +338,11 @@ def sweep(
     each = tuple(replace(hparams, **setting) if setting else hparams for setting in settings)
     for one in each:
         require_hparams(one)
+        if getattr(one, "sharding", None) is not None:
+            raise ValueError(
+                "hparams.sharding is set, and a run of a sweep has one device; set it to None, or "
+                "use vmap_over_mesh."
+            )
     require_arrays(problem=problem, hparams=each)
     run = _run_in_threads if jax.default_backend() == "cpu" else _run_as_lanes
     runs: dict[tuple[int, int], tuple[PyTree, PyTree]] = {}
@@ -347,26 +365,26 @@ Runs = Iterable[tuple[tuple[int, int], tuple[PyTree, PyTree]]]
 
 
 def _run_in_threads(
-    learner: Any, keys: Key, problem: PyTree, hparams: Sequence[PyTree], lengths: np.ndarray
+    learner: HasSteps, keys: Key, problem: PyTree, hparams: Sequence[PyTree], lengths: np.ndarray
 ) -> Runs:
     """Runs as they end, of one program each, in a thread for each core."""
     x64 = jnp.result_type(float) == np.float64
 
-    def run(program: PyTree, *arguments: PyTree) -> tuple[PyTree, PyTree]:
+    def run(program: Future[jax.stages.Compiled], *arguments: PyTree) -> tuple[PyTree, PyTree]:
         with enable_x64(x64):  # local to a thread
-            return jax.block_until_ready(program(*arguments))
+            return jax.block_until_ready(program.result()(*arguments))
 
-    running: dict[Future[Any], tuple[int, int]] = {}
+    running: dict[Future[tuple[PyTree, PyTree]], tuple[int, int]] = {}
     pool = ThreadPoolExecutor(min(num_cores(), len(keys) * len(hparams)))
     try:
         for h, settings in enumerate(hparams):
-            settings, lowered = jax.tree.map(jnp.asarray, settings), None
+            settings = jax.tree.map(jnp.asarray, settings)
+            # Traced here, where JAX's settings are the caller's, and compiled while init is.
+            state = jax.eval_shape(learner.init, keys[0], problem, settings)
+            lowered = run_blocks.lower(learner.step, state, problem, settings, lengths)
+            program = pool.submit(lowered.compile)
             for n in range(len(keys)):
-                # Traced and compiled here, where JAX's settings are the caller's.
                 state = learner.init(keys[n], problem, settings)
-                if lowered is None:
-                    lowered = run_blocks.lower(learner.step, state, problem, settings, lengths)
-                    program = lowered.compile()
                 running[pool.submit(run, program, state, problem, settings, lengths)] = (h, n)
         for future in as_completed(running):
             state, metrics = future.result()
@@ -376,7 +394,7 @@ def _run_in_threads(
 
 
 def _run_as_lanes(
-    learner: Any, keys: Key, problem: PyTree, hparams: Sequence[PyTree], lengths: np.ndarray
+    learner: HasSteps, keys: Key, problem: PyTree, hparams: Sequence[PyTree], lengths: np.ndarray
 ) -> Runs:
     """Runs of each setting as lanes of one program."""
 
@@ -402,7 +420,7 @@ def _require_keys(keys: Key) -> None:
         )
 
 
-def _settings(hparams: PyTree, over: Any) -> tuple[dict[str, Any], ...]:
+def _settings(hparams: PyTree, over: PyTree) -> tuple[dict[str, PyTree], ...]:
     """For each setting the values that vary by name."""
     if isinstance(over, Mapping):
         values = {name: _values(name, x) for name, x in over.items()}
@@ -419,7 +437,7 @@ def _settings(hparams: PyTree, over: Any) -> tuple[dict[str, Any], ...]:
     return tuple(settings)
 
 
-def _values(name: str, values: Any) -> list[Any]:
+def _values(name: str, values: PyTree) -> list[PyTree]:
     """The values of a hyperparameter, numbers of one type."""
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ValueError(f"over[{name!r}] is {validation.shorten(values)}; give a list of values.")

@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.array_types import PyTree
 from jaxltl.plot.style import (
     ACCENT,
     FAINT,
@@ -163,7 +164,7 @@ def sweep(
       >>> len(sweep({"loss": np.ones((2, 3, 5))}, ["slow", "fast"]).axes)  # settings, seeds, steps
       1
     """
-    runs: Any = metrics
+    runs: PyTree = metrics
     if hasattr(runs, "names") and hasattr(runs, "metrics"):  # a Sweep; importing it takes a second
         steps = runs.step if steps is None else steps
         settings, metrics = settings or runs.names, runs.metrics

@@ -571,7 +571,7 @@ class WithAxis(nn.Module):
             lambda: ppo.make_problem(walk_step),
             "environment is function; give one of make_environment",
         ),
-        (lambda: ppo.make_problem(WALK, network=walk_step), "network is function; give a flax"),
+        (lambda: ppo.make_problem(WALK, network=walk_step), "network cannot be called with"),
         (lambda: ppo.make_problem(WALK, network=Table(3)), r"\(\(3,\), \(\)\).* expected \(\(2,\)"),
         (lambda: ppo.make_problem(WALK, network=WithAxis()), r"\(\(2,\), \(1,\)\) for one obs"),
         (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] besides its param"),

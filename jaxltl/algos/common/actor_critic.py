@@ -36,6 +36,7 @@ import numpy as np
 from jax import lax
 from jax.typing import DTypeLike
 
+from jaxltl.algos.common.networks import NetworkLike
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
@@ -47,8 +48,8 @@ class HasNetwork(Protocol):
     """A problem with a network and its initial memory, ``()`` without."""
 
     @property
-    def network(self) -> nn.Module:
-        """The module."""
+    def network(self) -> NetworkLike:
+        """The network."""
 
     @property
     def memory(self) -> PyTree:
@@ -241,7 +242,7 @@ def default_network(actions: Finite | Box) -> ActorCritic:
     return ActorCritic(shape=actions.shape)
 
 
-def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
+def initial_memory(network: NetworkLike, memory: PyTree = None) -> PyTree:
     """The initial memory of a `network`, a tree of arrays; ``()`` without memory.
 
     A `memory` replaces that of the network's ``initial_memory()``.
@@ -258,7 +259,7 @@ def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
         raise ValueError(
             f"memory is {validation.shorten(memory)}; give a tree of arrays of numbers."
         ) from None
-    own = begin() if hasattr(network, "initial_memory") else arrays
+    own = begin() if jax.tree.leaves(begin()) else arrays
     if jax.tree.map(jnp.shape, arrays) != jax.tree.map(jnp.shape, own):
         raise ValueError(
             f"memory has the shapes {jax.tree.map(jnp.shape, arrays)}, and that of the network "
@@ -297,7 +298,7 @@ def evaluated(
     return Output(memory, action, value)
 
 
-def fresh_parameters(key: Key, network: nn.Module, memory: PyTree, observation: PyTree) -> PyTree:
+def fresh_parameters(key: Key, network: NetworkLike, memory: PyTree, observation: PyTree) -> PyTree:
     """The random initial parameters of a `network`, of a `key`, a dict of dicts of arrays.
 
     Of the initial `memory`, ``()`` without, and one `observation` only the shapes matter.
@@ -307,7 +308,7 @@ def fresh_parameters(key: Key, network: nn.Module, memory: PyTree, observation: 
 
 
 def require_network(
-    network: nn.Module,
+    network: NetworkLike,
     memory: PyTree,
     observation: PyTree,
     space: jax.ShapeDtypeStruct,

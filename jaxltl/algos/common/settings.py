@@ -21,13 +21,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import flax.errors
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
+from jaxltl.algos.common.networks import NetworkLike
 from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import struct, validation
 from jaxltl.core.array_types import PyTree
@@ -212,13 +212,14 @@ def _is_array(leaf: object) -> bool:
 
 
 def require_output(
-    subject: str, network: nn.Module, inputs: PyTree, expected: tuple[int, ...], rows: str
+    subject: str, network: NetworkLike, inputs: PyTree, expected: tuple[int, ...], rows: str
 ) -> None:
     """Validation of the shape that a `network` returns for `inputs`; `subject` and `rows` are for the text.
 
     Raises:
       ValueError: with the shapes returned and expected.
 
+    >>> import flax.linen as nn
     >>> require_output("logits have", nn.Dense(2), (np.zeros(3),), (2,), "one a symbol.")
     """
     output = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
@@ -248,12 +249,13 @@ def finite_features(
     return jnp.asarray(values, dtype)
 
 
-def applied(network: nn.Module, parameters: PyTree, *read: PyTree) -> PyTree:
+def applied(network: NetworkLike, parameters: PyTree, *read: PyTree) -> PyTree:
     """The output of a `network` with `parameters` for the inputs `read`.
 
     Raises:
       ValueError: parameters of another network, or inputs of other shapes.
 
+    >>> import flax.linen as nn
     >>> applied(nn.Dense(2), {"kernel": np.eye(2), "bias": np.zeros(2)}, np.zeros(3))
     ... # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax
@@ -12,6 +12,7 @@ from flax import linen as nn
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import optimizers
+from jaxltl.algos.common.networks import NetworkLike, as_network
 from jaxltl.algos.common.settings import (
     Number,
     applied,
@@ -78,7 +79,7 @@ class Problem:
     length: jax.Array
     event: jax.Array
     features: jax.Array
-    network: nn.Module = struct.field(pytree_node=False)
+    network: NetworkLike = struct.field(pytree_node=False)
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -116,7 +117,7 @@ def make_problem(
     demonstrations: Trajectories | Sequence[Trajectories],
     formula: Automaton | Formula | str,
     *,
-    network: nn.Module | None = None,
+    network: NetworkLike | Callable[..., PyTree] | None = None,
     features: ArrayLike | None = None,
 ) -> Problem:
     """A checked :class:`Problem`.
@@ -126,8 +127,8 @@ def make_problem(
       observation: ``float[S, O]``, or one for each world: what is seen in each state.
       demonstrations: of a world, or one batch for each world; states and actions alone.
       formula: a formula over P symbols without a meaning yet, or its automaton, co-safe, safety or Buchi.
-      network: the grounding, a flax module ``float[..., O] -> float[..., P]``; default
-        :class:`LinearGrounding`.
+      network: the grounding ``float[..., O] -> float[..., P]``, of
+        :func:`~jaxltl.algos.common.networks.as_network`; default :class:`LinearGrounding`.
       features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the event reward;
         default none.
 
@@ -156,6 +157,7 @@ def make_problem(
     observation = stack_observations(model, _padded(observation, worlds))
     world, state, action, length = joined_demonstrations(worlds, several)
     network = LinearGrounding(len(automaton.propositions)) if network is None else network
+    network = as_network(network)
     logits = (*observation.shape[:-1], len(automaton.propositions))
     subject = "the grounding's logits have"
     require_output(subject, network, (observation,), logits, "one for each symbol.")
@@ -277,7 +279,7 @@ NEVER = -1e30  # logarithm of probability 0: finite, so that derivatives stay fi
 
 
 def letter_log_probability(
-    network: nn.Module, parameters: PyTree, observation: jax.Array, letters: jax.Array
+    network: NetworkLike, parameters: PyTree, observation: jax.Array, letters: jax.Array
 ) -> jax.Array:
     """``log lambda(l | s)``, ``float[..., L]``: independent symbols, conditioned on an existing letter.
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -16,6 +15,7 @@ from jaxltl.algos.common import action_distributions as actions_of, trees
 from jaxltl.algos.common.actor_critic import Output, evaluated
 from jaxltl.algos.common.collection import Transition, generalized_advantages, transition
 from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
+from jaxltl.algos.common.networks import NetworkLike
 from jaxltl.algos.common.schedules import Schedule
 from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, RunState, static, traced
 from jaxltl.core import struct
@@ -32,12 +32,12 @@ class Problem:
     Attributes:
       environment: with finitely many actions, or a box of floats.
       memory: initial memory of the network, a tree of arrays; ``()`` without memory.
-      network: a ``flax.linen`` module; static.
+      network: static.
     """
 
     environment: Environment
     memory: PyTree
-    network: nn.Module = struct.field(pytree_node=False)
+    network: NetworkLike = struct.field(pytree_node=False)
 
 
 @struct.dataclass

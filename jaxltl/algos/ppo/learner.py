@@ -44,10 +44,10 @@ for seconds, so only shapes are shown.)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -68,6 +68,7 @@ from jaxltl.algos.common.actor_critic import (
 )
 from jaxltl.algos.common.collection import acting, minibatch_epochs
 from jaxltl.algos.common.moments import no_moments
+from jaxltl.algos.common.networks import NetworkLike, as_network
 from jaxltl.algos.common.schedules import at
 from jaxltl.algos.common.settings import require_own
 from jaxltl.algos.ppo.collection import (
@@ -113,15 +114,20 @@ __all__ = [
 
 
 def make_problem(
-    environment: Environment, *, network: nn.Module | None = None, memory: PyTree = None
+    environment: Environment,
+    *,
+    network: NetworkLike | Callable[[Key], Callable[..., PyTree]] | None = None,
+    memory: PyTree = None,
 ) -> Problem:
     """A checked :class:`Problem` of an `environment` with finitely many actions, or a box of floats.
 
-    The `network` is a ``flax.linen`` module of one observation, ``network(observation) -> (action
-    parameters, value)``; with memory ``network(memory, observation) -> (memory, (action parameters,
-    value))``. Action parameters are logits ``float[A]``, or for a box ``(mean, log_deviation)`` of an
-    action's shape; the value is a scalar. Default :class:`ActorCritic`. The initial `memory` of a
-    recurrent network is by default its ``initial_memory()``.
+    The `network` is a module of ``flax.linen``, or a function of a random key that makes a module of
+    ``flax.nnx`` or another callable with parameters, :func:`~jaxltl.algos.common.networks.as_network`.
+    It reads one observation, ``network(observation) -> (action parameters, value)``; with memory
+    ``network(memory, observation) -> (memory, (action parameters, value))``. Action parameters are
+    logits ``float[A]``, or for a box ``(mean, log_deviation)`` of an action's shape; the value is a
+    scalar. Default :class:`ActorCritic`. The initial `memory` of a recurrent network is by default
+    its ``initial_memory()``.
 
     Raises:
       ValueError: a network that returns other shapes or keeps more than parameters; a memory that
@@ -133,8 +139,7 @@ def make_problem(
         raise ValueError(
             f"environment.actions is a box of {actions.dtype}; enumerate its elements as Finite(n)."
         )
-    network = default_network(actions) if network is None else network
-    validation.instance("network", network, nn.Module, "a flax.linen.Module")
+    network = default_network(actions) if network is None else as_network(network)
     memory = trees.strong(initial_memory(network, memory))
     seen = jax.eval_shape(
         lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
