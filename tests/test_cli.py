@@ -807,6 +807,8 @@ def test_a_mistake_in_a_file_is_told_before_jax_is_imported(tmp_path):
         "import sys\nfrom jaxltl.__main__ import run\nsys.argv = ['jaxltl', 'learn', 'wrong.toml']\n"
         "try:\n    run()\nexcept SystemExit as end:\n    print(end.code, 'jax' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
     assert "did you mean 'formula'" in done.stderr
     assert done.stdout.splitlines()[-1] == "2 False", done.stdout

@@ -44,6 +44,8 @@ from .multi_objective.multi_objective import (
     pareto as pareto,
 )
 from .multi_objective.objectives import Objective as Objective
+from .partial_observability.chains import controlled_chain as controlled_chain
+from .partial_observability.solve import belief_bounds as belief_bounds
 from .prepared.prepared import (
     Prepared as Prepared,
     prepare as prepare,

@@ -12,6 +12,7 @@ COLUMNS = {
     "padded game": "game on an MDP",
     "rows game": "game on a SparseMDP",
     "intervals game": "game on an IntervalMDP",
+    "rows pomdp": "POMDP",
     "traced padded": "MDP inside `jit`",
     "traced rows": "SparseMDP inside `jit`",
     "traced padded game": "game inside `jit`",

@@ -32,6 +32,7 @@ from jaxltl.core.values.door.question import (
 )
 from jaxltl.core.values.interval import satisfaction as interval_satisfaction
 from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
+from jaxltl.core.values.partial_observability import answers as partial_answers
 from jaxltl.core.values.undiscounted import (
     acceptance,
     compiled_engines,
@@ -67,6 +68,7 @@ _DISCOUNT = Engine(row_engines.discount, instead=_SWEPT, column="traced rows")
 _DISCOUNTED_GAME = Engine(minimax.discounted_game)
 _AVERAGE = Engine(average.average, ("max_steps",))
 _ACCEPT = Engine(interval_satisfaction.accept_with_nature)
+_PARTIAL_REACH = Engine(partial_answers.reach)
 _COMPILED_ACCEPT = Engine(acceptance.accept_padded, ("method", *_LIMITED))
 
 CONCRETE = ("padded", "rows", "intervals", "padded game", "rows game", "intervals game")
@@ -79,6 +81,7 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "intervals": _ROBUST_REACH,
         "padded game": _ROBUST_REACH,
         "rows game": _ROBUST_REACH,
+        "rows pomdp": _PARTIAL_REACH,
         "intervals game": _ROBUST_REACH,
         "other": _COMPILED_REACH,
         "traced padded": _COMPILED_REACH,
@@ -91,6 +94,7 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "intervals": _ROBUST_REACH,
         "padded game": _ROBUST_REACH,
         "rows game": _ROBUST_REACH,
+        "rows pomdp": _PARTIAL_REACH,
         "intervals game": _ROBUST_REACH,
     },
     TotalReward: {
@@ -99,6 +103,7 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "intervals": _ROBUST_EARN,
         "padded game": _ROBUST_EARN,
         "rows game": _ROBUST_EARN,
+        "rows pomdp": Engine(partial_answers.earn),
         "intervals game": _ROBUST_EARN,
         "traced padded": _COMPILED_EARN,
         "mesh padded": _COMPILED_EARN,
@@ -200,7 +205,8 @@ def solve(
     if accuracy.relative and not engine.relative:
         raise ValueError(f"relative=True is for a SparseMDP, not for {kind} (see to_sparse).")
     solution = engine.solve(model, question, accuracy, **selected)
-    solution = replace(solution, initial=getattr(model, "initial", None))
+    if not kind.is_partial:  # whose values are those of the initial belief
+        solution = replace(solution, initial=getattr(model, "initial", None))
     return check(solution) if throw else solution
 
 

@@ -56,6 +56,7 @@ from jaxltl.core.values.properties.answers import (
 )
 from jaxltl.core.values.properties.expressions import expression_bounds
 from jaxltl.core.values.properties.model_query import ModelQuery, QueryResult
+from jaxltl.core.values.properties.partially_observable import solve_partially_observable
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
 from jaxltl.core.values.properties.exact_thresholds import exact_values
 from jaxltl.core.values.undiscounted import step_bounded as bounded
@@ -97,7 +98,8 @@ def solve_property(
         in ``Pmaxmin=?``; an interval chain that of nature; a game a coalition of its players, system
         and environment, as in ``<<system>> Pmax=?``. In a multi-player game a coalition has names or
         numbers of players, ``<<p1, 3>>``, or all, ``<<*>>``; without one all players are one. States
-        of a product are numbered ``s * Q + q``.
+        of a product are numbered ``s * Q + q``. A POMDP is solved from its initial belief, to a width of
+        at least 1e-3.
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
       states: ``int[I]``; default the initial states. Not with ``multi(...)``.
       tolerance: width of the bounds, absolute for probabilities and relative otherwise.
@@ -123,6 +125,12 @@ def solve_property(
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
     """
+    if isinstance(model, POMDP):
+        if states is not None or relative or exact:
+            raise ValueError(
+                "states, relative and exact are not for a POMDP, which is solved from its initial belief."
+            )
+        return solve_partially_observable(model, prop, tolerance)
     source = checkable(model)
     if isinstance(prop, str):
         prop = parse_property(prop, Definitions(variables=tuple(graph_of_model(source).valuation)))

@@ -10,6 +10,7 @@ from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.refusals import refuse_traced
@@ -21,6 +22,7 @@ from jaxltl.core.values.engine.host_solution import default_tolerance
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
+from jaxltl.core.values.partial_observability.solve import partially_observable_satisfaction
 from jaxltl.core.values.undiscounted.acceptance import require_product
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 
@@ -79,7 +81,7 @@ def satisfaction_probability(
 
 @validated(games=True)
 def optimal_satisfaction(
-    model: Product | Model | IntervalMDP | Game,
+    model: Product | Model | IntervalMDP | Game | POMDP,
     formula: FormulaLike | None = None,
     *,
     objective: str = "max",
@@ -109,7 +111,8 @@ def optimal_satisfaction(
     model with adversarial nature is a stochastic parity game.
 
     Args:
-      model: a product; or with `formula` a concrete model, an interval model or a game on one of them.
+      model: a product; or with `formula` a concrete model, an interval model or a game on one of them, or
+        a POMDP, with bounds from its initial belief for co-safe and safe formulas.
       formula: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       nature: for interval models, ``"adversarial"`` (default) or ``"cooperative"``.
@@ -141,6 +144,21 @@ def optimal_satisfaction(
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
     """
+    if isinstance(model, POMDP):
+        if formula is None:
+            raise ValueError(
+                "optimal_satisfaction: formula is None; give the formula for the POMDP."
+            )
+        refuse_nature(nature)
+        refuse_environment(environment)
+        if states is not None or relative or label_on is not None:
+            raise ValueError(
+                "states, label_on and relative are not for a POMDP, which is solved from its initial belief."
+            )
+        answer = partially_observable_satisfaction(
+            model, formula, objective=objective, tolerance=tolerance
+        )
+        return check(answer) if throw else answer
     if formula is None:
         if states is not None or label_on is not None:
             raise ValueError(

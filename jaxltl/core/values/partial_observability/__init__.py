@@ -1,0 +1,1 @@
+"""Partially observable models: controllers, beliefs and certified bounds."""

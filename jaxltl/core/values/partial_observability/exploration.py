@@ -1,0 +1,287 @@
+"""Exploration of beliefs between a certified bound of all controllers and the value of one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
+from jaxltl.core.values.partial_observability.beliefs import BeliefGraph
+from jaxltl.core.values.partial_observability.bounds import BeliefRows, NodeValues, visits
+from jaxltl.core.values.partial_observability.library import (
+    Evaluated,
+    Library,
+    MemorySteps,
+    row_edges,
+    steps_of_rows,
+)
+from jaxltl.core.values.partial_observability.problem import BeliefProblem
+
+Report = Callable[[int, float, float], None]  # of the number of beliefs and the bounds so far
+_ROUND = 300  # beliefs that a round expands at least
+_SHARE = 0.3  # of the expanded beliefs that a round expands at most
+_REPEATS = 30  # evaluations of a controller that continues in its own steps
+_IMPROVING = 4  # pairs of these for each transition between beliefs, on average at most
+# Depth of the beliefs that a round expands below its first ones; the great one, in rounds 1, 2, 4, 8 ...,
+# finds controllers, the small one narrows the bound of all controllers.
+_DEPTH, _DEEP = 12, 300
+
+
+@dataclass(frozen=True)
+class BeliefBounds:
+    """Bounds of the optimal value from the initial belief, and the controller that attains one of them."""
+
+    outer: float  # of all controllers: the upper bound of a maximum
+    inner: float  # of the controller: the lower bound of a maximum
+    policy: FiniteMemoryPolicy
+    num_beliefs: int  # expanded
+    rounds: int
+    is_complete: bool  # False if a limit ended the exploration
+
+    def joined(self, other: BeliefBounds, maximize: bool) -> BeliefBounds:
+        """The bounds of another exploration, or of this one where they are narrower."""
+        narrower, better = (min, max) if maximize else (max, min)
+        best = other if better(self.inner, other.inner) == other.inner else self
+        return replace(
+            other,
+            outer=narrower(self.outer, other.outer),
+            inner=best.inner,
+            policy=best.policy,
+        )
+
+
+@dataclass
+class Exploration:
+    """State of an exploration."""
+
+    problem: BeliefProblem
+    library: Library
+    graph: BeliefGraph
+    outer: Floats  # float64[nodes], bounds of all controllers at leaves
+    inner: Floats  # float64[nodes], bounds of the library
+    memory: Integers  # int[nodes], the memory state of the library that attains it
+    best_outer: float
+    best_inner: float
+    best: tuple[Integers, Integers]  # the best controller: start memory and reached memory states
+
+    def extend(self) -> None:
+        """Bounds of the nodes that are new."""
+        graph, problem = self.graph, self.problem
+        new = np.arange(self.outer.size, graph.size)
+        some = graph.measures().take(new)
+        seen = graph.observation()[new]
+        worst = -np.inf if problem.maximize else np.inf
+        matrix = some.matrix(problem.num_states)
+        best = np.full(new.size, worst)
+        for action, bound in enumerate(problem.action_bound):
+            value = matrix @ np.where(np.isfinite(bound), bound, 0.0)
+            value = np.where(problem.available[seen, action], value, worst)
+            best = np.maximum(best, value) if problem.maximize else np.minimum(best, value)
+        corner = matrix @ problem.corner
+        best = np.minimum(best, corner) if problem.maximize else np.maximum(best, corner)
+        sign = 1 if problem.maximize else -1
+        self.outer = np.concatenate([self.outer, best * (1 + sign * 1e-12)])
+        inner, memory = self.library.best_at(some)
+        self.inner = np.concatenate([self.inner, inner])
+        self.memory = np.concatenate([self.memory, memory])
+
+    @property
+    def gap(self) -> float:
+        """The width of the bounds, of rewards relative to the value."""
+        width = abs(self.best_outer - self.best_inner)
+        share = self.problem.is_reward and np.isfinite(width)
+        return width / max(abs(self.best_inner), 1e-300) if share and width else width
+
+    def refresh(self) -> None:
+        """Bounds of all leaves from the library, after it has changed."""
+        leaves = np.flatnonzero(~self.graph.expanded)
+        some = self.graph.measures().take(leaves)
+        self.inner[leaves], self.memory[leaves] = self.library.best_at(some)
+
+    def keep(self, evaluated: Evaluated, start: Integers) -> bool:
+        """Keeps a controller if it is the best one."""
+        sign = 1 if self.problem.maximize else -1
+        if not sign * evaluated.initial > sign * self.best_inner:
+            return False
+        self.best_inner = evaluated.initial
+        self.best = start, np.unique(evaluated.chain.memory)
+        return True
+
+    def improve(self, rows: BeliefRows) -> bool:
+        """Evaluates controllers of the explored beliefs; True if one is better.
+
+        At its leaves a controller continues in the library; then, while that improves it, in its own steps.
+        """
+        problem, library = self.problem, self.library
+        policy = rows.solve(self.inner, safe=False, tolerance=1e-5)
+        sign = 1 if problem.maximize else -1
+        least = 2e-3 * self.gap if np.isfinite(self.gap) else 0.0
+        if not sign * (rows.at_root(policy.value) - self.best_inner) > least:
+            return False
+        work = _IMPROVING * rows.table["to"].size + 10 * _IMPROVING
+        initial = np.flatnonzero(problem.initial > 0)
+        memory, best = self.memory, None
+        for _ in range(_REPEATS):
+            steps, start, leaves = self._controller(rows, policy, memory)
+            evaluated = library.evaluate(library.machine(start, steps), initial)
+            change = np.inf if best is None else sign * (evaluated.initial - best[1].initial)
+            if not change > least:
+                break
+            best = steps, evaluated, start
+            work -= evaluated.bound.size
+            if work < 0 or not problem.maximize or not leaves.size:
+                break
+            some = rows.graph.measures().take(leaves)
+            value, chosen = library.alternatives(some, evaluated, library.steps.size)
+            better = value > self.inner[leaves]
+            memory = self.memory.copy()
+            memory[leaves[better]] = chosen[better]
+        assert best is not None
+        if not sign * best[1].initial > sign * self.best_inner:
+            return False
+        self.best_inner = best[1].initial
+        start = library.freeze(*best)
+        self.best = start, np.arange(library.num_blocks, library.num_blocks + library.steps.size)
+        self.refresh()
+        return True
+
+    def _controller(
+        self, rows: BeliefRows, policy: NodeValues, memory: Integers
+    ) -> tuple[MemorySteps, Integers, Integers]:
+        """MemorySteps of a policy of rows, the memory states of initial observations, and the leaves it reaches."""
+        graph, table, library = rows.graph, rows.table, self.library
+        count = self.problem.pomdp.num_observations
+        reached = np.zeros(graph.size, bool)
+        level = graph.root[0]
+        reached[level] = True
+        while level.size:
+            inner = level[policy.row[level] >= 0]
+            entry, _ = row_edges(table["start"], policy.row[inner])
+            after = np.unique(table["to"][entry])
+            level = after[~reached[after]]
+            reached[level] = True
+        nodes = np.flatnonzero(reached & (policy.row >= 0))
+        memory = memory.copy()
+        memory[nodes] = library.num_blocks + library.steps.size + np.arange(nodes.size)
+        row = policy.row[nodes]
+        entry, place = row_edges(table["start"], row)
+        seen, to = graph.observation(), table["to"][entry]
+        edges = place, seen[to], memory[to]
+        steps = steps_of_rows(seen[nodes], table["action"][row], edges, count)
+        start = np.full(count, library.fallback, np.int64)
+        start[seen[graph.root[0]]] = memory[graph.root[0]]
+        return steps, start, np.flatnonzero(reached & (policy.row < 0))
+
+
+def explore(
+    problem: BeliefProblem,
+    controllers: Sequence[FiniteMemoryPolicy],
+    *,
+    tolerance: float,
+    max_beliefs: int,
+    max_seconds: float,
+    report: Report | None = None,
+) -> BeliefBounds:
+    """Expands beliefs that matter most until the bounds are within the tolerance, or a limit is met."""
+    begin = time.monotonic()
+    library = Library(problem, list(controllers))
+    graph = BeliefGraph(problem)
+    none, ends = np.zeros(0, np.int64), (np.inf, -np.inf)
+    outer, inner = ends if problem.maximize else ends[::-1]
+    state = Exploration(
+        problem, library, graph, np.zeros(0), np.zeros(0), none, outer, inner, (none, none)
+    )
+    initial = np.flatnonzero(problem.initial > 0)
+    for start in library.start:
+        state.keep(library.evaluate(library.machine(start), initial), start)
+    state.extend()
+    rounds, complete, checked = 0, False, 0
+    try:
+        while True:
+            rows = BeliefRows(graph, graph.rows())
+            bound = rows.solve(state.outer, safe=True, tolerance=min(1e-4, tolerance / 8))
+            at_root = rows.at_root(bound.value)
+            narrower = min if problem.maximize else max
+            state.best_outer = narrower(state.best_outer, at_root)
+            expanded = int(graph.expanded.sum())
+            leaves = not graph.expanded.all()
+            if expanded >= 1.25 * checked + 20 or not leaves:
+                checked = expanded
+                state.improve(rows)
+            rounds += 1
+            if report is not None:
+                low, high = sorted((state.best_inner, state.best_outer))
+                report(expanded, low, high)
+            if state.gap <= tolerance or not leaves:
+                complete = state.gap <= tolerance
+                break
+            room = max_beliefs - expanded
+            late = room <= 0 or time.monotonic() - begin > max_seconds
+            depth = _DEEP if rounds & (rounds - 1) == 0 else _DEPTH
+            if late or not _grow(state, rows, bound, room, depth):
+                state.improve(rows)
+                complete = state.gap <= tolerance
+                break
+    except KeyboardInterrupt:
+        pass
+    return BeliefBounds(
+        state.best_outer,
+        state.best_inner,
+        library.policy(*state.best),
+        int(graph.expanded.sum()),
+        rounds,
+        complete,
+    )
+
+
+def _grow(state: Exploration, rows: BeliefRows, bound: NodeValues, room: int, deepest: int) -> bool:
+    """Expands leaves of the greatest gaps, weighted by visits, and some beliefs below them."""
+    graph = state.graph
+    amount = min(room, max(_ROUND, int(_SHARE * graph.expanded.sum())))
+    mass = visits(rows, bound.row)
+    score = np.where(graph.expanded, 0, mass * np.abs(state.outer - state.inner))
+    score = np.where(np.isfinite(score), score, mass)
+    if not (score > 0).any():
+        return False
+    done = 0
+    for depth in range(deepest + 1):
+        chosen = np.flatnonzero(score > 1e-12 * score.max())
+        chosen = chosen[np.argsort(-score[chosen], kind="stable")][: max(amount - done, 1)]
+        before = len(graph._rows["node"].parts)
+        size = graph.size
+        graph.expand(np.sort(chosen))
+        state.extend()
+        done += chosen.size
+        if done >= amount or depth == deepest:
+            break
+        # The children of the best action by the bounds of leaves.
+        mass = np.append(mass, np.zeros(graph.size - size))
+        score, mass = _below(state, chosen, mass, before)
+        if not (score > 0).any():
+            break
+    return True
+
+
+def _below(
+    state: Exploration, parents: Integers, mass: Floats, before: int
+) -> tuple[Floats, Floats]:
+    """Scores of the unexpanded successors of some nodes under their best actions."""
+    graph, problem = state.graph, state.problem
+    parts = {name: x.parts for name, x in graph._rows.items()}
+    first = before if len(parts["node"]) > before else 0
+    node, gain, lost, count = (
+        np.concatenate(parts[name][first:]) for name in ("node", "gain", "lost", "count")
+    )
+    to, by = (np.concatenate(x.parts[first:]) for x in (graph._to, graph._by))
+    row = np.arange(node.size).repeat(count)
+    value = gain + lost + np.bincount(row, by * state.outer[to], minlength=node.size)
+    order = np.lexsort((-value if problem.maximize else value, node))
+    best = np.zeros(node.size, bool)
+    best[order[np.append(True, node[order][1:] != node[order][:-1])]] = True
+    arriving = np.bincount(to[best[row]], (by * mass[node[row]])[best[row]], minlength=graph.size)
+    score = np.where(graph.expanded, 0, arriving * np.abs(state.outer - state.inner))
+    return np.where(np.isfinite(score), score, arriving), mass + arriving
