@@ -143,14 +143,33 @@ def pytest_collection_finish() -> None:
 
 
 _MAPS, _MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-_compiled = [0]
+_compiled, _all_compiled = [0], [0]
+PROGRAMS = 200  # that a file's default tests compile at most; one that needs more declares its own
 
 
 def _count(event: str, *_: object, **__: object) -> None:
-    _compiled[0] += event.endswith("backend_compile_duration")
+    is_program = event.endswith("backend_compile_duration")
+    _compiled[0] += is_program
+    _all_compiled[0] += is_program
 
 
 jax.monitoring.register_event_duration_secs_listener(_count)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def declared_programs(request: pytest.FixtureRequest):
+    """A file whose default tests compile more programs than it declares fails, with its last test.
+
+    Declared are some more than it compiles by itself: files before it leave it fewer.
+    """
+    before = _all_compiled[0]
+    yield
+    number, module = _all_compiled[0] - before, getattr(request.node, "obj", None)
+    most = getattr(module, "PROGRAMS", PROGRAMS)
+    assert number <= most or "not slow" not in request.config.option.markexpr, (
+        f"{request.node.nodeid} compiled {number} programs, of at most {most}: share shapes and jitted "
+        "functions, use NumPy outside of jit, or declare PROGRAMS in the file"
+    )
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -31,6 +31,8 @@ from jaxltl.core.types import Status
 from tests.algos.cases import LEARNERS, LearnerCase
 from tests.support import counted_traces, lane
 
+PROGRAMS = 300  # that the default tests compile at most
+
 
 @struct.dataclass
 class ToyState:

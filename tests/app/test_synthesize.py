@@ -15,6 +15,8 @@ from jaxltl.io.policies import load_policy
 from tests.support import replaced
 from tests.test_cli import failure, run
 
+PROGRAMS = 250  # that the default tests compile at most
+
 SQUARE = """
 [game]
 map = '''

@@ -34,6 +34,8 @@ from jaxltl.core.environments.task_environment import stack_tasks, task_environm
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from tests.reference_logic import random_formula
 
+PROGRAMS = 300  # that the default tests compile at most
+
 LEVEL = 1e-6
 
 

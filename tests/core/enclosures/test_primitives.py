@@ -12,6 +12,8 @@ from jax import lax
 from jaxltl.core.enclosures import primitives, program
 from jaxltl.core.enclosures.linear_bounds import enclose, linear_bounds, over_boxes
 
+PROGRAMS = 400  # that the default tests compile at most
+
 
 def unpacked(x):
     p, v = x

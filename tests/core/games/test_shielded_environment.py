@@ -26,6 +26,8 @@ from jaxltl.envs.robots import grid_game
 from tests import reference
 from tests.support import as_mdp, random_action
 
+PROGRAMS = 250  # that the default tests compile at most
+
 SAFE = "G !collision"
 OFTEN = "G !collision & G F (system_a | system_b)"
 

@@ -27,6 +27,8 @@ from tests.support import (
     stack,
 )
 
+PROGRAMS = 250  # that the default tests compile at most
+
 
 @dataclass(frozen=True)
 class Solver:

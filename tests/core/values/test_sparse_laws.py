@@ -29,6 +29,8 @@ from tests.support import (
     stack,
 )
 
+PROGRAMS = 250  # that the default tests compile at most
+
 COUNT = 9
 
 

@@ -13,6 +13,8 @@ from jaxltl.core.values.undiscounted import reaching
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.support import random_product
 
+PROGRAMS = 300  # that the default tests compile at most
+
 
 def cases(count, seed, num_memory=4):
     rng = np.random.default_rng(seed)
