@@ -35,11 +35,9 @@ CODES = {"uint32": "I", "uint64": "Q", "double64": "d"}  # of the module array
 # Keys and types of tables in the index; "?" marks optional keys. A formula is the name of a label
 # or a list of an operator and its operands.
 INDEX = "version:int producer:str numbers:str question:dict claims:list members:dict counts?:dict"
-POLICY = " policy?:str memory?:int next?:str"
-QUESTION = (
-    "text:str path:dict objective:str nature?:str environment?:str observations?:str" + POLICY
-)
-CLAIM = "side:str bound:str values:str" + POLICY
+RULE = " policy?:str memory?:int next?:str"
+QUESTION = "text:str path:dict objective:str nature?:str environment?:str observations?:str" + RULE
+CLAIM = "side:str bound:str values:str" + RULE
 COUNTS = "member:str method:str confidence:str assumption:str"
 PATHS = {
     "until": "kind:str target:str|list stay?:str|list steps?:int",
@@ -86,7 +84,7 @@ def read_archive(path: str, limit: int) -> dict[str, bytes]:
             if not info.isdir():
                 name, end = info.name.lstrip("./"), info.offset_data + info.size
                 is_whole = info.isreg() and not info.issparse() and end <= len(data)
-                is_whole = is_whole and name not in contents
+                is_whole = is_whole and name not in contents and info.size >= 0
                 need(is_whole, f"{name!r:.80} is cut off, no file, or there twice")
                 contents[name] = bytes(data[info.offset_data : end])
     return contents
@@ -584,7 +582,9 @@ class CertificateFile:
                 holds = all(x <= 0 or excludes(table["method"], i, n, x, chance) for i, x in tests)
                 hold(holds or end - begin == 1, f"row {r}: the counts allow more than an interval")
         self.confidence = f", with confidence {table['confidence']}"
-        self.trusted += f"the counts, and that {table['assumption']}"
+        fixed = "" if table["method"] == "anytime" else ", with sample sizes fixed in advance"
+        self.trusted = f"the counts{fixed}, that rows have no other successors"
+        self.trusted += f", and that {table['assumption']}"
 
 
 # --- the conditions -------------------------------------------------------------------------------
@@ -607,8 +607,7 @@ class ClaimChecker:
         sizes += [path["steps"] + 1] if "steps" in path else []
         hold(len(sizes) < 2, "two memories, or a memory and bounded steps, are not covered")
         self.counts, self.memory = "steps" in path, [*sizes, 1][0]
-        axes = [file.automaton.num_states] if file.automaton else []
-        axes += sizes
+        axes = [file.automaton.num_states, *sizes] if file.automaton else sizes
         shape, self.width = [states, *axes], math.prod(axes)
         self.values = file.array(claim["values"], double=shape, rational=shape)
         # A policy of the question knows states and memory alone, that of the claim nodes.
@@ -845,7 +844,8 @@ def verdict(path: str, limit: int = 2**30) -> tuple[int, list[str]]:
     except Exception as why:  # no error of any kind is an acceptance
         status, lines = 2, [f"not a certificate: {type(why).__name__}: {why}"]
     gc.enable()
-    return status, ["".join(c if c.isprintable() else "?" for c in line[:2000]) for line in lines]
+    most = 2000 if status else None  # a claim without its end is another claim
+    return status, ["".join(c if c.isprintable() else "?" for c in line[:most]) for line in lines]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -242,6 +242,26 @@ def test_archives_are_read_in_bounded_memory(tmp_path, capsys):
     assert main([str(path)]) == 0  # members that the index does not name are left alone
 
 
+def test_members_of_negative_size_are_refused(tmp_path, capsys):
+    """In some versions of Python they lead back to earlier bytes, which are then read again."""
+    path = write(tmp_path / "file.umb", {"more": b"", **GOOD}, compress=False)
+    data = bytearray(path.read_bytes())
+    data[124:136] = (2**96 - 512).to_bytes(12, "big")  # -512, as a binary number
+    data[148:156] = b" " * 8
+    data[148:156] = b"%06o\0 " % sum(data[:512])
+    path.write_bytes(data)
+    assert main([str(path)]) == 2
+    text = capsys.readouterr().out
+    assert "'more' is cut off" in text or "invalid offset" in text  # of this file, or of tarfile
+
+
+def test_long_claims_are_printed_to_their_end(tmp_path, capsys):
+    """The end of this number is an exponent."""
+    bound = "0." + "9" * 3000 + "e2"
+    status, text = outcome(tmp_path, capsys, five(bounds=("0.5", bound)))
+    assert status == 0 and f"is <= {bound} in every initial state" in text
+
+
 @pytest.mark.parametrize("cut", [1, 600, 3000])
 @pytest.mark.parametrize("compress", [True, False])
 def test_truncated_archives_are_no_certificates(cut, compress, tmp_path, capsys):
@@ -923,6 +943,7 @@ def test_intervals_contain_confidence_sets_of_counts(method, tmp_path, capsys):
     low, high = COIN[method]
     status, text = outcome(tmp_path, capsys, coin_file(method, low, high))
     assert status == 0 and "with confidence 0.95" in text and "there are no others" in text
+    assert ("fixed in advance" in text) == (method != "anytime")
     for ends in ((low + 0.001, high), (low, high - 0.001)):
         status, text = outcome(tmp_path, capsys, coin_file(method, *ends))
         assert status == 1 and "the counts allow more" in text, ends
