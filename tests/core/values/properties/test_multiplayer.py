@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from benchmarks.multiplayer import avoid, dice
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.types import Status
@@ -250,6 +251,25 @@ rewards "r" true : s; endrewards
 )  # fmt: skip
 def test_a_game_of_modules(text, value):
     check(game(RELAY), text, value)
+
+
+def test_games_of_the_literature():
+    """With one throw x > y in 15 of 36; with two, the first player keeps an x with (x-1)/6 > 55/216."""
+    assert jl.solve_property(dice(10), '<<one>> P>=0.5 [ F "one" ]').holds == [True]
+    check(dice(1), '<<one>> Pmax=? [ F "one" ]', "15/36")
+    check(dice(1), '<<two>> Pmax=? [ F "two" ]', "21/36")
+    check(dice(2), '<<one>> Pmax=? [ F "one" ]', "614/1296")
+    check(dice(2), '<<1>> P>=614/1296 [ F "one" ]', True)
+    check(dice(2), '<<1>> P>614/1296 [ F "one" ]', False)
+    check(dice(2), '<<two>> Pmin=? [ F "one" ]', "614/1296")
+    # One pursuer does not catch an intruder on a grid, whose cop number is two.
+    world = avoid(4)
+    assert world.num_states == 3636
+    check(world, "<<p2>> Pmax=? [ F caught ]", 0)
+    leaves = jl.solve_property(world, '<<p1>> Pmax=? [ F "exit" ]')
+    kept = jl.solve_property(world, '<<p2>> Pmax=? [ G !"exit" ]')
+    assert leaves.value[0] + kept.value[0] == pytest.approx(1, abs=1e-6)
+    assert 0.85 < leaves.value[0] < 0.87
 
 
 @pytest.mark.parametrize(
