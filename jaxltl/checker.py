@@ -577,6 +577,7 @@ class CertificateFile:
         for r, (begin, end) in enumerate(ends):
             low, common, high = self.model.rows[r][1:]
             n = sum(counts[begin:end])
+            need(n < 2**20, f"row {r} has over 2^20 samples")
             for k, a, b in zip(counts[begin:end], low, high or low):
                 tests = (k, Fraction(a, common)), (n - k, 1 - Fraction(b, common))
                 holds = all(x <= 0 or excludes(table["method"], i, n, x, chance) for i, x in tests)

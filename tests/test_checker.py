@@ -150,6 +150,111 @@ def test_forgeries_are_refused_for_their_reason(name, tmp_path, capsys):
     assert len(text.splitlines()) == 1
 
 
+LOOP, OTHER = [(0, 1.0)], [(1, 1.0)]
+FREE = [(0, (0.0, 1.0)), (1, (0.0, 1.0))]  # nature may stay in state 0
+HALVES = [(0, (0.25, 0.75)), (1, (0.25, 0.75))]
+RECUR = {"kind": "formula", "formula": ["G", ["F", "a"]], "automaton": "automaton"}
+# Of each: states, label of state 1 (for formulas of state 0), question, side, values, more, reason.
+CONDITIONS = {
+    "an end component under a minimum": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": UNTIL, "objective": "min"},
+        ("lower", [1.0, 1.0], {}),
+        "state 0: paths may stay forever",
+    ),
+    "a choice of the environment under a lower bound": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": UNTIL, "objective": "max", "environment": "adversarial"},
+        ("lower", [1.0, 1.0], {"policy": ("uint32", [2], [1, 0])}),
+        "state 0: paths may stay forever",
+    ),
+    "a distribution by which nature stays": (
+        [[FREE], [[(1, (1.0, 1.0))]]],
+        {"path": UNTIL, "objective": "max", "nature": "adversarial"},
+        ("lower", [0.5, 1.0], {}),
+        "state 0: paths may stay forever",
+    ),
+    "nature's best distribution in place of its worst": (
+        [[HALVES], [[(1, (1.0, 1.0))]], [[(2, (1.0, 1.0))]]],
+        {"path": {**UNTIL, "steps": 1}, "objective": "max", "nature": "adversarial"},
+        ("lower", [0.0, 0.5, 1.0, 1.0, 0.0, 0.0], {"shape": [3, 2]}),
+        "state 0, automaton",
+    ),
+    "a reward that misses the target": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": {"kind": "reward", "reward": "cost", "target": "goal"}, "objective": "max"},
+        ("upper", [9.0, 0.0], {"cost": [0.0, 0.0]}),
+        "state 0: paths may stay forever",
+    ),
+    "a total that never ends": (
+        [[LOOP], [OTHER]],
+        {"path": {"kind": "total", "reward": "cost"}, "objective": "max"},
+        ("upper", [9.0, 0.0], {}),
+        "state 0: the value",
+    ),
+    "an accepting component left out of an upper bound": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": RECUR, "objective": "max"},
+        ("upper", [0.5, 0.0], {"shape": [2, 1]}),
+        "state 0: the value",
+    ),
+    "a rejecting component under a lower bound": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": RECUR, "objective": "max"},
+        ("lower", [1.0, 0.0], {"shape": [2, 1], "policy": ("uint32", [2, 1], [1, 0])}),
+        "state 0: the value",
+    ),
+    "an automaton that differs on one lasso": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": {**RECUR, "formula": ["F", ["G", "a"]]}, "objective": "max"},
+        ("lower", [0.0, 0.0], {"shape": [2, 1]}),
+        "the automaton accepts a word that violates the formula",
+    ),
+    "a memory that the policy does not have": (
+        [[LOOP, OTHER], [OTHER]],
+        {"path": UNTIL, "objective": "max", "policy": "policy"},
+        ("lower", [1.0, 1.0], {"policy": ("uint32", [2], [0, 0])}),
+        "state 0: paths may stay forever",
+    ),
+    "weights of which the mean is worse": (
+        [[OTHER, [(2, 1.0)]], [OTHER], [[(2, 1.0)]]],
+        {"path": UNTIL, "objective": "max", "policy": "policy"},
+        ("lower", [0.75, 1.0, 0.0], {"policy": ("double", [4], [1.0, 1.0, 1.0, 1.0])}),
+        "state 0: the value",
+    ),
+    "a discount of 1": (
+        [[LOOP], [OTHER]],
+        {"path": {"kind": "total", "reward": "cost", "discount": "1"}, "objective": "max"},
+        ("upper", [9.0, 0.0], {}),
+        "the discount is 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_each_condition_is_needed(name, tmp_path, capsys):
+    states, question, (side, values, more), why = CONDITIONS[name]
+    question = {**question, "text": question_text(question)}
+    goal, owner = [1], [1] * len(states) if "environment" in question else None
+    labels = {"goal": goal, "a": [0]}
+    rewards = {"cost": {"states": more.get("cost", [1.0] + [0.0] * (len(states) - 1))}}
+    claim = {"side": side, "bound": str(Fraction(values[0])), "values": "values"}
+    claim |= {"policy": "policy"} if "policy" in more and "policy" not in question else {}
+    if "steps" in question["path"]:
+        claim["bound"] = "1/2"
+    arrays = {"values": ("double", more.get("shape", [len(values)]), values)}
+    arrays |= {"policy": more["policy"]} if "policy" in more else {}
+    made = certificate(
+        model(states, labels=labels, rewards=rewards, owner=owner),
+        question,
+        [claim],
+        arrays,
+        {"automaton": hoa("G F a")},
+    )
+    status, text = outcome(tmp_path, capsys, made)
+    assert status == 1 and why in text and len(text.splitlines()) == 1, text
+
+
 # --- damaged files ----------------------------------------------------------------------------
 
 
@@ -219,6 +324,30 @@ DAMAGED = {
             "path": {**UNTIL, "target": ["X", "goal"]},
             "text": 'Pmax=? [ F (X "goal") ]',
         },
+    ),
+    "a probability that is no number": {
+        **GOOD,
+        "branch-to-probability.bin": doubles([1.0, math.nan, *[1.0] * 8]),
+    },
+    "an infinite probability": {
+        **GOOD,
+        "branch-to-probability.bin": doubles([math.inf, *[1.0] * 9]),
+    },
+    "steps that lie": edited(
+        GOOD,
+        question={
+            **MAX,
+            "path": {**UNTIL, "steps": 2**60},
+            "text": f'Pmax=? [ F<={2**60} "goal" ]',
+        },
+    ),
+    "a memory that lies": edited(
+        GOOD, claims=[{**INDEX["claims"][0], "memory": 2**60, "next": "low"}]
+    ),
+    "a number that is none": edited(GOOD, version=math.nan),
+    "counts that lie": edited(
+        GOOD,
+        counts={"member": "low", "method": "anytime", "confidence": "0.9", "assumption": ""},
     ),
     "a formula that doubles": edited(
         GOOD,
@@ -949,6 +1078,9 @@ def test_intervals_contain_confidence_sets_of_counts(method, tmp_path, capsys):
         assert status == 1 and "the counts allow more" in text, ends
     assert outcome(tmp_path, capsys, coin_file(method, low, high, "0.96"))[0] == 1
     assert outcome(tmp_path, capsys, coin_file("guess", low, high))[0] == 2
+    huge = {**coin_file(method, low, high), "certificate/counts.bin": words([2**40, 10, 0, 0])}
+    status, text = outcome(tmp_path, capsys, huge)
+    assert status == 2 and "over 2^20 samples" in text
     index = json.loads(coin_file(method, low, high)["certificate/index.json"])
     question = {**index["question"], "nature": "cooperative", "text": 'Pmaxmax=? [ F "goal" ]'}
     status, text = outcome(tmp_path, capsys, coin_file(method, low, high, question=question))
