@@ -518,8 +518,8 @@ class CertificateFile:
         self.direction = {"system": objective}
         for player, exists in self.model.opponents.items():
             word = self.question.get(player)
-            known = ("adversarial", "cooperative") if exists else (None,)
-            need(word in known, f"{player} is {word!r:.40}, which does not fit the model")
+            fits = word in (("adversarial", "cooperative") if exists else (None,))
+            need(fits, f"{player} is {word!r:.40}, which does not fit the model")
             self.direction[player] = OTHER[objective] if word == "adversarial" else objective
         text = question_text(self.question)
         hold(self.question["text"] == text, f"the text of the question is not {text!r}")
@@ -571,7 +571,7 @@ class CertificateFile:
         confidence = to_fraction(table["confidence"])
         counts = self.array(table["member"], uint=[self.model.branch_start[-1]])
         need(0 < confidence < 1 and self.model.opponents["nature"], "counts are of intervals")
-        ends = [(a, b) for a, b in zip(self.model.branch_start, self.model.branch_start[1:])]
+        ends = [*zip(self.model.branch_start, self.model.branch_start[1:])]
         sizes = [b - a for a, b in ends if b - a > 1]
         chance = (1 - confidence) / max(1, sum(1 if n == 2 else n for n in sizes))
         for r, (begin, end) in enumerate(ends):
@@ -616,10 +616,8 @@ class ClaimChecker:
         rule, inner = (file.question, axes) if axes else (claim, shape[1:])
         self.next: Sequence = ()
         if "memory" in rule:
-            self.next, self.block = (
-                file.array(rule["next"], uint=[states, *inner]),
-                math.prod(inner),
-            )
+            self.next = file.array(rule["next"], uint=[states, *inner])
+            self.block = math.prod(inner)
         need(max(self.next, default=0) < self.memory, "a memory state is out of range")
         directions = file.direction["system"], file.direction["environment"], ""
         self.is_ours = [directions[owner] == ours for owner in self.model.owner]
