@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
 import os
 from collections.abc import Iterator
@@ -105,7 +107,7 @@ def write_certificate(
       ACCEPTED
       0
     """
-    with errors_in("write_certificate: "):
+    with errors_in("write_certificate: "), _no_collection():
         prop = parse_property(question)
         if isinstance(model, MultiplayerGame) and prop.coalition:
             model, prop = model.game(prop.coalition), replace(prop, coalition=None)
@@ -153,6 +155,18 @@ def write_certificate(
     contents["certificate/index.json"] = json.dumps(index, indent=1).encode()
     with write_bytes(path, None) as target:
         write_gzip(target, tar_pieces(list(contents.items())))
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without garbage collection, since the checker makes millions of tuples that are not cyclic."""
+    is_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if is_enabled:
+            gc.enable()
 
 
 def question_problem(

@@ -30,6 +30,7 @@ Values = Floats | list[Fraction]
 OPPOSITE = {"max": "min", "min": "max"}
 SHIFTS = (1, 8, 64, 4096)  # multiples of the largest violation by which bounds are widened
 _LARGEST_SHIFT = 1e-3  # relative; a larger violation means that the bounds are wrong
+_QUICK = 2000  # transitions below which bounds are tried even if they seem to be violated
 _LARGEST_EXACT = 60  # states that are solved in fractions
 TIGHT = 1e-6  # relative slack up to which rows count when bounds are widened
 
@@ -208,7 +209,8 @@ def candidates(
         x = np.clip(x, 0, 1)
     elif not signed:
         x = np.maximum(x, 0)
-    yield x
+    if problem.host.num_transitions < _QUICK:
+        yield x
     yield from _widened(problem, 1 if side == "upper" else -1, x, rows)
     if problem.host.num_states <= _LARGEST_EXACT and problem.uncertain is None:
         exact = _exact(problem, value, rows)
@@ -243,6 +245,8 @@ def _widened(problem: Certified, sign: int, x: Floats, rows: Integers) -> Iterat
     mean, p = problem.means(np.where(np.isfinite(x), x, 0.0))
     infinite = np.add.reduceat(p * ~np.isfinite(x[host.successor]), host.entry_start[:-1]) > 0
     slack = np.where(infinite, np.inf, sign * (x[host.state] - mean))
+    if host.num_transitions >= _QUICK and not (slack[used] < 0).any():
+        yield x
     scale = max(1.0, float(np.max(np.abs(x[np.isfinite(x)]), initial=0)))
     tight = np.flatnonzero(used & (slack < TIGHT * scale))
     place = np.full(host.num_states, -1)
