@@ -126,6 +126,30 @@ def test_what_tells_fingerprints_apart():
     assert one(x=nets[0]) == one(x=nets[2])
 
 
+def test_functions_are_told_apart_by_their_text_and_not_by_bytecode(tmp_path, monkeypatch):
+    """Bytecode changes with minor versions of Python."""
+
+    def module(name, text):
+        (tmp_path / f"{name}.py").write_text(text)
+        code = compile(text, str(tmp_path / f"{name}.py"), "exec")
+        names = {"__name__": "world"}
+        exec(code, names)
+        return {x: checkpoint.fingerprint(x=f) for x, f in names.items() if callable(f)}
+
+    first = "def step(x):\n    return x + 1\n"
+    second = "# moved\n\ndef step(x):\n    'Adds one.'\n    return (x +  1)  # here\n"
+    one, other = (
+        "pair = [lambda x: x + 1, lambda x: x + 2]\nfirst, second = pair\n",
+        "f = lambda x: 3\n",
+    )
+    assert module("a", first) == module("b", second)
+    assert module("a", first) != module("c", first.replace("1", "2"))
+    lambdas = module("d", one)
+    assert lambdas["first"] != lambdas["second"]
+    monkeypatch.setattr(checkpoint, "_constant", None)  # of bytecode
+    assert module("e", first) and module("f", other) == module("g", f"\n{other}")
+
+
 @pytest.mark.slow
 def test_another_process_finds_the_same_fingerprint():
     program = (

@@ -18,6 +18,7 @@ read onto any other mesh by any number of processes.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
@@ -27,6 +28,7 @@ import inspect
 import json
 import os
 import secrets
+import textwrap
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -184,7 +186,8 @@ def _data(leaf: jax.Array) -> jax.Array:
 def fingerprint(**parts: object) -> dict[str, str]:
     """A description of each of the `parts`: types, static fields, and arrays by a hash of their bytes.
 
-    Functions are described by their code, so that other processes find the same.
+    Functions are described by their text, so that other processes find the same, also of another
+    version of Python; where the text is not found, by their bytecode.
 
     >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))
     >>> sorted(one), [name for name in one if one[name] != two[name]]
@@ -244,8 +247,30 @@ def _function(name: str, value: types.FunctionType) -> Iterator[tuple[str, str]]
 
 
 def _code(code: types.CodeType) -> str:
+    """A hash of a function's text without comments and docstring, else of its bytecode."""
+    if (text := _source(code)) is not None:
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
     held = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
     return hashlib.sha256(code.co_code + repr((held, code.co_names)).encode()).hexdigest()[:16]
+
+
+def _source(code: types.CodeType) -> str | None:
+    """The formatted text of a function; None if it is not found, or one of several in a statement."""
+    try:
+        statement = ast.parse(textwrap.dedent(inspect.getsource(code))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):
+        return None
+    nodes = [
+        node
+        for node in ast.walk(statement)
+        if isinstance(node, ast.Lambda if code.co_name == "<lambda>" else ast.FunctionDef)
+        and getattr(node, "name", "<lambda>") == code.co_name
+    ]
+    if len(nodes) != 1:
+        return None
+    if isinstance(node := nodes[0], ast.FunctionDef) and ast.get_docstring(node) is not None:
+        node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(node)
 
 
 def _constant(value: object) -> str:
