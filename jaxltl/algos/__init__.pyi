@@ -4,6 +4,7 @@ from . import (
     common as common,
     expected_sarsa as expected_sarsa,
     feasible as feasible,
+    finite_state_controllers as finite_state_controllers,
     grounding as grounding,
     interval_learning as interval_learning,
     many_tasks as many_tasks,

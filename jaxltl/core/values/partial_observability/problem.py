@@ -131,6 +131,14 @@ def reward_problem(
     return _problem(pomdp, ~target, target, corner, reward, maximize=maximize)
 
 
+def discounted_problem(
+    pomdp: POMDP, reward: Floats, target: Booleans, *, maximize: bool
+) -> BeliefProblem:
+    """The states of a discounted reward ``float64[R]`` until a target is reached, without bounds."""
+    nothing = np.zeros(pomdp.num_states)
+    return _problem(pomdp, ~target, target, nothing, reward, maximize=maximize)
+
+
 def _problem(
     pomdp: POMDP,
     maybe: Booleans,

@@ -96,10 +96,10 @@ def belief_bounds(
     """
     pomdp = _require_pomdp(pomdp)
     model = pomdp.fully_observable
-    goal = _states(pomdp, "target", target)
+    goal = target_states(pomdp, "target", target)
     maximize = objective == "max"
     if reward is None:
-        within = None if stay is None else _states(pomdp, "stay", stay)
+        within = None if stay is None else target_states(pomdp, "stay", stay)
         problem = reach_problem(pomdp, goal, within, maximize=maximize)
     else:
         if maximize or stay is not None:
@@ -144,7 +144,7 @@ def _require_pomdp(pomdp: POMDP) -> POMDP:
     return pomdp
 
 
-def _states(pomdp: POMDP, name: str, states: Array | str) -> Booleans:
+def target_states(pomdp: POMDP, name: str, states: Array | str) -> Booleans:
     """A set of states ``bool[S]`` from a mask, a label or a formula of labels."""
     if isinstance(states, str):
         return states_satisfying(pomdp.fully_observable, states, name)
@@ -194,9 +194,9 @@ def controller_value(
         replace(pomdp, fully_observable=replace(model, rewards=earned)), policy
     )
     state = chain.valuation["state"]
-    goal = _states(pomdp, "target", target)[state]
+    goal = target_states(pomdp, "target", target)[state]
     if reward is None:
-        within = None if stay is None else _states(pomdp, "stay", stay)[state]
+        within = None if stay is None else target_states(pomdp, "stay", stay)[state]
         bounds = solver.reachability(
             chain.host, goal, maximize=True, stay=within, tolerance=tolerance, depth=4
         )

@@ -1,0 +1,358 @@
+"""Policy gradient for finite-state controllers of partially observable models (Meuleau et al. 1999).
+
+A controller of M memory states chooses action a with probability ``pi(a | m, o)``, and memory state m'
+with ``eta(m' | m, o')`` when it enters an observation o'; both are softmax tables. Its value is that of a
+chain of states and memory states,
+
+    v(m, s) = sum_a pi(a | m, o(s)) (g(s, a) + discount sum_t P(t | s, a) sum_n eta(n | m, o(t)) v(n, t)),
+
+which is solved, and differentiated implicitly. Many starts are a ``vmap`` over keys. The learned value
+certifies nothing; ``reachability_probability(pomdp, target, policy=...)`` or ``total_reward`` of the policy do.
+
+Example: a hidden coin; one guess, right in state 2. A look, which costs nothing, shows the coin.
+  >>> import jax, numpy as np, jaxltl as jl
+  >>> from jaxltl.algos import finite_state_controllers as fsc
+  >>> table = np.zeros((6, 3, 6))  # heads, tails, right, wrong, heads seen, tails seen
+  >>> table[0, :, [3, 2, 4]] = table[1, :, [2, 3, 5]] = np.eye(3)
+  >>> table[4, :, [3, 2, 0]] = table[5, :, [2, 3, 1]] = np.eye(3)
+  >>> table[[2, 3], :, [2, 3]] = 1
+  >>> world = jl.from_dense(table, initial=[0.5, 0.5, 0, 0, 0, 0], label={"right": [2]})
+  >>> coin = jl.models.make_pomdp(world, [0, 0, 1, 1, 2, 3])
+  >>> problem = fsc.make_problem(coin, "right")
+  >>> hparams = fsc.Hparams(learning_rate=0.5)
+  >>> starts = jax.random.split(jax.random.key(0), 4)
+  >>> train = jax.vmap(lambda key: fsc.train(key, problem, hparams, num_steps=100))
+  >>> state, metrics = train(starts)
+  >>> best = jax.tree.map(lambda x: x[metrics.value[:, -1].argmax()], state)
+  >>> policy = fsc.policy(best, problem, hparams)
+  >>> bool(jl.reachability_probability(coin, "right", policy=policy).lower > 0.9)
+  True
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+
+from jaxltl.algos.common import learner, optimizers
+from jaxltl.algos.common.settings import Number, RunState, static, traced
+from jaxltl.core import struct
+from jaxltl.core.models.pomdp import POMDP
+from jaxltl.core.models.protocols import Array, Key
+from jaxltl.core.models.sparse import Reward, choice_reward
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
+from jaxltl.core.validation import Range, choice, require_in_range
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.linear import solve_linear
+from jaxltl.core.values.partial_observability.problem import (
+    BeliefProblem,
+    discounted_problem,
+    reach_problem,
+    reward_problem,
+)
+from jaxltl.core.values.partial_observability.solve import target_states
+
+
+@struct.dataclass
+class Problem:
+    """The value of controllers of a POMDP, on its undecided states, N of them.
+
+    Attributes:
+      successor, probability: ``int32[N, A, K]`` and ``float[N, A, K]``, of undecided successors.
+      gain: ``float[N, A]``, the probability of entering the target, or the reward.
+      observation: ``int32[N]``.
+      available: ``bool[O, A]``.
+      initial: ``float[N]``, the initial belief.
+      initial_gain: ``float[]``, its probability of the target.
+      discount: ``float[]``.
+      sign: 1 for a maximum, -1 for a minimum; static.
+    """
+
+    successor: jax.Array
+    probability: jax.Array
+    gain: jax.Array
+    observation: jax.Array
+    available: jax.Array
+    initial: jax.Array
+    initial_gain: jax.Array
+    discount: jax.Array
+    sign: int = struct.field(pytree_node=False, default=1)
+
+
+def make_problem(
+    pomdp: POMDP,
+    target: Array | str | None = None,
+    *,
+    stay: Array | str | None = None,
+    reward: Reward = None,
+    discount: float | None = None,
+    objective: str = "max",
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      pomdp: a concrete POMDP.
+      target: ``bool[S]``, a label or a formula of labels. Without a reward, the value is the probability
+        of reaching it.
+      stay: the states through which it must be reached.
+      reward: earned until the target, or with a discount for ever; rewards and names as of
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
+      discount: of rewards, below 1; default: none, for which every reachable state must be able to reach
+        the target.
+      objective: ``"max"`` or ``"min"``.
+
+    Raises:
+      ValueError: neither a target nor a discounted reward, or a state that cannot reach the target of an
+        undiscounted reward.
+    """
+    choice("objective", objective, ("max", "min"))
+    maximize = objective == "max"
+    if reward is None:
+        if target is None or discount is not None:
+            raise ValueError(
+                "make_problem: give a target, or a reward with its discount or its target."
+            )
+        within = None if stay is None else target_states(pomdp, "stay", stay)
+        goal = target_states(pomdp, "target", target)
+        return _arrays(reach_problem(pomdp, goal, within, maximize=maximize), 1.0)
+    earned = choice_reward(pomdp.fully_observable, reward)
+    if stay is not None:
+        raise ValueError("make_problem: stay is for probabilities; leave it out with a reward.")
+    if discount is not None:
+        require_in_range("discount", discount)
+        goal = np.zeros(pomdp.num_states, bool)
+        goal = goal if target is None else target_states(pomdp, "target", target)
+        return _arrays(discounted_problem(pomdp, earned, goal, maximize=maximize), discount)
+    if target is None:
+        raise ValueError("make_problem: target is None; total rewards need a target or a discount.")
+    problem = reward_problem(pomdp, earned, target_states(pomdp, "target", target), maximize=False)
+    if problem.has_infinite:
+        raise ValueError(
+            "make_problem: some reachable state cannot reach the target almost surely, so that rewards of "
+            "softmax controllers are infinite; give a discount."
+        )
+    return replace(_arrays(problem, 1.0), sign=1 if maximize else -1)
+
+
+def _arrays(problem: BeliefProblem, discount: float) -> Problem:
+    count = [np.diff(t.indptr) for t in problem.transition]
+    width = max([1, *(int(c.max(initial=0)) for c in count)])
+    shape = problem.num_states, len(problem.transition), width
+    successor, probability = np.zeros(shape, np.int32), np.zeros(shape)
+    for a, (matrix, number) in enumerate(zip(problem.transition, count, strict=True)):
+        row = np.arange(problem.num_states).repeat(number)
+        place = np.arange(row.size) - matrix.indptr[row]
+        successor[row, a, place], probability[row, a, place] = matrix.indices, matrix.data
+    dtype = jnp.result_type(float)
+    legal = problem.available | ~problem.available.any(1, keepdims=True)
+    return Problem(
+        successor=jnp.asarray(successor),
+        probability=jnp.asarray(probability, dtype),
+        gain=jnp.asarray(problem.gain.T, dtype),
+        observation=jnp.asarray(problem.observation, jnp.int32),
+        available=jnp.asarray(legal),
+        initial=jnp.asarray(problem.initial, dtype),
+        initial_gain=jnp.asarray(problem.initial_gain, dtype),
+        discount=jnp.asarray(discount, dtype),
+        sign=1 if problem.maximize else -1,
+    )
+
+
+class ControllerLogits(NamedTuple):
+    """Logits of a controller.
+
+    Attributes:
+      action: ``float[M, O, A]``.
+      update: ``float[M, O, M]``, of the next memory state by the observation that is entered.
+
+    >>> ControllerLogits(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 1))).action.shape
+    (1, 2, 3)
+    """
+
+    action: jax.Array
+    update: jax.Array
+
+
+@struct.dataclass
+class Hparams:
+    """Settings of the learner.
+
+    Attributes:
+      learning_rate: of the optimizer; default 0.1.
+      scale: standard deviation of the initial logits; default 0.5.
+      num_memory: memory states; static, default 1.
+      optimizer: the name of one of optax; static, default ``"adam"``.
+    """
+
+    learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
+    scale: Number = traced(Range(0, open_above=True), default=0.5)
+    num_memory: int = static(Range(1, 1000, integer=True), default=1)
+    optimizer: str = static((*optimizers.NAMES, "sign"), default="adam")
+
+
+@struct.dataclass
+class State(RunState):
+    """A controller in training.
+
+    Attributes:
+      parameters: :class:`ControllerLogits`.
+      optimizer: optax's state.
+    """
+
+    parameters: ControllerLogits
+    optimizer: optax.OptState
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of the controller before a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      value: from the initial belief.
+      gradient_norm: of the value in the logits.
+      status: COMPLETED, or NONFINITE.
+    """
+
+    value: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+def controller_value(problem: Problem, parameters: ControllerLogits) -> jax.Array:
+    """The value of a softmax controller from the initial belief, with implicit derivatives.
+
+    Args:
+      problem: of :func:`make_problem`.
+      parameters: the logits; the value is differentiable in them, and in the arrays of the problem.
+
+    Returns:
+      ``float[]``, without a certificate.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> world = jl.from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]],
+      ...                       initial=[1, 0, 0], label={"a": [1]})
+      >>> problem = make_problem(jl.models.make_pomdp(world, [0, 0, 0]), "a")
+      >>> round(float(controller_value(problem, ControllerLogits(jnp.zeros((1, 1, 1)), jnp.zeros((1, 1, 1))))), 6)
+      0.5
+    """
+    seen, discount = problem.observation, problem.discount
+    act = jax.nn.softmax(jnp.where(problem.available, parameters.action, -jnp.inf))[:, seen]
+    keep = jax.nn.softmax(parameters.update)[:, seen]
+    earned = jnp.sum(act * problem.gain, -1)
+
+    def operator(value: jax.Array) -> jax.Array:
+        entering = jnp.einsum("mnk,kn->mn", keep, value)
+        after = jnp.sum(problem.probability * entering[:, problem.successor], -1)
+        return earned + discount * jnp.sum(act * after, -1)
+
+    def residual(x: jax.Array) -> jax.Array:
+        return x - (operator(x) - earned)
+
+    solved = lax.stop_gradient(solve_linear(residual, earned))
+    value = implicit(operator, solved)
+    return problem.initial_gain + jnp.sum(problem.initial * value[0])
+
+
+def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
+    """Normal logits."""
+    first, second = jax.random.split(learner.init_key(key))
+    num_memory, count = hparams.num_memory, problem.available.shape[0]
+    dtype = problem.gain.dtype
+    action = jax.random.normal(first, (num_memory, *problem.available.shape), dtype)
+    update = jax.random.normal(second, (num_memory, count, num_memory), dtype)
+    parameters = ControllerLogits(hparams.scale * action, hparams.scale * update)
+    return start_at(key, parameters, problem, hparams)
+
+
+def start_at(key: Key, parameters: ControllerLogits, problem: Problem, hparams: Hparams) -> State:
+    """A :class:`State` at given logits, such as those of :func:`logits_of`; ``init`` draws them.
+
+    Args:
+      key: random key, which the state keeps.
+      parameters: the logits.
+      problem, hparams: as for ``init``.
+
+    Returns:
+      :class:`State`.
+
+    Example:
+      >>> parameters = ControllerLogits(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 1)))
+      >>> start_at(jax.random.key(0), parameters, None, Hparams()).step.item()
+      0
+    """
+    del problem
+    return State(key, jnp.int32(0), parameters, optimizers.start(hparams, parameters))
+
+
+def logits_of(
+    policy: FiniteMemoryPolicy, problem: Problem, least: float = 1e-2
+) -> ControllerLogits:
+    """Logits of a finite-memory policy over observations, with at least the weight `least` for each choice.
+
+    Args:
+      policy: such as that of :func:`~jaxltl.core.values.partial_observability.solve.belief_bounds`, for a
+        start from explored beliefs.
+      problem: of the same POMDP.
+      least: the least weight, before normalisation.
+
+    Returns:
+      :class:`ControllerLogits`, for :func:`start_at`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [0, 1.0]]], label={"a": [1]})
+      >>> problem = make_problem(jl.models.make_pomdp(world, [0, 0]), "a")
+      >>> policy = jl.FiniteMemoryPolicy(np.array([[0]]), np.array([0]), np.array([[0]]))
+      >>> logits_of(policy, problem).action.round().tolist()
+      [[[0.0, -5.0]]]
+    """
+    available = np.asarray(problem.available)
+    action = np.asarray(policy.action)
+    if not policy.is_random:
+        action = np.eye(available.shape[1])[action]
+    update = np.asarray(policy.next_memory)
+    memory = np.eye(update.shape[1])[update]
+    weights = (np.log(np.maximum(x, least)).swapaxes(0, 1) for x in (action, memory))
+    dtype = problem.gain.dtype
+    first, second = (jnp.asarray(x, dtype) for x in weights)
+    return ControllerLogits(first, second)
+
+
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """A gradient step."""
+
+    def loss(parameters: ControllerLogits) -> tuple[jax.Array, None]:
+        return -problem.sign * controller_value(problem, parameters), None
+
+    moved = optimizers.descend(loss, state, hparams)
+    finite = jnp.isfinite(moved.loss) & jnp.isfinite(moved.gradient_norm)
+    metrics = Metrics(
+        value=-problem.sign * moved.loss,
+        gradient_norm=moved.gradient_norm,
+        status=learner.completion_status(jnp.bool_(True), finite),
+    )
+    after = State(state.key, state.step + 1, moved.parameters, moved.optimizer)
+    return after, metrics
+
+
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> FiniteMemoryPolicy:
+    """The finite-memory policy over observations: random actions, and the likeliest memory updates.
+
+    ``int[O, M]`` updates on entry, from memory state 0; on the host.
+    """
+    del hparams
+    logits = jnp.where(problem.available, state.parameters.action, -jnp.inf)
+    action = np.asarray(jax.nn.softmax(logits), np.float64).swapaxes(0, 1)
+    action = action / action.sum(-1, keepdims=True)
+    update = np.asarray(state.parameters.update).argmax(-1).T.astype(np.int32)
+    return FiniteMemoryPolicy(action, np.zeros(len(action), np.int32), update)
