@@ -26,6 +26,15 @@ def counts(few: int, many: int) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.exhaustive)])
 
 
+def seeds(few: int, slow: int, many: int) -> list[Any]:
+    """Seeds of a law: few by default, up to `slow` with ``-m slow``, many with the exhaustive ones."""
+    return [
+        *range(few),
+        *(pytest.param(i, marks=pytest.mark.slow) for i in range(few, slow)),
+        *(pytest.param(i, marks=pytest.mark.exhaustive) for i in range(slow, many)),
+    ]
+
+
 def as_mdp(model: reference.Model, **labels: Any) -> MDP:
     """The library's model of a reference model."""
     return make_mdp(

@@ -10,6 +10,7 @@ from jaxltl.app.guarantee import GuaranteeSearch
 from jaxltl.app.protocols import Training
 from jaxltl.core.values.undiscounted import mixture
 from jaxltl.core.values.undiscounted.optimum import policy_reachability
+from tests.support import seeds
 
 
 def check_case(case, place, monkeypatch):
@@ -57,8 +58,7 @@ def test_where_no_reward_attains_a_probability_none_is_searched(tmp_path):
     assert found.share == 1 and found.attained >= patrol.probability
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", range(50))
+@pytest.mark.parametrize("number", seeds(0, 10, 50))
 def test_the_search_ends_on_random_maps(number, tmp_path, monkeypatch):
     check_case(cases(number + 1)[number], tmp_path, monkeypatch)
 

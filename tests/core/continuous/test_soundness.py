@@ -33,6 +33,7 @@ from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.task_environment import stack_tasks, task_environment
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from tests.reference_logic import random_formula
+from tests.support import seeds
 
 PROGRAMS = 300  # that the default tests compile at most
 
@@ -405,8 +406,7 @@ def test_leaving_the_domain_means_what_outside_says(case):
     assert check_leaving(case, TASKS) > 0.4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", seeds(0, 8, 24))
 def test_random_formulas_where_runs_leave_the_domain(seed):
     chooser = random.Random(seed)
     case = list(leaving_cases())[seed]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +21,13 @@ WIDTH = 1e-5
     [
         ("satisfaction", "!b U a", 2),
         *(
-            pytest.param(question, formula, 10, marks=pytest.mark.slow)
-            for question in lanes.QUESTIONS
-            for formula in lanes.FORMULAS
+            pytest.param(
+                question,
+                formula,
+                10,
+                marks=pytest.mark.exhaustive if (i // 4 - i) % 4 else pytest.mark.slow,
+            )
+            for i, (question, formula) in enumerate(product(lanes.QUESTIONS, lanes.FORMULAS))
         ),
     ],
 )

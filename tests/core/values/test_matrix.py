@@ -22,6 +22,7 @@ import jaxltl as jl
 from jaxltl.core.types import Status
 from tests import reference_matrix as reference
 from tests.model_kinds import KINDS, Subject
+from tests.support import seeds
 
 DISCOUNT, STEPS, RELATIVE = 0.75, 3, 1e-8
 BUDGET, UNIT = 3.0, 0.25  # of rewards that are at least one unit
@@ -549,6 +550,15 @@ def case_of(kind) -> str:
 
 
 every_kind = pytest.mark.parametrize("kind", KINDS, ids=case_of)
+# Each question is compiled for each kind, half a minute for a kind: others with the exhaustive tests.
+some_kinds = pytest.mark.parametrize(
+    "kind",
+    [
+        x if i % 3 == 1 else pytest.param(x, marks=pytest.mark.exhaustive)
+        for i, x in enumerate(KINDS)
+    ],
+    ids=case_of,
+)
 
 
 def test_the_tables_have_all_questions_and_kinds():
@@ -559,15 +569,13 @@ def test_the_tables_have_all_questions_and_kinds():
 
 
 @every_kind
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(1, 9))]
-)
+@pytest.mark.parametrize("seed", seeds(1, 4, 9))
 def test_questions_on_the_host_are_answered_rightly_or_refused(kind, seed):
     check(kind, on_host(kind), CONCRETE, np.random.default_rng([seed, KINDS.index(kind)]))
 
 
 @pytest.mark.slow
-@every_kind
+@some_kinds
 def test_questions_for_compiled_programs_are_answered_rightly_or_refused(kind):
     names = [name for name in QUESTIONS if is_compiled(name, kind[0])]
     check(kind, names, CONCRETE, np.random.default_rng(KINDS.index(kind)))
@@ -591,7 +599,7 @@ def test_traced_models_are_refused_by_a_value_error(kind):
 
 
 @pytest.mark.slow
-@every_kind
+@some_kinds
 def test_traced_models_are_answered_rightly(kind):
     names = [name for name in QUESTIONS if name not in refusals(kind)]
     check(kind, names, TRACED, np.random.default_rng(KINDS.index(kind)), jax.jit)

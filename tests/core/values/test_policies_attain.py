@@ -7,6 +7,7 @@ import jaxltl as jl
 from jaxltl.core.types import Status
 from tests import reference_matrix as reference
 from tests.model_kinds import KINDS, Subject
+from tests.support import seeds
 
 HOST = [kind for kind in KINDS if kind[0] not in ("chain", "instance")]
 ASKS = {
@@ -16,9 +17,7 @@ ASKS = {
 }
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(1, 20))]
-)
+@pytest.mark.parametrize("seed", seeds(1, 4, 20))
 @pytest.mark.parametrize("kind", HOST, ids=lambda kind: "-".join(map(str, kind)))
 def test_policies_attain_the_optimum(kind, seed):
     rng = np.random.default_rng([seed, KINDS.index(kind)])

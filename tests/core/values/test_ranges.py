@@ -7,6 +7,7 @@ import jaxltl as jl
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.values.properties.solve_property import solve_property
+from tests.support import seeds
 
 PROPERTIES = (
     *(("P", x) for x in ('X "a"', 'F "a"', '"c" U "a"', 'G !"a"', '"c" W "b"', '"b" R "c"')),
@@ -86,7 +87,7 @@ def require_range(found, span, place):
         assert not tiny or "=200" in str(place), place
 
 
-SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 40))]
+SEEDS = seeds(2, 8, 40)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -9,6 +9,7 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.multi_objective import Objective, multi_objective
 from tests.reference_multi_objective import Question, Unfolded, answer
+from tests.support import seeds
 
 SPLITS = [  # doubles mean themselves, divided by their sum
     tuple(Fraction(x) / (Fraction(x) + Fraction(y)) for x, y in pair)
@@ -66,8 +67,7 @@ def thresholds(rng, unfolded, index):
     return [None if i == index else x for i, x in enumerate(mixed)]
 
 
-@pytest.mark.few(40)
-@pytest.mark.parametrize("seed", range(400))
+@pytest.mark.parametrize("seed", seeds(30, 80, 400))
 def test_answers_are_those_of_mixtures_of_policies(seed):
     rng = np.random.default_rng(seed)
     model, size, rows, questions = random_case(rng)

@@ -18,6 +18,7 @@ from jaxltl.core.sparse.exact.bounded import until_at_cost, until_within
 from jaxltl.core.sparse.exact.model import ExactMDP, TooLarge, Work
 from jaxltl.core.values.properties.solve_property import solve_property
 from tests import reference_thresholds as reference
+from tests.support import seeds
 
 TEXTS = {  # ways to write probabilities of one row
     "thirds": ("1/3", "2/3"),
@@ -205,7 +206,7 @@ def require_verdicts(model, rows, cost, parse, relations):
                     assert 0 <= answer.lower[0] <= answer.value[0] <= answer.upper[0]
 
 
-SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 40))]
+SEEDS = seeds(1, 6, 40)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -12,6 +12,7 @@ from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties.solve_property import solve_property
 from tests.sparse_models import exact_solve
+from tests.support import seeds
 
 TOLERANCE = 1e-6
 OBJECTIVES = "max", "min"
@@ -205,8 +206,7 @@ def test_converged_bounds_are_as_narrow_as_a_share_of_the_value(seed):
         assert good == many
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 60))
+@pytest.mark.parametrize("seed", seeds(2, 12, 60)[2:])
 def test_converged_bounds_are_as_narrow_in_more_models(seed):
     many, good = require_relative_widths(tiny_model(seed, 5 + seed % 3, chain=seed % 4 == 0))
     assert good == many
