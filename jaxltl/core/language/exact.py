@@ -1,20 +1,19 @@
-"""Programs in rational arithmetic: literals, quotients and constants as they are written."""
+"""Expressions in rational arithmetic: literals, quotients and constants as they are written."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from fractions import Fraction
 
 from jaxltl.core.language.expressions import Expression, LanguageError, literal, substitute
 from jaxltl.core.language.parser import ExpressionParser
-from jaxltl.core.language.resolve import changed, resolved
-from jaxltl.core.language.syntax import Program, Syntax
 
 _NUMBER = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _MAX_EXPONENT = 400  # of a decimal, as many digits as a double needs
 _ONE = literal(Fraction(1))
+_TOO_LARGE = 2**31  # of integers on arrays in single precision
 _DENOMINATOR = 10**6  # of a double that is given for a constant
 
 
@@ -28,17 +27,18 @@ def exact_tree(expression: Expression, text: str = "") -> Expression:
     >>> substitute(exact_tree(ExpressionParser("0.1 + 1/3").whole(), "0.1 + 1/3"), {}).value
     Fraction(13, 30)
     """
-    return _exact_tree(expression, text, {})
+    return shared_exact_tree(expression, text, {})
 
 
-def _exact_tree(e: Expression, text: str, memory: dict[int, Expression]) -> Expression:
+def shared_exact_tree(e: Expression, text: str, memory: dict[int, Expression]) -> Expression:
+    """The same with results by node, for trees that share nodes and stay alive."""
     if (result := memory.get(id(e))) is not None:
         return result
     result = e
     if isinstance(e.value, float) and e.is_literal:
         result = literal(_written(e.value, text, e.place), e.place)
     elif e.operands:
-        operands = tuple([_exact_tree(x, text, memory) for x in e.operands])
+        operands = tuple([shared_exact_tree(x, text, memory) for x in e.operands])
         if e.operator == "/":
             operands = (Expression("*", (_ONE, operands[0]), place=e.place), operands[1])
         result = Expression(e.operator, operands, e.value, e.place)
@@ -96,56 +96,72 @@ def exact_constant(value: object) -> bool | int | Fraction:
     return simple if float(simple) == value else Fraction(repr(value))
 
 
-def exact_program(program: Program) -> Program | None:
-    """The program with its probabilities and rewards folded in rational arithmetic.
+Monomials = dict[tuple[str, ...], Fraction]  # coefficients by the variables that are multiplied
 
-    Guards and updates are those of the program, so that both have the same states. None if the
-    program has no syntax tree, or is not resolved in fractions.
+
+def exact_comparisons(e: Expression, largest: Mapping[str, int]) -> Expression:
+    """The tree of :func:`exact_tree` with comparisons of polynomials in integers in place of fractions.
+
+    Both sides are multiplied by a common denominator. `largest` has the largest absolute value of each
+    integer variable; comparisons whose terms may exceed 2^31 are left as they are, in doubles.
     """
-    if program.syntax is None:
+    left, right = None, None
+    if e.operator in ("<", "<=", ">", ">=", "=", "!="):
+        left, right = (_polynomial(x) for x in e.operands)
+    if left is not None and right is not None:
+        terms = dict(left)
+        for key, c in right.items():
+            terms[key] = terms.get(key, Fraction(0)) - c
+        scale = math.lcm(*(c.denominator for c in terms.values()))
+        whole: dict[tuple[str, ...], int] = {key: int(c * scale) for key, c in terms.items() if c}
+        bounds = [
+            abs(c) * math.prod(largest.get(n, _TOO_LARGE) for n in k) for k, c in whole.items()
+        ]
+        if sum(bounds) >= _TOO_LARGE:
+            return e
+        constant = -whole.pop((), 0)
+        products = []
+        for key, count in whole.items():
+            factors = (literal(count), *(Expression("name", value=n, place=e.place) for n in key))
+            products.append(Expression("*", factors, place=e.place))
+        total = (
+            products[0] if len(products) == 1 else Expression("+", tuple(products), place=e.place)
+        )
+        if not products:
+            total = literal(0, e.place)
+        return substitute(Expression(e.operator, (total, literal(constant)), place=e.place), {})
+    if not e.operands or not is_inexact(e):
+        return e
+    operands = tuple(exact_comparisons(x, largest) for x in e.operands)
+    return Expression(e.operator, operands, e.value, e.place)
+
+
+def _polynomial(e: Expression) -> Monomials | None:
+    """The coefficients of a polynomial in names; None for other expressions and for Booleans."""
+    if e.is_literal:
+        number = isinstance(e.value, int | Fraction) and not isinstance(e.value, bool)
+        return {(): Fraction(e.value)} if number else None  # type: ignore[arg-type]
+    if e.operator == "name":
+        return {(str(e.value),): Fraction(1)}
+    if e.operator not in ("+", "-", "neg", "*", "/"):
         return None
-    try:
-        values = {name: exact_constant(x) for name, x in program.arguments.items()}
-        exact = resolved(_exact_syntax(program.syntax), values, real=Fraction)
-        modules = []
-        for m, other in zip(program.modules, exact.modules, strict=True):
-            commands = []
-            for c, d in zip(m.commands, other.commands, strict=True):
-                outcomes = [
-                    replace(o, probability=p.probability)
-                    for o, p in zip(c.outcomes, d.outcomes, strict=True)
-                ]
-                commands.append(replace(c, outcomes=tuple(outcomes)))
-            modules.append(replace(m, commands=tuple(commands)))
-        rewards = []
-        for r, s in zip(program.rewards, exact.rewards, strict=True):
-            items = [replace(i, value=j.value) for i, j in zip(r.items, s.items, strict=True)]
-            rewards.append(replace(r, items=tuple(items)))
-    except (ValueError, ArithmeticError, TypeError):
-        return None
-    return replace(
-        program,
-        modules=tuple(modules),
-        rewards=tuple(rewards),
-        constants=exact.constants,
-        formulas=exact.formulas,
-    )
-
-
-def _exact_syntax(syntax: Syntax) -> Syntax:
-    memory: dict[int, Expression] = {}
-    text = syntax.source.text
-
-    def change(e: Expression) -> Expression:
-        return _exact_tree(e, text, memory)
-
-    return replace(
-        syntax,
-        constants=list(changed(tuple(syntax.constants), change)),
-        formulas=list(changed(tuple(syntax.formulas), change)),
-        variables=list(changed(tuple(syntax.variables), change)),
-        modules=list(changed(tuple(syntax.modules), change)),
-        labels=list(changed(tuple(syntax.labels), change)),
-        rewards=list(changed(tuple(syntax.rewards), change)),
-        initial=None if syntax.initial is None else change(syntax.initial),
-    )
+    parts = [_polynomial(x) for x in e.operands]
+    total: Monomials = {}
+    for i, part in enumerate(parts):
+        if part is None:
+            return None
+        if e.operator in ("*", "/") and i:
+            if e.operator == "/":
+                if part.keys() != {()} or not part[()]:
+                    return None
+                part = {(): 1 / part[()]}
+            pairs = [(j, k, c * d) for j, c in total.items() for k, d in part.items()]
+            total = {}
+            for j, k, c in pairs:
+                key = tuple(sorted(j + k))
+                total[key] = total.get(key, Fraction(0)) + c
+            continue
+        sign = -1 if e.operator == "neg" or (e.operator == "-" and i) else 1
+        for key, c in part.items():
+            total[key] = total.get(key, Fraction(0)) + sign * c
+    return total

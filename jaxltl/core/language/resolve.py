@@ -10,6 +10,12 @@ from fractions import Fraction
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeVar, cast
 
+from jaxltl.core.language.exact import (
+    exact_comparisons,
+    exact_constant,
+    is_inexact,
+    shared_exact_tree,
+)
 from jaxltl.core.language.expressions import (
     Expression,
     LanguageError,
@@ -62,6 +68,8 @@ def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Pr
     values = {key: constant_value(key, value) for key, value in (constants or {}).items()}
     try:
         program = resolved(syntax, values)
+        if _has_inexact_guards(syntax):
+            program = _with_exact_guards(program, syntax, constants or {})
     except LanguageError as error:
         raise syntax.source.located(error) from None
     return replace(program, syntax=syntax, arguments=dict(constants or {}))
@@ -72,6 +80,81 @@ def resolved(
 ) -> Program:
     """The program of a syntax tree, whose integers become `real` in constants of type double."""
     return _Resolver(syntax, values, real).program()
+
+
+def exact_syntax(syntax: Syntax) -> Syntax:
+    """The syntax tree with all literals and quotients as fractions."""
+    memory: dict[int, Expression] = {}
+    text = syntax.source.text
+
+    def change(e: Expression) -> Expression:
+        return shared_exact_tree(e, text, memory)
+
+    return replace(
+        syntax,
+        constants=list(changed(tuple(syntax.constants), change)),
+        formulas=list(changed(tuple(syntax.formulas), change)),
+        variables=list(changed(tuple(syntax.variables), change)),
+        modules=list(changed(tuple(syntax.modules), change)),
+        labels=list(changed(tuple(syntax.labels), change)),
+        rewards=list(changed(tuple(syntax.rewards), change)),
+        initial=None if syntax.initial is None else change(syntax.initial),
+    )
+
+
+def _has_inexact_guards(syntax: Syntax) -> bool:
+    """True if guards or labels have quotients or decimals, which doubles may compare wrongly."""
+    tables = [(c.name, c.expression) for c in syntax.constants if c.type == "double"]
+    inexact = {name for name, e in tables if e is None or is_inexact(e)}
+    inexact |= {c.name for c in syntax.constants if c.expression and is_inexact(c.expression)}
+    inexact |= {name for name, e in syntax.formulas if is_inexact(e)}
+    modules = [m for m in syntax.modules if isinstance(m, Module)]
+    conditions = [c.guard for m in modules for c in m.commands] + [e for _, e in syntax.labels]
+    conditions += [e for _, e in syntax.formulas] + [e for e in [syntax.initial] if e is not None]
+    conditions += [i.guard for r in syntax.rewards for i in r.items]
+    return any(is_inexact(e) or names_in(e) & inexact for e in conditions)
+
+
+def _with_exact_guards(
+    program: Program, syntax: Syntax, constants: Mapping[str, object]
+) -> Program:
+    """The program with guards, labels and formulas compared in rational arithmetic, where that is possible."""
+    try:
+        values = {name: exact_constant(x) for name, x in constants.items()}
+        exact = resolved(exact_syntax(syntax), values, real=Fraction)
+    except (ValueError, ArithmeticError, TypeError):
+        return program
+    largest = {v.name: max(abs(v.low), abs(v.high)) for v in program.variables if v.type == "int"}
+
+    def compared(e: Expression, rational: Expression) -> Expression:
+        whole = exact_comparisons(rational, largest)
+        return e if is_inexact(whole) else whole
+
+    modules = tuple(
+        replace(
+            m,
+            commands=tuple(
+                replace(c, guard=compared(c.guard, d.guard))
+                for c, d in zip(m.commands, n.commands, strict=True)
+            ),
+        )
+        for m, n in zip(program.modules, exact.modules, strict=True)
+    )
+    rewards = tuple(
+        replace(
+            r,
+            items=tuple(
+                replace(i, guard=compared(i.guard, j.guard))
+                for i, j in zip(r.items, s.items, strict=True)
+            ),
+        )
+        for r, s in zip(program.rewards, exact.rewards, strict=True)
+    )
+    initial = program.initial
+    if initial is not None and exact.initial is not None:
+        initial = compared(initial, exact.initial)
+    labels = {name: compared(e, exact.labels[name]) for name, e in program.labels.items()}
+    return replace(program, modules=modules, rewards=rewards, labels=labels, initial=initial)
 
 
 def constant_value(name: str, value: object) -> Value:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,13 +24,21 @@ from jaxltl.core.language.expressions import (
     substitute,
     type_of,
 )
-from jaxltl.core.language.exact import exact_constant, exact_program, exact_tree, is_inexact
+from jaxltl.core.language.exact import exact_constant, exact_tree, is_inexact
+from jaxltl.core.language.exact_program import exact_program
 from jaxltl.core.language.resolve import constant_value
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
 
-if TYPE_CHECKING:
-    from jaxltl.core.logic.property import Property
+
+class Meaning(Protocol):
+    """A comparison or a property that a name in an expression stands for."""
+
+    @property
+    def text(self) -> str: ...
+
+    @property
+    def is_number(self) -> bool: ...
 
 
 @brief(fields=("text",))
@@ -52,7 +60,7 @@ class Comparison:
 
     text: str
     expression: Expression
-    definitions: tuple[tuple[str, Comparison | Property], ...] = ()
+    definitions: tuple[tuple[str, Meaning], ...] = ()
 
     @property
     def is_number(self) -> bool:

@@ -35,7 +35,7 @@ class _OperandParser(ExpressionParser):
 
     def _atom(self) -> Expression:
         stream, place = self.stream, self.place
-        stream.place = bisect.bisect_left(stream.starts, place)
+        stream.place = min(bisect.bisect_left(stream.starts, place), len(stream.tokens) - 1)
         label = stream.labels.get(self.texts[self.at].strip('"'))
         if self.kinds[self.at] == "quoted" and label is not None and label.definitions:
             stream.take()

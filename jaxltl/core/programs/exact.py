@@ -8,7 +8,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from jaxltl.core.language.exact import exact_program, exact_tree, exact_value
+from jaxltl.core.language.exact import exact_tree, exact_value
+from jaxltl.core.language.exact_program import exact_program
 from jaxltl.core.language.expressions import Expression
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.models.number_source import Part, RationalNumbers

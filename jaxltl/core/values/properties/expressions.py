@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import reduce
-from typing import TYPE_CHECKING
+from typing import cast
 
 import numpy as np
 
@@ -22,11 +22,10 @@ from jaxltl.core.language.expressions import (
 )
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.models.construct.state_formulas import label_columns
+from jaxltl.core.logic.property import Property
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.values.properties.answers import Answer
 
-if TYPE_CHECKING:
-    from jaxltl.core.logic.property import Property
-    from jaxltl.core.values.properties.answers import Answer
 
 Bounds = tuple[Value, Value]  # fractions, integers, truth values, or infinite doubles
 _CORNERS = frozenset(("neg", "+", "-", "*", "min", "max", "floor", "ceil", "round", "!", "=>"))
@@ -48,7 +47,7 @@ def expression_bounds(
     columns: dict[str, Sequence[Bounds]] = {}
     for name in sorted(names_in(tree)):
         if name in results:
-            meaning = results[name]
+            meaning = cast(Comparison | Property, results[name])
             columns[name] = (
                 expression_bounds(model, meaning, states, solve)
                 if isinstance(meaning, Comparison)

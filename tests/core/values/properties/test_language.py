@@ -4,6 +4,9 @@ A fair die of Knuth and Yao: states 0 to 6 toss a coin, in state 7 the face d is
 model is an MDP in which a robot picks a lane.
 """
 
+import contextlib
+import random
+
 import numpy as np
 import pytest
 
@@ -11,6 +14,7 @@ from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.comparisons import program_definitions
 from jaxltl.core.logic.properties import MalformedProperty, parse_each, parse_properties
 from jaxltl.core.programs.build import build_model
+from jaxltl.core.values.properties import exact_thresholds
 from jaxltl.core.values.properties.solve_property import solve_property
 
 SOURCES = {
@@ -28,6 +32,13 @@ SOURCES = {
     label "goal" = x=3; label "far" = x=4;
     rewards "time" x<3 : 1; endrewards rewards "toll" [a] x<3 : 3; [b] x<3 : 1; endrewards""",
 }
+SOURCES[
+    "tenths"
+] = """dtmc const double c = 0.1; const double t = 1/3; module m s : [0..9]; b : bool;
+    [] s=0 & t=0.3333333333333333 -> (s'=1); [] s=0 & t!=0.3333333333333333 -> t:(s'=2) + 1-t:(s'=9);
+    [] s>0 & s*c<0.3 -> (s'=3) & (b'=true); [] s*0.1>=3*0.1 -> true; endmodule
+    label "three" = s/10 = c+0.2; label "third" = s/3 = 1 & 0.1+0.2 = 0.3; label "b" = b = (s*c = 0.3);
+    rewards s*c = 0.3 : 1; endrewards"""
 inf = float("inf")
 
 
@@ -388,7 +399,33 @@ FILTERS = {
     },
 }
 
+RATIONAL = {
+    "tenths": {
+        "P=? [ F s=1 ]": 0,
+        "P>0 [ F s=1 ]": False,
+        "P=? [ F s=2 ]": 1 / 3,
+        "P>=1/3 [ F s=2 ]": True,
+        "P>1/3 [ F s=2 ]": False,
+        "P<1/3 [ F s=2 ]": False,
+        "P=? [ F s=2 ] = t": True,
+        "P=? [ F s=2 ] = 0.3333333333333333": False,
+        'P=? [ F "three" ]': 1 / 3,
+        'P=? [ F "third" ]': 1 / 3,
+        'filter(forall, "b")': True,
+        "R=? [ C<=3 ]": 1 / 3,
+        "P=? [ F s*c = 0.9 ]": 2 / 3,
+        "P=? [ F s*c*c = 0.09 ]": 2 / 3,
+        "filter(count, s/10 = 0.3)": 1,
+        "filter(count, s*0.1 > 0.2)": 2,
+        "filter(max, s/3) = 3": True,
+        "filter(sum, s*0.1) = 1.4": True,
+        "c + 0.2 = 0.3": True,
+        "floor((c + 0.2) * 10)": 3,
+    },
+}
+
 GROUPS = {
+    "rational": RATIONAL,
     "ctl": CTL,
     "cosafe": COSAFE,
     "expressions": EXPRESSIONS,
@@ -400,7 +437,7 @@ GROUPS = {
 @pytest.mark.parametrize("name", SOURCES)
 @pytest.mark.parametrize("group", GROUPS)
 def test_values_by_hand(models, group, name):
-    for text, expected in GROUPS[group].get(name, {}).items():
+    for text, expected in GROUPS[group].get(name, {}).items():  # few models, many properties
         check(models, name, text, expected)
 
 
@@ -462,11 +499,10 @@ def test_exact_values_are_fractions(models, text):
         assert lower <= value <= upper and upper - lower <= 1e-15 * max(1, abs(value))
 
 
-def test_exact_answers_are_refused_for_large_models(models):
-    text = "dtmc module m x : [0..20000]; [] x<20000 -> 0.5:(x'=x+1) + 0.5:(x'=0); [] x=20000 -> true; endmodule"
-    large = build_model(read_program(text))
-    with pytest.raises(ValueError, match="exact=True is for models of moderate size"):
-        solve_property(large, "P=? [ F x=20000 ]", exact=True)
+def test_exact_answers_are_refused_for_large_models(models, monkeypatch):
+    monkeypatch.setattr(exact_thresholds, "MAX_TRANSITIONS", 1)
+    with pytest.raises(ValueError, match=r"exact=True is for models of moderate size.*13 states"):
+        answer(models, "die", "P=? [ F d=6 ]", exact=True)
 
 
 def test_a_malformed_property_does_not_stop_the_others(models):
@@ -496,3 +532,24 @@ def test_a_malformed_property_does_not_stop_the_others(models):
         " line 7, column 18",
     ]
     assert items[3].name == "q" and items[-1].operator == "T"
+
+
+PIECES = "P=? [ ] ( ) { } F G X U W R & | ! => <=> = < <= s d 1 1/3 filter(max, E A ? : ; const ceil( + - * / ^ << #"
+
+
+def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models):
+    rng = random.Random(0)
+    model, known = models["die"]
+    texts = [text for group in GROUPS.values() for text in group.get("die", {})]
+    for i in range(1000):
+        text = rng.choice(texts)
+        for _ in range(rng.randint(1, 3)):
+            first = rng.randrange(len(text) + 1)
+            piece = rng.choice((*PIECES.split(), '"end"', ""))
+            text = text[:first] + piece + text[first + rng.randrange(5) :]
+        for item in parse_each(text, known):
+            if isinstance(item, MalformedProperty):
+                assert "column" in item.error, text
+            elif i % 20 == 0:
+                with contextlib.suppress(ValueError):
+                    solve_property(model, item)
