@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ _FIRST_LEVELS = 16  # of collected reward, doubled until the bounds are narrow
 _MAX_LEVELS = 512
 _MAX_VALUES = 4_000_000  # of all levels together
 _TINY = 1e-13  # relative tolerance of a level, as errors of levels add up
+_MARGIN = 1e-6  # relative, of bounds for the rationals behind the doubles of a model
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -61,6 +63,35 @@ def reward_if_reached(
     return Enclosure(value, low, high, row, rounds, 0.0, "levels of collected reward")
 
 
+class LevelEnds(NamedTuple):
+    """Bounds of the values of states in which a number of units is collected.
+
+    With z units, at least `num_units`, they are ``z reach(s)`` and ``kept(s) + z - num_units``, or 0
+    where `kept` is. They hold for all probabilities that round to those of the model.
+    """
+
+    num_units: int
+    open_: Booleans  # bool[S], the states neither in the target nor of value 0 or infinity
+    rows: Booleans  # bool[R], the rows that do not lead to states of infinite value
+    infinite: Booleans  # bool[S]
+    reach: Floats  # float64[S]
+    kept: Floats  # float64[S]
+
+
+def level_ends(
+    mdp: HostMDP, units: Integers, target: Booleans, maximizing: Booleans, count: int
+) -> LevelEnds | None:
+    """Bounds once `count` units are collected; None if some are infinite or not decided."""
+    problem = _Problem.make(mdp, units, target, maximizing)
+    kept = problem.kept(count).upper
+    if not problem.is_decided or not np.isfinite(kept).all():
+        return None
+    rows = np.zeros(mdp.num_rows, bool)
+    rows[problem.origin[problem.origin >= 0]] = True
+    low, high = problem.lower_reach * (1 - _MARGIN), kept * (1 + _MARGIN)
+    return LevelEnds(count, problem.open_, rows, problem.infinite, low, high)
+
+
 @dataclass(frozen=True)
 class _Problem:
     """The transitions within one level of collected reward, and those that leave it."""
@@ -68,6 +99,7 @@ class _Problem:
     level: HostMDP  # the states and a last one for all that leaves the level
     origin: Integers  # int[R'], original rows, -1 in the last state
     maximizing: Booleans  # bool[S + 1]
+    open_: Booleans  # bool[S], states that are neither in the target nor of value 0 or infinity
     infinite: Booleans  # bool[S]
     is_decided: bool  # whether the graph decides where the target can be enforced
     row: Integers  # of leaving entries: the row of the level,
@@ -110,6 +142,7 @@ class _Problem:
             level=level,
             origin=origin,
             maximizing=np.append(up, False),
+            open_=open_,
             infinite=infinite,
             is_decided=bool(((reach.lower > 0) | (reach.upper <= 0)).all()),
             row=row,
@@ -129,12 +162,7 @@ class _Problem:
         above = np.arange(count, count + step)[:, None]
         low, high = np.zeros((count + step, size)), np.zeros((count + step, size))
         low[count:] = above * self.lower_reach * (1 - 4 * _EPS)
-        kept = game_reward_forever(
-            self.whole,
-            self.mean_units + count * self.arriving,
-            self.maximizing[:-1],
-            tolerance=_TINY,
-        )
+        kept = self.kept(count)
         most = np.where(np.isfinite(kept.upper), kept.upper, 0)  # infinite ends are used below
         high[count:] = np.where(most > 0, most + (above - count), 0)
         rounding, row = (8 + np.diff(self.whole.entry_start).max()) * _EPS, self.origin[:0]
@@ -156,6 +184,11 @@ class _Problem:
         lower = np.where(self.infinite, np.inf, low[0]) if self.is_decided else 0 * low[0]
         upper = np.where(self.infinite | (not bounded), np.inf, high[0])
         return lower, np.maximum(lower, upper), self.origin[row]
+
+    def kept(self, count: int) -> Enclosure:
+        """Values of the game in which runs that miss the target keep their rewards."""
+        reward = self.mean_units + count * self.arriving
+        return game_reward_forever(self.whole, reward, self.maximizing[:-1], tolerance=_TINY)
 
     def one_step(self, reward: Floats) -> tuple[Floats, Integers]:
         """Optimal rewards of rows in each state, and the rows."""

@@ -23,6 +23,7 @@ from jaxltl.core.models.number_source import NumberSource, RationalNumbers
 from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
 from jaxltl.core.sparse.exact import bounded
 from jaxltl.core.sparse.exact.average import average
+from jaxltl.core.sparse.exact.games import game_if_reached
 from jaxltl.core.sparse.exact.model import (
     MAX_WORK,
     ONE,
@@ -35,6 +36,7 @@ from jaxltl.core.sparse.exact.model import (
 )
 from jaxltl.core.sparse.exact.total import least_total, reachability, until_end
 from jaxltl.core.sparse.bounded.reward_bounded import in_units
+from jaxltl.core.sparse.solvers.reward_if_reached import level_ends
 from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.values.engine.state_quantities import transition_reward
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
@@ -43,6 +45,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
 )
 
 MAX_TRANSITIONS = 10_000  # and states, of which each counts for ten
+_LEVELS = 16  # of collected reward that are told apart
 _WIDTH = 0.01  # of the bounds of the product, of which only the graph is used
 
 
@@ -62,11 +65,12 @@ def exact_values(
       effort: the multiple of the limits on states, transitions and work.
     """
     inner = model.mdp if isinstance(model, Game) else model
-    if not isinstance(inner, SparseMDP) or prop.unreached == "zero":
+    if not isinstance(inner, SparseMDP):
         return None
     if max(inner.num_states * 10, inner.num_transitions) > MAX_TRANSITIONS * effort:
         return None
-    if isinstance(model, Game) and not _is_of_few_steps(prop):
+    levels = prop.unreached == "zero"
+    if isinstance(model, Game) and not levels and not _is_of_few_steps(prop):
         return _between_answers(inner, prop, states, maximize, rows, effort)
     try:
         # Backward induction takes the directions of all states.
@@ -84,6 +88,27 @@ def _is_of_few_steps(prop: Property) -> bool:
     if isinstance(path, Formula):
         return prop.operator == "P" and path.operator == "X" and is_boolean(path.operands[0])
     return isinstance(path, Earned) and path.steps is not None
+
+
+def _if_reached(query: _ExactQuery, prop: Property, maximize: bool | Booleans) -> Values:
+    """Rewards that count if a target is reached; TooLarge if levels of reward do not decide them."""
+    model, path = query.model, prop.path
+    assert isinstance(path, Formula)
+    cost = np.ones(model.num_transitions)
+    if prop.operator == "R":
+        cost = transition_reward(model, reward_structure(model, prop.reward))
+    largest = float(cost.max(initial=0))
+    units, most = in_units(cost, largest)
+    target = query.where(path.operands[0])
+    up = np.broadcast_to(np.asarray(maximize), model.num_states)
+    ends = level_ends(model.host, units, target, up, max(_LEVELS, 2 * most))
+    if ends is None or not most:
+        raise TooLarge
+    low, high = game_if_reached(query.mdp, units, target, ends, up, query.work)
+    if query.at(low) != query.at(high):
+        raise TooLarge
+    unit = Fraction(largest).limit_denominator(10**9) / most
+    return [x * unit if isinstance(x, Fraction) else x for x in query.at(low)]
 
 
 def _between_answers(
@@ -126,6 +151,8 @@ def _values(query: _ExactQuery, prop: Property, maximize: bool) -> Values:
         final = exact_state_reward(query.numbers, structure, query.reward_name(prop.reward))
         free = [ZERO] * len(mdp.rows)
         return query.at(bounded.earned_within(mdp, free, final, path.steps, maximize, work))
+    if prop.unreached == "zero":
+        return _if_reached(query, prop, maximize)
     reward = query.reward(prop)
     if prop.operator == "LRA" or path == Earned("average"):
         return query.at(average(mdp, reward, maximize, work))

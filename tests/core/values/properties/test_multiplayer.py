@@ -240,6 +240,10 @@ rewards "r" true : s; endrewards
         ('filter(forall, <<1,3>> P>=0.5 [ F "end" ] <=> s!=1)', True),
         ('filter(forall, <<1,3>> R{"r"}<=2 [ F "end" ] <=> s>1)', True),
         ('filter(forall, <<3>> R{"r"}>=2 [ Fc "end" ] <=> s<3)', True),
+        ('filter(forall, <<3>> R{"r"}>=2 [ F0 "end" ] <=> s=2)', True),
+        ('filter(forall, <<1,3>> R{"r"}>=1 [ F0 "end" ] <=> (s=0|s=2))', True),
+        ('<<1,3>> R{"r"}>1 [ F0 "end" ]', False), ('<<2>> R{"r"}<=1 [ F0 "end" ]', True),
+        ('<<2>> R{"r"}<1 [ F0 "end" ]', False), ('<<*>> R{"r"}>=1000 [ F0 "end" ]', True),
         # Rewards until a co-safe formula is satisfied.
         ('<<1>> R{"r"}max=? [ (F s=1) & (F s=2) ]', "3/2"), ('<<2,3>> R{"r"}min=? [ (F s=1) & (F s=2) ]', "3/2"),
         ('<<2,3>> R{"r"}min=? [ X X s=2 ]', "inf"), ('<<1,2,3>> R{"r"}min=? [ X F s>0 ]', 0),
