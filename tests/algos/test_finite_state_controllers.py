@@ -7,6 +7,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import finite_state_controllers as fsc
+from tests.algos.cases import LearnerCase
 
 
 def coin():
@@ -113,3 +114,18 @@ def test_wrong_problems():
             fsc.make_problem(pomdp, **options)
     with pytest.raises(ValueError, match="cannot reach"):
         fsc.make_problem(pomdp, "right", reward=reward)
+
+
+# --- the laws of all learners ------------------------------------------------------------------
+
+
+def controllers():
+    problem = fsc.make_problem(coin(), "right")
+    return LearnerCase(
+        fsc, problem, fsc.Hparams(learning_rate=0.5), fsc.Hparams(learning_rate=0.25)
+    )
+
+
+CASES = {
+    "controllers": controllers,
+}
