@@ -75,7 +75,7 @@ from .core.values.evaluation.data_guarantee import learn_guarantee as learn_guar
 from .core.values.evaluation.evaluation import evaluate as evaluate
 from .core.values.evaluation.optimality_gap import optimality_gap as optimality_gap
 from .core.values.multi_objective.multi_objective import (
-    multi_objective as multi_objective,
+    constrained_optimum as constrained_optimum,
     pareto as pareto,
 )
 from .core.values.prepared.prepared import prepare as prepare, solve_prepared as solve_prepared

@@ -29,7 +29,7 @@ from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.core.statistics.binomial import bounded_mean
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.values.evaluation.evaluation import frequency_estimate
-from jaxltl.core.values.multi_objective.multi_objective import multi_objective
+from jaxltl.core.values.multi_objective.multi_objective import constrained_optimum
 from jaxltl.core.values.multi_objective.objectives import Objective
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.total_reward import total_reward
@@ -762,7 +762,7 @@ def test_good_input_is_taken(tmp_path):
         ),
         (lambda m: reachability_probability(m, "a", policy="x"), "policy is 'x'; give the number"),
         (
-            lambda m: multi_objective(m, [Objective(target="a"), Objective(target="a")]),
+            lambda m: constrained_optimum(m, [Objective(target="a"), Objective(target="a")]),
             "ask for one at a time",
         ),
         (lambda m: jl.models.to_dense(m), "or give its nominal model, model.nominal"),

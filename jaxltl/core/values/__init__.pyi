@@ -40,7 +40,7 @@ from .multi_objective.multi_objective import (
     NearestMixture as NearestMixture,
     Pareto as Pareto,
     achievable as achievable,
-    multi_objective as multi_objective,
+    constrained_optimum as constrained_optimum,
     pareto as pareto,
 )
 from .multi_objective.objectives import Objective as Objective

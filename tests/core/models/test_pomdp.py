@@ -145,7 +145,7 @@ CALLS = {
     "make_interval": lambda m: jl.make_interval(m, MASK, MASK),
     "prepare": jl.prepare,
     "optimal_actions": lambda m: jl.optimal_actions(m, "F on"),
-    "multi_objective": lambda m: jl.multi_objective(m, ["F on"]),
+    "constrained_optimum": lambda m: jl.constrained_optimum(m, ["F on"]),
     "pareto": lambda m: jl.pareto(m, ["F on"]),
     "task_performance": lambda m: jl.task_performance(m, MASK),
     "soft_value": lambda m: jl.values.soft_value(m, MASK, 0.9),

@@ -116,7 +116,7 @@ def calls(kind):
         (jl.task_performance, {"model": prod, "policy": one}, {"method": "auto"}),
         (values.practical_policy, {"model": prod, "policy": one}, {"over": "mean"}),
         (jl.minimax_value, {"game": game, "reward": earned, "discount": 0.9}, {"per": "move"}),
-        (jl.multi_objective, {"model": coin(), "objectives": goals}, {"tolerance": 1e-6}),
+        (jl.constrained_optimum, {"model": coin(), "objectives": goals}, {"tolerance": 1e-6}),
         (jl.solve_property, {"model": coin(), "prop": 'Pmax=? [F "a"]'}, {"tolerance": 1e-6}),
         (jl.to_automaton, {"formula": "F a"}, {"max_states": 9, "acceptance": "auto"}),
         (jl.product, {"world": KINDS["padded"](), "formula": "F a"}, {"label_on": "entry"}),

@@ -137,12 +137,12 @@ class ConstrainedOptimum(NamedTuple):
       nearest: if `holds` is unknown, the best of the mixtures nearest to the thresholds.
 
     Example:
-      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, multi_objective
+      >>> from jaxltl.core.values.multi_objective.multi_objective import Objective, constrained_optimum
       >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> both = [Objective(target="a"), Objective(target="b", threshold=0.25)]
-      >>> best = multi_objective(model, both)
+      >>> best = constrained_optimum(model, both)
       >>> round(best.lower, 6), round(best.upper, 6), best.status.name
       (0.75, 0.75, 'CONVERGED')
     """

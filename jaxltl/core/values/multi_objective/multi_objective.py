@@ -34,7 +34,7 @@ __all__ = [
     "Objective",
     "Pareto",
     "achievable",
-    "multi_objective",
+    "constrained_optimum",
     "pareto",
 ]
 
@@ -177,48 +177,41 @@ def _require(model: Model, objectives: Sequence[Objective]) -> None:
 
 
 @validated(host=True)
-def multi_objective(
+def constrained_optimum(
     model: Model,
     objectives: Sequence[Objective],
     *,
     tolerance: float = TOLERANCE,
     max_points: int = 200,
-) -> Achievable | ConstrainedOptimum | Pareto:
-    """Multi-objective query, as ``multi(...)`` of PRISM and Storm.
+) -> ConstrainedOptimum:
+    """The optimum of one objective among the policies that meet the thresholds of all others.
 
     Args:
-      model, objectives, max_points: as for :func:`achievable`. One objective without a threshold is
-        optimised; if two or more have none, none may have one.
+      model, objectives, max_points: as for :func:`achievable`; one objective has no threshold.
       tolerance: the width of the bounds, relative where the value exceeds one.
 
     Returns:
-      :class:`Achievable` if all have thresholds, :class:`ConstrainedOptimum` if one has none, and
-      :class:`Pareto` if none has one. Concrete arrays only; not differentiable.
+      :class:`ConstrainedOptimum`, with the front as evidence. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: some but not all of several objectives without a threshold; or as for
-        :func:`achievable`.
+      ValueError: none or several objectives without a threshold; or as for :func:`achievable`.
 
     Example:
       >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> query = [Objective(target="a"), Objective(target="b", threshold=0.4)]
-      >>> best = multi_objective(model, query)
+      >>> best = constrained_optimum(model, query)
       >>> round(best.value, 6), best.holds
       (0.6, True)
     """
     _require(model, objectives)
     free = [i for i, o in enumerate(objectives) if o.threshold is None]
-    if not free:
-        return achievable(model, objectives, tolerance=tolerance, max_points=max_points)
-    if len(free) > 1:
-        if len(free) < len(objectives):
-            raise ValueError(
-                f"{len(free)} of {len(objectives)} objectives have no threshold; give one to all "
-                "but one of them (the best value), to all (achievability) or to none (the curve)."
-            )
-        return pareto(model, objectives, tolerance=max(tolerance, 1e-6), max_points=max_points)
+    if len(free) != 1:
+        raise ValueError(
+            f"{len(free)} of {len(objectives)} objectives have no threshold; give one to all but one of "
+            "them. With thresholds for all ask achievable, without any pareto."
+        )
     return _optimum(model, objectives, free[0], tolerance, max_points)
 
 

@@ -47,11 +47,11 @@ class Objective:
         is wrong.
 
     Example:
-      >>> from jaxltl import make_sparse, multi_objective
+      >>> from jaxltl import constrained_optimum, make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> query = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]
-      >>> round(multi_objective(model, query).value, 6)
+      >>> round(constrained_optimum(model, query).value, 6)
       0.75
     """
 

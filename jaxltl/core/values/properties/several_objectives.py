@@ -16,16 +16,28 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     ConstrainedOptimum,
     Objective,
     Pareto,
-    multi_objective,
+    achievable,
+    constrained_optimum,
+    pareto,
 )
 
 
 def solve_multi_objective(
     model: SparseMDP, prop: Property, tolerance: float
 ) -> Achievable | ConstrainedOptimum | Pareto:
-    """Solution of ``multi(...)``."""
+    """Solution of ``multi(...)``: the objectives without a threshold say which of three questions it is."""
     parts = [_objective(model, x) for x in prop.parts]
-    return multi_objective(model, parts, tolerance=tolerance)
+    free = sum(part.threshold is None for part in parts)
+    if not free:
+        return achievable(model, parts, tolerance=tolerance)
+    if free == 1:
+        return constrained_optimum(model, parts, tolerance=tolerance)
+    if free < len(parts):
+        raise ValueError(
+            f"{prop.text}: {free} of {len(parts)} objectives have no threshold; give one to all but one of "
+            "them (the best value), to all (achievability) or to none (the curve)."
+        )
+    return pareto(model, parts, tolerance=max(tolerance, 1e-6))
 
 
 def _objective(model: SparseMDP, prop: Property) -> Objective:

@@ -8,7 +8,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.multi_objective import (
     Objective,
     achievable,
-    multi_objective,
+    constrained_optimum,
     pareto,
 )
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -156,7 +156,7 @@ def test_one_objective_is_what_its_own_solver_finds(seed):
     )
     for formula in ("G F a", "F G b", "a U b", "G (a -> F b)"):
         for direction in ("max", "min"):
-            alone = multi_objective(model, [Objective(formula=formula, direction=direction)])
+            alone = constrained_optimum(model, [Objective(formula=formula, direction=direction)])
             expected = optimal_satisfaction(model, formula, objective=direction)
             assert alone.lower - 1e-6 <= expected.value[0] <= alone.upper + 1e-6
             assert alone.status == Status.CONVERGED
@@ -206,10 +206,12 @@ def test_mixtures_and_half_spaces_are_the_evidence():
     no = achievable(model, [Objective(target=a), Objective(target=b)], [0.4, 0.7])
     assert no.holds is False
     assert no.front.normals[no.normal] @ [0.4, 0.7] > no.front.bounds[no.normal]
-    best = multi_objective(model, [Objective(target=a), Objective(target=b, threshold=0.25)])
+    best = constrained_optimum(model, [Objective(target=a), Objective(target=b, threshold=0.25)])
     assert best.holds and best.lower <= 0.75 <= best.upper
     assert best.upper - best.lower <= 1e-6
-    impossible = multi_objective(model, [Objective(target=a), Objective(target=b, threshold=1.5)])
+    impossible = constrained_optimum(
+        model, [Objective(target=a), Objective(target=b, threshold=1.5)]
+    )
     assert impossible.holds is False and np.isnan(impossible.value)
 
 
@@ -221,11 +223,11 @@ def test_thresholds_of_what_is_best(seed):
     target[0] = other[0] = False
     most = reachability_probability(model, target).value[0]
     least = reachability_probability(model, other, objective="min").value[0]
-    alone = multi_objective(
+    alone = constrained_optimum(
         model, [Objective(target=target), Objective(target=other, threshold=0.0)]
     )
     assert alone.lower - 1e-6 <= most <= alone.upper + 1e-6
-    spared = multi_objective(
+    spared = constrained_optimum(
         model, [Objective(avoid=other), Objective(target=target, threshold=0.0)]
     )
     assert spared.lower - 1e-6 <= 1 - least <= spared.upper + 1e-6
@@ -282,14 +284,14 @@ def test_storm_finds_the_same(seed):
     for text, objectives in questions.items():
         (question,) = stormpy.parse_properties(text)
         theirs = str(stormpy.model_checking(storm, question))
-        found = multi_objective(model, objectives)
+        found = constrained_optimum(model, objectives)
         assert found.status == Status.CONVERGED
         assert ("false" in theirs) == (found.holds is False), text
         if found.holds:
             assert found.lower - 1e-3 <= float(theirs) <= found.upper + 1e-3, text
     (question,) = stormpy.parse_properties('Pmax=? [ F "a" ]')
     np.testing.assert_allclose(
-        multi_objective(model, [Objective(target=sets["a"])]).value,
+        constrained_optimum(model, [Objective(target=sets["a"])]).value,
         storm_values(storm, 'Pmax=? [ F "a" ]')[0],
         atol=1e-6,
     )
@@ -321,7 +323,7 @@ def test_a_border_of_many_corners(corners):
     model, x, y = arc(corners)
     for least in (0.28, 0.7, 0.99999):
         most = np.interp(least, y, x)  # mixtures of neighbours are the border
-        best = multi_objective(
+        best = constrained_optimum(
             model, [Objective(reward="x"), Objective(reward="y", threshold=least)]
         )
         assert best.status == Status.CONVERGED
@@ -347,7 +349,7 @@ def test_what_is_attained_nearest_to_a_border_is_told():
         assert (near.lower + near.gap >= thresholds - 1e-15).all() and (near.gap <= 1e-13).all()
         assert (near.share @ found.front.points >= thresholds - 1e-12).all()
     # All that can be had of y, and the most of x beside it, which is none.
-    best = multi_objective(model, [Objective(reward="x"), Objective(reward="y", threshold=1.0)])
+    best = constrained_optimum(model, [Objective(reward="x"), Objective(reward="y", threshold=1.0)])
     assert best.holds is None and best.status == Status.PRECISION
     assert best.upper <= 1e-6 and best.value <= best.upper
     assert best.nearest.gap.tolist() == [0, pytest.approx(0, abs=1e-13)]
@@ -391,9 +393,9 @@ def test_what_is_wrong_is_named():
     with pytest.raises(ValueError, match="give one finite number for each"):
         achievable(model, [Objective(target=end), Objective(avoid=end)])
     with pytest.raises(ValueError, match="to all but one"):
-        multi_objective(
+        constrained_optimum(
             model,
             [Objective(target=end), Objective(avoid=end), Objective(avoid=end, threshold=0.5)],
         )
-    least = multi_objective(model, [Objective(reward="r", direction="min", target=end)])
+    least = constrained_optimum(model, [Objective(reward="r", direction="min", target=end)])
     assert least.lower == least.upper == 0
