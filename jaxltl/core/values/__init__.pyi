@@ -46,6 +46,10 @@ from .multi_objective.multi_objective import (
 from .multi_objective.objectives import Objective as Objective
 from .partial_observability.chains import controlled_chain as controlled_chain
 from .partial_observability.solve import belief_bounds as belief_bounds
+from .partial_observability.supports import (
+    SupportShield as SupportShield,
+    support_shield as support_shield,
+)
 from .prepared.prepared import (
     Prepared as Prepared,
     prepare as prepare,
