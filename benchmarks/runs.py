@@ -1,7 +1,7 @@
 """(u) Runs from the host: a callback against none, and a sweep against a loop, compilation included.
 
 ``python -m benchmarks.runs [callback] [sweep] [LEARNER ...]``. The callback appends the newest
-metrics to a list after each hundredth of a run. The sweep has 32 seeds and 5 values of a
+metrics to a list after each fiftieth of a run. The sweep has 32 seeds and 5 values of a
 hyperparameter, and its peer is a loop over ``jit(train)``; both begin without compiled programs.
 If other programs share the cores, the processor's seconds divided by the threads that are ready to
 run are the seconds of an idle machine: *idle ratio*.
