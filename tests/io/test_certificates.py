@@ -191,6 +191,27 @@ def test_products_with_formulas(label_on, tmp_path, capsys):
     assert width(verified(path, capsys)) < 1e-5
 
 
+def test_coalitions_are_games_and_hidden_states_are_refused(tmp_path, capsys):
+    model, path = random_model(1, size=5), tmp_path / "file.umb"
+    world = jl.models.make_multiplayer_game(model, [0, 1, 2, 0, 1], ["a", "b", "c"])
+    write_certificate(path, world, None, '<<a, c>> Pmax=? [ F "goal" ]')
+    text = verified(path, capsys)
+    found = jl.solve_property(world, '<<a, c>> Pmax=? [ F "goal" ]')
+    assert width(text) < 1e-5 and "<<system>>" in text
+    low = float(Fraction(text.split(" is ")[1].split()[1]))
+    assert abs(low - found.value[0]) < 1e-5
+    hidden = jl.models.make_pomdp(
+        jl.make_sparse(None, [0, 1, 2], [1, 1], [1.0, 1.0], label={"goal": [1]}), [0, 1]
+    )
+    for refused, question in (
+        (world, 'Pmax=? [ F "goal" ]'),
+        (hidden, 'Pmax=? [ F "goal" ]'),
+        (jl.make_game(model, [True] * 5), '<<environment>> Pmax=? [ F "goal" ]'),
+    ):
+        with pytest.raises(ValueError, match="certificates are written for"):
+            write_certificate(path, refused, None, question)
+
+
 def with_labels(seed):
     """A random model with two labels."""
     model, label = random_model(seed, size=7), np.random.default_rng(seed).random((7, 2)) < 0.5

@@ -15,7 +15,7 @@ from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.types import Solution
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee
 
-MAX_NODES = 200_000  # states with memory, up to which a command writes a certificate by itself
+MAX_NODES = 50_000  # states with memory, up to which a command writes a certificate by itself
 
 
 @dataclass(frozen=True)
