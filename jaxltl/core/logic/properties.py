@@ -293,6 +293,8 @@ class _Parser(PathParser):
         if match[1] == "R" and self.accept("{"):
             fields["reward"] = self.reward_name()
             self.expect("}")
+        elif match[1] == "R" and len(self.known.rewards) > 1:
+            fields["reward"] = self.known.rewards[0] or None  # as in PRISM
         # R{"name"}max has max after the name.
         both = start.text[len(match[1]) :] or self.accept(*_DIRECTIONS) or ""
         fields |= {"objective": both[:3] or None, "nature": both[3:] or None}

@@ -14,12 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.logic.bounded import Earned
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.good_prefixes import is_plain_reachability
-from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.logic.ltl import Formula, is_syntactically_cosafe
 from jaxltl.core.logic.properties import Property, parse_property
-from jaxltl.core.models.construct.property_models import END, prefix_product, transition_graph
+from jaxltl.core.models.construct.property_models import (
+    END,
+    LOST,
+    fair_reachability,
+    prefix_product,
+    transition_graph,
+)
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
@@ -90,6 +96,7 @@ def solve_property(
     tolerance: float = TOLERANCE,
     relative: bool = False,
     exact: bool = False,
+    fair: bool = False,
 ) -> Answer | Achievable | ConstrainedOptimum | Pareto:
     """Model checking: the value of a property, or its truth, with certified bounds.
 
@@ -107,6 +114,9 @@ def solve_property(
         interval models, ``multi(...)`` and long-run averages.
       exact: True for values in rational arithmetic, by policy iteration in fractions, of chains and MDPs of
         moderate size; probabilities and rewards of a program are those of its text, so that 0.1 is a tenth.
+      fair: True for probabilities of MDPs over fair strategies alone, which take each choice of a state
+        infinitely often if they visit it infinitely often, in the product with the formula's automaton. Of
+        co-safe and safe formulas; rewards have no such option.
 
     Returns:
       :class:`Answer`. If narrower bounds do not decide a threshold either, `holds` is None and the
@@ -138,11 +148,14 @@ def solve_property(
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
 
     def again(
-        world: SourceModel, part: Property, states: ArrayLike | None = None, exact: bool = exact
+        world: SourceModel,
+        part: Property,
+        states: ArrayLike | None = None,
+        exact: bool = exact,
+        tolerance: float = tolerance,
     ) -> Answer:
-        answer = solve_property(
-            world, part, states=states, tolerance=tolerance, relative=relative, exact=exact
-        )
+        options = {"relative": relative, "exact": exact, "fair": fair}
+        answer = solve_property(world, part, states=states, tolerance=tolerance, **options)
         return cast(Answer, answer)
 
     if prop.definitions:
@@ -157,7 +170,7 @@ def solve_property(
         )
     width = RelativeTolerance if relative else float
     if prop.aggregate is not None:
-        return _filter(source, prop, states, width(tolerance), exact)
+        return _filter(source, prop, states, width(tolerance), again)
     graph = graph_of_model(source)
     places, states = states, starting_states(graph, states)
     if prop.operator == "value":
@@ -181,12 +194,42 @@ def solve_property(
         )
     if prop.operator == "multi":
         return _several(chosen, prop, places is None, tolerance)
+    if fair and not graph.is_chain:
+        product, start, prop = _fair(chosen, prop, states)
+        answer = _of_model(product, prop, start, width(requested_width(tolerance)), exact)
+        return answer._replace(states=states, strategy=None)
     path = prop.path if prop.operator in ("R", "T") else None
     if isinstance(path, Formula) and not is_plain_reachability(path):
         larger, start = prefix_product(chosen, path, states, prop.text)
         simple = replace(prop, path=_AT_END, definitions=())
         return again(larger, simple, states=start)._replace(states=states, strategy=None)
     return _of_model(chosen, prop, states, width(requested_width(tolerance)), exact)
+
+
+def _fair(
+    model: CheckableModel, prop: Property, states: np.ndarray
+) -> tuple[SparseMDP, np.ndarray, Property]:
+    """The property over all strategies of a product that has the value of one over fair strategies."""
+    path = unfolded(prop.path) if isinstance(prop.path, Bounded) else prop.path
+    if prop.operator != "P" or not isinstance(path, Formula) or not isinstance(model, SparseMDP):
+        raise ValueError(
+            f"{prop.text}: fair=True is for probabilities of formulas in MDPs without intervals and players."
+        )
+    direction: Literal["max", "min"] = "max" if aim_of(model, prop).policy == "max" else "min"
+    proven = path if is_syntactically_cosafe(path) else ~path
+    if not is_syntactically_cosafe(proven):
+        raise ValueError(
+            f"{prop.text}: fair=True is for formulas that a prefix proves or refutes, such as F and G."
+        )
+    larger, start = prefix_product(model, proven, states, prop.text)
+    assert isinstance(larger, SparseMDP)
+    end, lost = (Formula("ap", proposition=name) for name in (END, LOST))
+    larger = fair_reachability(larger, states_satisfying(larger, end))
+    # The limits of fair strategies decide: all runs end in END or LOST.
+    reached = end if proven is path else lost
+    missed = lost if proven is path else end
+    simple = Formula("F", (reached,)) if direction == "max" else Formula("G", (~missed,))
+    return larger, start, replace(prop, path=simple, objective=direction, definitions=())
 
 
 def _of_model(
@@ -286,7 +329,11 @@ def _value(
 
 
 def _filter(
-    model: SourceModel, prop: Property, states: object, tolerance: float, exact: bool
+    model: SourceModel,
+    prop: Property,
+    states: object,
+    tolerance: float,
+    again: Callable[..., Answer],
 ) -> Answer:
     """The aggregate of a property over the states of a filter."""
     if states is not None:
@@ -298,11 +345,7 @@ def _filter(
     shares = {"sum": len(among)}
     part = replace(prop, aggregate=None, definitions=())
     fine = tolerance / shares.get(str(prop.aggregate), 1)
-    relative = isinstance(tolerance, RelativeTolerance)
-    answer = cast(
-        Answer,
-        solve_property(model, part, states=among, tolerance=fine, relative=relative, exact=exact),
-    )
+    answer = again(model, part, states=among, tolerance=float(fine))
     return filtered(prop, answer, tolerance)
 
 

@@ -441,6 +441,50 @@ def test_values_by_hand(models, group, name):
         check(models, name, text, expected)
 
 
+# In state 0: stay, or toss a coin to 1 or 2; in 1 stay or go to 0; 2 stays.
+FAIR_MODEL = """mdp module m x : [0..2]; [] x=0 -> true; [a] x=0 -> 0.5:(x'=1) + 0.5:(x'=2);
+[] x=1 -> true; [] x=1 -> (x'=0); [] x=2 -> true; endmodule rewards true : 1; endrewards"""
+FAIR = {
+    "Pmin=? [ F x=2 ]": (0, 1),
+    "Pmax=? [ F x=2 ]": (1, 1),
+    "Pmin=? [ F x=1 ]": (0, 0.5),
+    "Pmin=? [ X x=0 ]": (0, 0),
+    "Pmax=? [ G x<2 ]": (1, 0),
+    "Pmin=? [ G x<2 ]": (0, 0),
+    "Pmax=? [ G x=0 ]": (1, 0),
+    "Pmin=? [ F (x=0 & X x=1) ]": (0, 0.5),
+    "Pmin=? [ F (x=1 & X x=0) ]": (0, 0.5),
+    "Pmin=? [ x<2 U x=2 ]": (0, 1),
+    "Pmin=? [ x=0 U x=2 ]": (0, 0.5),
+    "Pmax=? [ x=0 W x=2 ]": (1, 0.5),
+    "Pmin=? [ F<=1 x=2 ]": (0, 0),
+    "P>=1 [ F x=2 ]": (False, True),
+    "P<=0 [ G x<2 ]": (False, True),
+    "filter(count, P>=1 [ F x=2 ])": (1, 3),
+    "1 - Pmin=? [ F x=1 ]": (1, 0.5),
+}
+
+
+@pytest.mark.parametrize("fair", [False, True])
+def test_fair_strategies_take_all_choices_for_ever(fair):
+    program = read_program(FAIR_MODEL)
+    model, known = build_model(program), program_definitions(program)
+    for text, values in FAIR.items():
+        (prop,) = parse_properties(text, known)
+        actual = solve_property(model, prop, fair=fair)
+        expected = values[fair]
+        got = actual.value if actual.holds is None else actual.holds
+        assert got == (pytest.approx([expected]) if actual.holds is None else [expected]), text
+    for text in ("Pmin=? [ G F x=0 ]", "Rmin=? [ F x=2 ]"):
+        if fair:
+            with pytest.raises(ValueError, match="fair=True is for"):
+                solve_property(model, parse_properties(text, known)[0], fair=True)
+
+
+def test_a_reward_without_a_name_is_the_first_of_a_program(models):
+    assert answer(models, "lanes", "R=? [ C<=2 {x=2} ]; Rmax=? [ C<=2 ]").value == [2]
+
+
 REFUSED = {
     "filter(forall, pow(2,s-1)>0)": "exponent of an integer is negative",
     "const int c = 0; pow(2,c-1)": "exponent of an integer is negative",
