@@ -130,6 +130,7 @@ def test_a_given_map_and_where_it_is_begun():
     assert (array.observe(end)[..., 0] == np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0]])).all()
 
 
+@pytest.mark.slow
 def test_maps_without_ways_are_uniform():
     free = letter_world(size=3, letters=2, num_copies=2, connected=False, horizon=None)
     drawn = jax.vmap(free.reset)(jax.random.split(jax.random.key(0), 9000))

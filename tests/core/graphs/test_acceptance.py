@@ -121,6 +121,7 @@ def test_a_random_policy_is_evaluated(label_on):
         assert (exact[np.asarray(inside)] == 1).all()
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_finite_differences():
     # From state 0 a run is caught in 1, where a holds for ever, or in 2, where it never does.
     stay = [[1, 1], [1, 1]]

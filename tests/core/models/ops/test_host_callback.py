@@ -55,6 +55,7 @@ def test_results_are_converted_and_lanes_are_mapped(kind, double_here_only):
     np.testing.assert_array_equal(found, [[i, 1, 2] for i in range(4)])
 
 
+@pytest.mark.slow
 def test_derivatives_by_elimination(double_here_only):
     """A walk so long that Krylov steps do not suffice: the gambler's ruin."""
     size, start = 701, 350
