@@ -157,6 +157,17 @@ def test_a_sweep_has_all_combinations_and_static_values():
     assert sweep().settings == ({},)
 
 
+def test_a_sweep_has_the_precision_of_its_caller():
+    """Threads do not inherit it."""
+    for double in (False, True):
+        with jax.enable_x64(double):
+            keys = jax.random.split(KEY, 2)
+            runs = training.sweep(FIT, keys, 3.0, Hparams(), num_steps=4)
+            _, metrics = FIT.train(keys[1], 3.0, Hparams(), num_steps=4)
+        assert runs.metrics.error.dtype == metrics.error.dtype == f"float{64 if double else 32}"
+        assert np.array_equal(runs.metrics.error[0, 1], metrics.error)
+
+
 def test_lanes_of_an_accelerator_are_the_runs(monkeypatch):
     over = {"rate": [0.25, 0.5]}
     expected = sweep(over=over)
@@ -203,6 +214,7 @@ def test_a_sweep_is_drawn_with_its_own_names_and_steps():
         ({"keys": KEY}, r"keys is .*jax.random.split"),
         ({"num_steps": 0}, "num_steps=0"),
         ({"callback": 1}, "callback is 1"),
+        ({"hparams": SimpleNamespace(sharding=1)}, "hparams.sharding is set"),
     ],
 )
 def test_what_a_sweep_refuses(change, message):
