@@ -209,7 +209,7 @@ def question_problem(
         path = {"kind": "total", "reward": name, "steps": earned.steps}
     elif prop.operator == "P" and isinstance(prop.path, Formula):
         path = {"kind": "formula", "formula": nested(prop.path), "automaton": "automaton"}
-    is_wrong = "kind" not in path or prop.definitions
+    is_wrong = "kind" not in path or prop.definitions or prop.unreached != "infinite"
     if is_wrong or (discount is not None and (path["kind"] != "total" or "steps" in path)):
         raise ValueError(
             f"{prop.text}: certificates are written for P of formulas without bounds, of F<=k and "

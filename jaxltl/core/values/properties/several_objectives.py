@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxltl.core.logic.bounded import Bounded, Conditional, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
@@ -91,7 +91,8 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
 
 def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
     path = prop.path
-    if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
+    is_total = isinstance(path, Formula) or (isinstance(path, Earned) and path.kind == "total")
+    if prop.operator == "LRA" or not is_total or prop.unreached != "infinite":
         raise ValueError(
             f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
             "and T are supported."

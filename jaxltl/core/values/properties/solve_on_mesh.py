@@ -117,7 +117,8 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> MeshProperty:
 def _path(prop: Property) -> Formula:
     """The reduction of the property, if it is supported."""
     path = prop.path
-    if prop.operator in ("P", "R", "T") and isinstance(path, Formula):
+    known = prop.operator in ("P", "R", "T") and prop.unreached == "infinite"
+    if known and isinstance(path, Formula):
         return path
     quantity = {
         "LRA": "averages in the long run",

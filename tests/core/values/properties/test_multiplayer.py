@@ -284,12 +284,22 @@ def test_games_of_the_literature():
         ('<<*,1>> Pmax=? [ F "goal" ]', "expected '>>'"), ('<<1,*>> Pmax=? [ F "goal" ]', "no other players"),
         ('<<1>> P=? [ F "goal" ]', "say what the coalition wants"),
         ('<<1>> <<2>> Pmax=? [ F "goal" ]', "after a coalition"), ("<<1 Pmax=? [ X true ]", "expected '>>'"),
+        ('multi(R{"steps"}max=? [ Fc "goal" ], P>=0.5 [ F "goal" ])', r"only probabilities, R \[ F"),
+        ('multi(R{"steps"}max=? [ F0 "goal" ], P>=0.5 [ F "goal" ])', r"only probabilities, R \[ F"),
         ('<<1>> R{"time"}max=? [ C ]', "time"), ('<<1>> P>=1/2 [ Fc "goal" ]', "Fc"),
     ],
 )  # fmt: skip
 def test_mistakes_in_coalitions_are_named(text, message):
     with pytest.raises(ValueError, match=message):
         jl.solve_property(game(VAULT), text)
+
+
+@pytest.mark.parametrize("path", ["Fc", "F0"])
+def test_certificates_are_not_written_for_other_variants_of_rewards(tmp_path, path):
+    model, text = game(RELAY), f'<<1>> R{{"r"}}min=? [ {path} "end" ]'
+    found = jl.total_reward(model.game([1]), "r", "end", objective="min", unreached="sum")
+    with pytest.raises(ValueError, match="certificates are written for"):
+        jl.io.write_certificate(tmp_path / "c.json", model, found, text)
 
 
 def test_players_of_models_from_arrays():
