@@ -9,7 +9,7 @@ these rows are bounds of those of the beliefs; see :mod:`.bounds` for rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -21,24 +21,30 @@ from jaxltl.core.values.partial_observability.problem import BeliefProblem
 _TRUNCATED = 1e-9  # share of a belief that is counted as seen
 _MERGED = 2.0**39  # reciprocal of the differences within which beliefs are one node
 Exact = dict[int, Fraction]  # weights of states
+_DEEPEST = 500  # steps from a belief that is known exactly to one that is computed
 _UNIT = 1e-13  # deviation of a mass from one that is not divided out, so that cycles stay exact
 
 
-@dataclass
 class GrowingArray:
-    """An array that grows by parts."""
+    """An array that grows at its end, with room to spare."""
 
-    parts: list[np.ndarray] = field(default_factory=list)
+    def __init__(self, dtype: type = np.int64) -> None:
+        self._room: np.ndarray = np.zeros(1024, dtype)
+        self.size = 0
 
     def add(self, part: np.ndarray) -> None:
         """Appends a part."""
-        self.parts.append(part)
+        end = self.size + part.size
+        if end > self._room.size:
+            room = np.zeros(max(end, 2 * self._room.size), self._room.dtype)
+            room[: self.size] = self.array()
+            self._room = room
+        self._room[self.size : end] = part
+        self.size = end
 
     def array(self) -> np.ndarray:
-        """The whole array."""
-        if len(self.parts) > 1:
-            self.parts = [np.concatenate(self.parts)]
-        return self.parts[0] if self.parts else np.zeros(0, np.int64)
+        """The array, a view that later parts leave as it is."""
+        return self._room[: self.size]
 
 
 @dataclass(frozen=True)
@@ -123,14 +129,15 @@ class BeliefGraph:
         self._projection = rng.uniform(0.5, 1.5, (2, problem.num_states))
         self._sign = rng.integers(1, 2**62, problem.num_states)
         self._known: dict[int, int] = {}
-        self._start, self._state, self._weight = GrowingArray(), GrowingArray(), GrowingArray()
+        self._start, self._state, self._weight = (GrowingArray(t) for t in (int, int, float))
         self._size = self._entries = 0
         self._start.add(np.zeros(1, np.int64))
         # rows: node, action, gain, mass that is lost to bounds of corners; entries: node, weight
-        self._rows = {name: GrowingArray() for name in ("node", "action", "gain", "lost", "count")}
-        self._to, self._by = GrowingArray(), GrowingArray()
+        kinds = {"node": int, "action": int, "gain": float, "lost": float, "count": int}
+        self._rows = {name: GrowingArray(t) for name, t in kinds.items()}
+        self._to, self._by = GrowingArray(int), GrowingArray(float)
         # of each node the node and the action by which it was found first, -1 of initial ones
-        self.parent, self.via = GrowingArray(), GrowingArray()
+        self.parent, self.via = GrowingArray(int), GrowingArray(int)
         self.exact = ExactBeliefs(self)
         self.expanded = np.zeros(0, bool)
         self.root = self._first()
@@ -159,6 +166,16 @@ class BeliefGraph:
         table = {name: x[order] for name, x in parts.items()}
         to, by = self._to.array(), self._by.array()
         return table | {"start": offsets_from_counts(count), "to": to[entry], "by": by[entry]}
+
+    @property
+    def num_rows(self) -> tuple[int, int]:
+        """The numbers of rows and of their entries."""
+        return self._rows["node"].size, self._to.size
+
+    def rows_from(self, first: tuple[int, int]) -> dict[str, np.ndarray]:
+        """The rows and entries from some numbers on, as they were added, with the `count` of entries."""
+        parts = {name: x.array()[first[0] :] for name, x in self._rows.items()}
+        return parts | {"to": self._to.array()[first[1] :], "by": self._by.array()[first[1] :]}
 
     def _first(self) -> tuple[Integers, Floats, float]:
         """Nodes and weights of the initial measure, and the bound of the rest."""
@@ -308,11 +325,24 @@ class ExactBeliefs:
     def is_exact(self, node: int, action: int, to: list[int], deviation: float) -> bool:
         """True if the beliefs of the nodes `to` are all that follows, and stored within a deviation."""
         key = node, action
+        if key not in self._checked and self._is_deep((node, *to)):
+            self._checked[key] = False
         if key not in self._checked:
             self._checked[key] = self._follows(node, action, to) and all(
                 self._is_near(j, deviation) for j in (node, *to)
             )
         return self._checked[key]
+
+    def _is_deep(self, nodes: tuple[int, ...]) -> bool:
+        """True if exact beliefs would take too many steps from the initial one."""
+        parent = self.graph.parent.array()
+        for node in nodes:
+            steps = 0
+            while node >= 0 and node not in self._belief:
+                node, steps = int(parent[node]), steps + 1
+                if steps > _DEEPEST:
+                    return True
+        return False
 
     def _follows(self, node: int, action: int, to: list[int]) -> bool:
         after = self.after(node, action)

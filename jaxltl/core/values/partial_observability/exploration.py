@@ -246,13 +246,14 @@ def _grow(state: Exploration, rows: BeliefRows, bound: NodeValues, room: int, de
     score = np.where(graph.expanded, 0, mass * np.abs(state.outer - state.inner))
     score = np.where(np.isfinite(score), score, mass)
     if not (score > 0).any():
-        return False
+        # The policy reaches no leaf: it stays in end components of inexact beliefs. The oldest leaves follow.
+        score = np.where(graph.expanded, 0, 1 / (1 + np.arange(graph.size)))
+        deepest = 0
     done = 0
     for depth in range(deepest + 1):
         chosen = np.flatnonzero(score > 1e-12 * score.max())
         chosen = chosen[np.argsort(-score[chosen], kind="stable")][: max(amount - done, 1)]
-        before = len(graph._rows["node"].parts)
-        size = graph.size
+        size, before = graph.size, graph.num_rows
         graph.expand(np.sort(chosen))
         state.extend()
         done += chosen.size
@@ -267,16 +268,14 @@ def _grow(state: Exploration, rows: BeliefRows, bound: NodeValues, room: int, de
 
 
 def _below(
-    state: Exploration, parents: Integers, mass: Floats, before: int
+    state: Exploration, parents: Integers, mass: Floats, before: tuple[int, int]
 ) -> tuple[Floats, Floats]:
     """Scores of the unexpanded successors of some nodes under their best actions."""
     graph, problem = state.graph, state.problem
-    parts = {name: x.parts for name, x in graph._rows.items()}
-    first = before if len(parts["node"]) > before else 0
-    node, gain, lost, count = (
-        np.concatenate(parts[name][first:]) for name in ("node", "gain", "lost", "count")
+    part = graph.rows_from(before)
+    node, gain, lost, count, to, by = (
+        part[name] for name in ("node", "gain", "lost", "count", "to", "by")
     )
-    to, by = (np.concatenate(x.parts[first:]) for x in (graph._to, graph._by))
     row = np.arange(node.size).repeat(count)
     value = gain + lost + np.bincount(row, by * state.outer[to], minlength=node.size)
     order = np.lexsort((-value if problem.maximize else value, node))
