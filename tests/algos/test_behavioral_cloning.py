@@ -15,7 +15,7 @@ from jaxltl.algos import behavioral_cloning as bc
 from jaxltl.core.models.construct.batch import stack_products, unstack_product
 from tests.algos.cases import LearnerCase, world
 
-PROGRAMS = 300  # that the default tests compile at most
+PROGRAMS = 450  # that the default tests compile at most
 
 SMALL = bc.DensePolicy(hidden=(16,))
 

@@ -16,7 +16,7 @@ from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.programs.simulation import list_choices, program_actions, program_environment
 
-PROGRAMS = 400  # that the default tests compile at most
+PROGRAMS = 600  # that the default tests compile at most
 
 CHAIN = """dtmc global g : [0..2];
 formula up = x<3 & b;

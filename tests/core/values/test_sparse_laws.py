@@ -29,7 +29,7 @@ from tests.support import (
     stack,
 )
 
-PROGRAMS = 250  # that the default tests compile at most
+PROGRAMS = 350  # that the default tests compile at most
 
 COUNT = 9
 
