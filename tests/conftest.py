@@ -144,7 +144,9 @@ def pytest_collection_finish() -> None:
 
 _MAPS, _MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _compiled, _all_compiled = [0], [0]
-PROGRAMS = 300  # that a file's default tests compile at most; one that needs more declares its own
+MAX_PROGRAMS = (
+    300  # that a file's default tests compile at most; one that needs more declares its own
+)
 
 
 def _count(event: str, *_: object, **__: object) -> None:
@@ -165,10 +167,10 @@ def declared_programs(request: pytest.FixtureRequest):
     before = _all_compiled[0]
     yield
     number, module = _all_compiled[0] - before, getattr(request.node, "obj", None)
-    most = getattr(module, "PROGRAMS", PROGRAMS)
+    most = getattr(module, "MAX_PROGRAMS", MAX_PROGRAMS)
     assert number <= most or "not slow" not in request.config.option.markexpr, (
         f"{request.node.nodeid} compiled {number} programs, of at most {most}: share shapes and jitted "
-        "functions, use NumPy outside of jit, or declare PROGRAMS in the file"
+        "functions, use NumPy outside of jit, or declare MAX_PROGRAMS in the file"
     )
 
 

@@ -31,7 +31,7 @@ from jaxltl.cli import main
 from notebooks.execute import difference
 from tests.pages import MARKS, PAGES, ROOT, Block, blocks, name_of
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 RUN = ("python", "sh", "pycon", "console")
 # Of a page that says nothing of how it is tested: what is slow in it, by a text.

@@ -15,7 +15,7 @@ from jaxltl.algos import behavioral_cloning as bc
 from jaxltl.core.models.construct.batch import stack_products, unstack_product
 from tests.algos.cases import LearnerCase, world
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 SMALL = bc.DensePolicy(hidden=(16,))
 

@@ -24,7 +24,7 @@ from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.envs.gridworld import gridworld
 from tests.algos.cases import LearnerCase, world
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 TASK = "!c U (a & F b)"
 MAP = "a . b\n. c .\nd . ."

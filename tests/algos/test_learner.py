@@ -31,7 +31,7 @@ from jaxltl.core.types import Status
 from tests.algos.cases import LEARNERS, LearnerCase
 from tests.support import counted_traces, lane
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 
 @struct.dataclass

@@ -20,7 +20,7 @@ from jaxltl.core.values.evaluation.optimality_gap import optimality_gap, tabulat
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import events_seen, letter_world
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 NAMES = ("a", "b", "c")
 EVENTS = make_events(NAMES)

@@ -17,7 +17,7 @@ from jaxltl.core.models.construct.lifting import allowed_steps
 from tests.algos.cases import LearnerCase, numbers, world
 from tests.support import assert_gradients
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 UP, DOWN, LEFT, RIGHT = range(4)
 TASK = "F (c & F g)"

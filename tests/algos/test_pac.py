@@ -18,7 +18,7 @@ from jaxltl.core.models.ops.operators import expectation
 from tests.reference_games import buchi, random_game
 from tests.support import as_mdp, counted_traces
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 SINGLE, DOUBLE = np.float32, np.float64
 

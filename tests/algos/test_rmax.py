@@ -19,7 +19,7 @@ from tests import reference_games
 from tests.algos.cases import LearnerCase, alternating_game
 from tests.support import as_mdp, lane, stack
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 
 @cache

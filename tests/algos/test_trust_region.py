@@ -32,7 +32,7 @@ from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.types import Status
 from tests.algos.cases import LearnerCase, choice_observe, choice_reset, choice_step
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 # --- worlds -----------------------------------------------------------------------------------
 

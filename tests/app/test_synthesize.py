@@ -15,7 +15,7 @@ from jaxltl.io.policies import load_policy
 from tests.support import replaced
 from tests.test_cli import failure, run
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 SQUARE = """
 [game]

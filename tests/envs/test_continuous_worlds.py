@@ -17,7 +17,7 @@ from jaxltl.core.continuous.regions import box
 from jaxltl.core.environments.episodes import with_time_limit
 from jaxltl.envs import continuous_worlds as worlds
 
-PROGRAMS = 600  # that the default tests compile at most
+MAX_PROGRAMS = 600  # that the default tests compile at most
 
 CASES = {
     "linear": worlds.linear,

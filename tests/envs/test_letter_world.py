@@ -10,7 +10,7 @@ import pytest
 from jaxltl.core.environments.episodes import auto_reset_step
 from jaxltl.envs.letter_world import ACTIONS, connected_cells, is_connected, letter_world
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 MAP = """

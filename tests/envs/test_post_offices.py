@@ -15,7 +15,7 @@ from jaxltl.core.models.game import is_deterministic
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.envs.post_offices import ACTIONS, patrol, patrol_reward, post_offices, surveillance
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 DISCOUNT = 0.6
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}

@@ -11,7 +11,7 @@ from jaxltl.core.continuous.noise import gaussian, triangular, uniform
 from jaxltl.core.continuous.regions import box, where_positive
 from jaxltl.core.environments.environment import Box, Finite
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 UNIT = {"domain": ([-1.0, -1.0], [1.0, 1.0])}
 

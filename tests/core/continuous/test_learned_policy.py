@@ -22,7 +22,7 @@ from jaxltl.core.environments.task_environment import TaskObservation
 from jaxltl.core.values.evaluation.evaluation import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 
-PROGRAMS = 600  # that the default tests compile at most
+MAX_PROGRAMS = 600  # that the default tests compile at most
 
 FORMULA = "!pit U goal"
 

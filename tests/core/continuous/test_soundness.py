@@ -35,7 +35,7 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl
 from tests.reference_logic import random_formula
 from tests.support import seeds
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 LEVEL = 1e-6
 

@@ -10,7 +10,7 @@ import pytest
 
 from jaxltl.core.enclosures.linear_bounds import enclose, over_boxes
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 # Constants are equal in single and double precision, so that all tests are of one function.
 MATRIX = np.random.default_rng(0).normal(size=(2, 5)).astype(np.float32).astype(float)

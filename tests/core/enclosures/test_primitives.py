@@ -12,7 +12,7 @@ from jax import lax
 from jaxltl.core.enclosures import primitives, program
 from jaxltl.core.enclosures.linear_bounds import enclose, linear_bounds, over_boxes
 
-PROGRAMS = 600  # that the default tests compile at most
+MAX_PROGRAMS = 600  # that the default tests compile at most
 
 
 def unpacked(x):

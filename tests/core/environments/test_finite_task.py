@@ -20,7 +20,7 @@ from jaxltl.core.environments.monitor import (
 from tests.reference_logic import holds_by_definition, random_formula, subsets, words
 from tests.support import counted_traces
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 COLUMNS = ("noise", "goal", "obstacle")
 YES, NO, OPEN = Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNDECIDED

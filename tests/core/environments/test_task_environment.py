@@ -28,7 +28,7 @@ from jaxltl.core.environments.task_environment import (
 from tests import reference
 from tests.support import as_mdp, lane, random_action
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 NAMES = ("a", "b", "c")
 FORMULAS = (

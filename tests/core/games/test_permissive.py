@@ -19,7 +19,7 @@ from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
 from tests import reference_games
 from tests.support import as_mdp
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 CORNERS = "system_upper_left | system_lower_right"
 

@@ -26,7 +26,7 @@ from jaxltl.envs.robots import grid_game
 from tests import reference
 from tests.support import as_mdp, random_action
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 SAFE = "G !collision"
 OFTEN = "G !collision & G F (system_a | system_b)"

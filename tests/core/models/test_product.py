@@ -10,7 +10,7 @@ from jaxltl.core.automata.automaton import make_automaton
 from tests import reference
 from tests.support import as_mdp, bit_labels, random_product, stack
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 READINGS = ("entry", "exit")
 

@@ -16,7 +16,7 @@ from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.programs.simulation import list_choices, program_actions, program_environment
 
-PROGRAMS = 600  # that the default tests compile at most
+MAX_PROGRAMS = 600  # that the default tests compile at most
 
 CHAIN = """dtmc global g : [0..2];
 formula up = x<3 & b;

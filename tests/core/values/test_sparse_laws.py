@@ -29,7 +29,7 @@ from tests.support import (
     stack,
 )
 
-PROGRAMS = 350  # that the default tests compile at most
+MAX_PROGRAMS = 350  # that the default tests compile at most
 
 COUNT = 9
 

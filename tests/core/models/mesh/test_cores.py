@@ -17,7 +17,7 @@ from jaxltl.core.models.mesh import cores
 from jaxltl.core.models.mesh.cores import over_cores
 from tests.support import counted_traces, lane
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 TIMEOUT = 60.0  # seconds, for threads that never meet
 

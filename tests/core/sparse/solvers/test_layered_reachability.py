@@ -13,7 +13,7 @@ from jaxltl.core.values.undiscounted import reaching
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.support import random_product
 
-PROGRAMS = 450  # that the default tests compile at most
+MAX_PROGRAMS = 450  # that the default tests compile at most
 
 
 def cases(count, seed, num_memory=4):
