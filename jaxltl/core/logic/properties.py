@@ -358,9 +358,8 @@ class _Parser(PathParser):
         while not parts or self.accept(","):
             first = self.token
             part = self.property_()
-            self.require(
-                part.operator != "multi", "a property with P or R; multi stands outermost", first
-            )
+            is_number = part.operator in ("P", "R", "T", "LRA") and part.aggregate is None
+            self.require(is_number, "a property with P or R; multi stands outermost", first)
             self.require(
                 part.nature is None,
                 "one direction, max or min: several objectives are solved for without intervals",

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
 from jaxltl.core.logic.comparisons import Definitions
+from jaxltl.core.logic.good_prefixes import is_plain_reachability
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
@@ -98,6 +99,7 @@ def _solved(pomdp: POMDP, prop: Property, objective: str, width: float) -> Solut
             "variable of the program."
         )
     is_total = isinstance(path, Formula) and prop.unreached == "infinite"
+    is_total = is_total and isinstance(path, Formula) and is_plain_reachability(path)
     if prop.operator not in ("R", "T") or not is_total or isinstance(path, Earned):
         raise ValueError(
             f"{prop.text}: of a POMDP there are bounds of P with a co-safe or safe formula, and of Rmin and Tmin "

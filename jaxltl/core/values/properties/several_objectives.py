@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
+from jaxltl.core.logic.good_prefixes import is_plain_reachability
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
@@ -103,6 +104,10 @@ def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
     if reward is None:
         reward = choice_reward(model, None)  # which names the rewards
     if isinstance(path, Formula):
+        if not is_plain_reachability(path):
+            raise ValueError(
+                f"{prop.text}: inside multi(...) rewards are earned until a state formula holds, R [ F ... ]."
+            )
         target = states_satisfying(model, path.operands[0], prop.text)
         return {"reward": reward, "target": target}
     return {"reward": reward}

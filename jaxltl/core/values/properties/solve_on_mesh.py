@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxltl.core import validation
+from jaxltl.core.logic.good_prefixes import is_plain_reachability
 from jaxltl.core.logic.labels import is_boolean, satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
@@ -117,12 +118,15 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> MeshProperty:
 def _path(prop: Property) -> Formula:
     """The reduction of the property, if it is supported."""
     path = prop.path
-    known = prop.operator in ("P", "R", "T") and prop.unreached == "infinite"
-    if known and isinstance(path, Formula):
-        return path
+    if isinstance(path, Formula):
+        is_reach = is_plain_reachability(path) and prop.unreached == "infinite"
+        if prop.operator == "P" or (prop.operator in ("R", "T") and is_reach):
+            return path
     quantity = {
         "LRA": "averages in the long run",
         "multi": "several objectives",
+        "value": "expressions",
+        **dict.fromkeys("EA", "quantifiers over paths"),
         "P": "bounds on steps or rewards",
     }.get(prop.operator, f"rewards [ {path} ]")
     raise ValueError(

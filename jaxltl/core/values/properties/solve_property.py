@@ -136,9 +136,9 @@ def solve_property(
       [0.5]
     """
     if isinstance(model, POMDP):
-        if states is not None or relative or exact:
+        if states is not None or relative or exact or fair:
             raise ValueError(
-                "states, relative and exact are not for a POMDP, which is solved from its initial belief."
+                "states, relative, exact and fair are not for a POMDP, which is solved from its initial belief."
             )
         return solve_partially_observable(model, prop, tolerance)
     source = checkable(model)

@@ -485,6 +485,20 @@ def test_a_reward_without_a_name_is_the_first_of_a_program(models):
     assert answer(models, "lanes", "R=? [ C<=2 {x=2} ]; Rmax=? [ C<=2 ]").value == [2]
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        'multi(R{"time"}min=? [ "goal" U x>2 ], P>=0 [ F x=3 ])',
+        'multi(R{"time"}min=? [ F X x>2 ], P>=0 [ F x=3 ])',
+        "multi(E [ F x=3 ], P>=0 [ F x=3 ])",
+        "multi(filter(max, Pmax=? [ F x=3 ]), P>=0 [ F x=3 ])",
+    ],
+)
+def test_objectives_are_not_read_as_others(models, text):
+    with pytest.raises(ValueError, match=r"until a state formula holds|a property with P or R"):
+        answer(models, "lanes", text)
+
+
 REFUSED = {
     "filter(forall, pow(2,s-1)>0)": "exponent of an integer is negative",
     "const int c = 0; pow(2,c-1)": "exponent of an integer is negative",

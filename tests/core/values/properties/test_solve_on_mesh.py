@@ -91,6 +91,9 @@ def test_bounds_are_gone_on_from(model, sharded, text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('R{"r"}max=? [ "a" U "b" ]', "rewards"),
+        ('E [ F "a" ]', "quantifiers over paths"),
+        ("1 + 2", "expressions"),
         ('Pmax=? [ F<=3 "win" ]', "bounds on steps or rewards are not solved for over a mesh"),
         ('R{"games"}max=? [ C<=3 ]', r"rewards \[ C<=3 \] are not solved for over a mesh"),
         ('LRAmax=? [ "win" ]', "averages in the long run are not solved for over a mesh"),
