@@ -184,10 +184,12 @@ class UmbModel:
         pairs = zip(self.branch_start, self.branch_start[1:])
         self.rows = [(target[a:b], *distribution(*[tuple(x[a:b]) for x in ends])) for a, b in pairs]
         # The player that chooses: 0 the system, 1 the environment, 2 nobody.
-        owner = read_numbers(contents, "state-to-player", "uint32", states, [0] * states)
+        default = [0] * states if players < 2 else ()
+        owner = read_numbers(contents, "state-to-player", "uint32", states, default)
+        need(max(owner) < max(1, players), "a state is owned by no player of the model")
         sizes = map(sub, self.row_start[1:], self.row_start)
         self.owner = [x if size > 1 else 2 for x, size in zip(owner, sizes)]
-        need({*self.owner} <= {2, *range(min(players, 2))}, "a state has choices, but no player")
+        need(players < 3, "a model of more than two players is not covered")
         self.opponents = {"nature": len(ends) > 1, "environment": players > 1}
         self.num_states = states
         self.initial = self._bits("state-is-initial", [2**64 - 1] * states)
@@ -462,23 +464,36 @@ def excludes(method: str, k: int, n: int, x: Fraction, chance: Fraction) -> bool
     if x * n >= k:
         return False
     (a, d), j = x.as_integer_ratio(), n - k
-    likelihood = math.comb(n, k) * a**k * (d - a) ** j
-    if method == "anytime":  # the mixture of Jeffreys over the likelihood is a martingale
-        mixture = math.comb(2 * k, k) * math.comb(2 * j, j) * d**n
-        return likelihood * 4**n <= chance * mixture
     if method == "hoeffding":  # exp(2 n (k/n - x)^2) >= 2 / chance, from below
-        y, term, total = int(2 * n * (Fraction(k, n) - x) ** 2 * 2**64), 2**64, 0
-        for i in range(1, 2**12):
-            total, term = total + term, (term * y >> 64) // i
+        y, term, total, i = int(2 * n * (Fraction(k, n) - x) ** 2 * 2**64), 2**64, 0, 0
+        while term and total * chance < 2**65 and i < 2**12:
+            i, total = i + 1, total + term
+            term = (term * y >> 64) // i
         return total * chance >= 2**65
-    need(method == "clopper-pearson", f"the method {method!r:.40} is unknown")
-    # The tail P(Bin(n, x) >= k), rounded up to 256 bits below its first term.
-    shift = max(0, likelihood.bit_length() - 256)
-    total = term = (likelihood >> shift) + 1
-    for i in range(k, n):
+    need(method in ("anytime", "clopper-pearson"), f"the method {method!r:.40} is unknown")
+    anytime = (
+        method == "anytime"
+    )  # the likelihood over the mixture of Jeffreys, its inverse a martingale
+    factors = [
+        (2 * (j + i) * a, (2 * i - 1) * d) if anytime else ((j + i) * a, i * d)
+        for i in range(1, k + 1)
+    ]
+    factors += [
+        (2 * i * (d - a), (2 * i - 1) * d) if anytime else (d - a, d) for i in range(1, j + 1)
+    ]
+    mantissa, exponent = 2**320, -320  # of the product of the factors, rounded up to 320 bits
+    for above, below in factors:
+        mantissa = -(-mantissa * above // below)
+        shift = mantissa.bit_length() - 320
+        mantissa, exponent = (
+            -(-mantissa >> shift) if shift > 0 else mantissa << -shift,
+            exponent + shift,
+        )
+    total = term = mantissa
+    for i in range(k, n if not anytime else k):  # the tail P(Bin(n, x) >= k), term by term
         term = -(-term * (n - i) * a // ((i + 1) * (d - a)))
         total += term
-    return total << shift <= chance / 2 * d**n
+    return total * Fraction(2) ** exponent <= (chance if anytime else chance / 2)
 
 
 # --- the question ---------------------------------------------------------------------------------
@@ -836,7 +851,10 @@ def verdict(path: str, limit: int = 2**30) -> tuple[int, list[str]]:
             num_nodes, text = ClaimChecker(file, claim).check()
             lines += [f"claimed: {text}", f"checked: {num_nodes} nodes of the claim's graph"]
         trust = "; ".join(x for x in (file.trusted, file.unproven) if x) or "nothing else"
-        lines += [f"on trust: that the model is the one meant; {trust}"]
+        parts = ["model", *(x for x in ("policy", "observations") if x in file.question)]
+        meant = "is the one meant" if len(parts) == 1 else "are those meant"
+        lines += [f"on trust: that the {' and '.join(parts)} {meant}; {trust}"]
+        status = 3 if file.unproven else 0
         lines += ["ACCEPTED, given the automaton" if file.unproven else "ACCEPTED"]
     except Refusal as why:
         status, lines = 1, [f"REFUSED: {why}"]
