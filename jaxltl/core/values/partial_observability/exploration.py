@@ -67,6 +67,7 @@ class Exploration:
     best_outer: float
     best_inner: float
     best: tuple[Integers, Integers]  # the best controller: start memory and reached memory states
+    end: float  # the time after which controllers are improved no more
 
     def extend(self) -> None:
         """Bounds of the nodes that are new."""
@@ -133,7 +134,8 @@ class Exploration:
                 break
             best = steps, evaluated, start
             work -= evaluated.bound.size
-            if work < 0 or not problem.maximize or not leaves.size:
+            late = work < 0 or time.monotonic() > self.end
+            if late or not problem.maximize or not leaves.size:
                 break
             some = rows.graph.measures().take(leaves)
             value, chosen = library.alternatives(some, evaluated, library.steps.size)
@@ -193,7 +195,16 @@ def explore(
     none, ends = np.zeros(0, np.int64), (np.inf, -np.inf)
     outer, inner = ends if problem.maximize else ends[::-1]
     state = Exploration(
-        problem, library, graph, np.zeros(0), np.zeros(0), none, outer, inner, (none, none)
+        problem,
+        library,
+        graph,
+        np.zeros(0),
+        np.zeros(0),
+        none,
+        outer,
+        inner,
+        (none, none),
+        begin + max_seconds,
     )
     initial = np.flatnonzero(problem.initial > 0)
     for start in library.start:
