@@ -424,7 +424,40 @@ RATIONAL = {
     },
 }
 
+SPELLINGS = {
+    "lanes": {
+        'Pmax=? [ F<=3 "goal" ]': 15 / 16,
+        'Pmax =? [ F "goal" ]': 1,
+        'Pmax= ? [F("goal")]': 1,
+        'P max=? [ F "goal" ]': 1,
+        "Pmax=? [ X X x=3 ]": 0.75,
+        'Pmax=? [ F[1,2] "goal" ]': 0.75,
+        'Pmax=? [ F>=2 "goal" ]': 1,
+        'Pmax=? [ F{"time"}<=3 "goal" ]': 15 / 16,
+        'Pmax=? [ "goal" ]': 0,
+        'Pmax=? [ F "goal" => F x=1 ]': 1,
+        'Pmax=? [ F "goal" & F "far" ]': 0,
+        "Pmin=? [ true U x>2 ]": 0,
+        'Pmin=? [ F "deadlock" ]': 0,
+        "P>=0.5 [ F x>2 ]": False,
+        'Pmax>=1 [ F "goal" ] & Pmin<=0 [ F "goal" ]': True,
+        '"a":Pmax=? [ F "goal" ];"a"': 1,
+        'R{"time"}max=? [ C ]': inf,
+        'R{"time"}min=? [ C ]': 5 / 3,
+        'R{"time"}min=? [ S ]': 0,
+        'R{"time"} min =? [ F "goal" | "far" ]': 5 / 3,
+        'R{"toll"}max=? [ C<=2 ]': 6,
+        "R{1}min=? [ F x>2 ]": 5 / 3,
+        "T min=? [ F x>2 ]": 5 / 3,
+        'R{"time"}min<=2 [ F x>2 ]': True,
+        'R{"time"}<5 [ C<=2 ]': True,
+        'filter(avg, R{"time"}min=? [ F x>2 ], x<3)': 16 / 9,
+        "LRAmax=? [ x=1 ]": 0.5,
+    },
+}
+
 GROUPS = {
+    "spellings": SPELLINGS,
     "rational": RATIONAL,
     "ctl": CTL,
     "cosafe": COSAFE,
