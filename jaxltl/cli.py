@@ -557,9 +557,9 @@ _EXPERIMENTS = {
 def verify(certificate: Path) -> None:
     """Check a certificate by exact arithmetic, independently of all solvers.
 
-    The same as python jaxltl/checker.py FILE, which runs without the package. The exit status is 0
-    if the certificate is accepted, 1 if a condition does not hold, 2 if the file is no certificate, 3 if all is proven but the automaton.
-    See docs/certificates.md.
+    The same as python jaxltl/checker.py FILE, which runs without the package. The exit status is 0 if
+    the certificate is accepted, 1 if a condition does not hold, 2 if the file is no certificate, 3 if
+    all but the automaton is proven. See docs/certificates.md.
     """
     from jaxltl import checker
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.array_types import Booleans
+from jaxltl.core.array_types import Booleans, PyTree
 from jaxltl.core.language.expressions import (
     Expression,
     LanguageError,
@@ -29,16 +29,6 @@ from jaxltl.core.language.exact_program import exact_program
 from jaxltl.core.language.resolve import constant_value
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
-
-
-class Meaning(Protocol):
-    """A comparison or a property that a name in an expression stands for."""
-
-    @property
-    def text(self) -> str: ...
-
-    @property
-    def is_number(self) -> bool: ...
 
 
 @brief(fields=("text",))
@@ -60,7 +50,9 @@ class Comparison:
 
     text: str
     expression: Expression
-    definitions: tuple[tuple[str, Meaning], ...] = ()
+    definitions: tuple[
+        tuple[str, PyTree], ...
+    ] = ()  # comparisons, and properties of a module above
 
     @property
     def is_number(self) -> bool:
