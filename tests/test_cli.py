@@ -194,7 +194,7 @@ def test_learn_writes_its_results(learned):
     (proof,) = written["certificates"]
     assert run("verify", place / "out" / proof["file"]).output.endswith("\nACCEPTED\n")
     assert len(proof["claims"]) == 2 and all("of a given policy" in x for x in proof["claims"])
-    assert "on trust: that the model is the one meant" in page and "jaxltl verify" in page
+    assert "on trust: that the model and policy are those meant" in page and "jaxltl verify" in page
     # What has a live part is not shown twice; the steps have none.
     assert page.count("data:image") == 1 and page.count("<svg") == 2 + 3
     assert "http" not in page and "prefers-color-scheme: dark" in page

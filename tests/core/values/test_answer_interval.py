@@ -355,7 +355,7 @@ def test_what_has_no_intervals_takes_one_direction():
         ('R{"time"}min=? [ F "goal1" ]', r'ask for R\{"time"\}minmin=\? or R\{"time"\}minmax=\?'),
         (
             "Rminmax=? [ C ]",
-            r"rewards for ever \(C\) are not solved for where probabilities are int",
+            r"rewards for ever \(C, F0, Fc\) are not solved for where probabilities are int",
         ),
         ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
         ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),

@@ -318,7 +318,7 @@ def test_what_is_refused():
     put = partial(to_mesh, world)
     with pytest.raises(ValueError, match="state 3 is -1; expected total"):
         jl.total_reward(world, put(np.where(np.arange(S)[:, None] == 3, -1, reward)), put(target))
-    with pytest.raises(ValueError, match="over a mesh, give a target"):
+    with pytest.raises(ValueError, match="over a mesh do; give one"):
         jl.total_reward(world, put(reward))
     with pytest.raises(ValueError, match="'cost' is no reward of this ShardedMDP"):
         jl.total_reward(world, "cost", put(target))
