@@ -25,7 +25,8 @@ NOT_ABOUT_CHOICE = {
     "expectation", "pushforward", "exists_successor", "forall_successor", "sample_successor",
     "make_trajectories", "rollout", "lift_trajectories", "project_trajectories", "make_counts",
     "align_counts", "states_with_label", "reach", "safety", "buchi", "cobuchi",
-    "gr1", "parity", "shard", "to_mesh", "make_game", "make_multiplayer_game", "make_parametric", "make_pomdp", "choice_reward",
+    "gr1", "parity", "shard", "to_mesh", "make_game", "make_multiplayer_game", "make_parametric", "make_pomdp",
+    "choice_reward",
     "occurring_letters", "make_interval", "stack_products", "write_model",
     "tabulate_policy", "model_from_parts", "from_mesh", "to_sparse", "to_padded", "apply_strategy",
 }  # fmt: skip
