@@ -121,8 +121,8 @@ def solve_property(
     Returns:
       :class:`Answer`. If narrower bounds do not decide a threshold either, `holds` is None and the
       status is not CONVERGED. For ``multi(...)``, the result of
-      :func:`~jaxltl.core.values.multi_objective.multi_objective.multi_objective`. Concrete arrays
-      only; not differentiable.
+      :func:`~jaxltl.core.values.multi_objective.multi_objective.achievable`, ``constrained_optimum`` or
+      ``pareto``, if no, one or all objectives have no threshold. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: an unknown label or reward; a missing direction; a property that is not
