@@ -315,12 +315,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 @main.command()
 @click.argument("model_file", metavar="MODEL", type=_PATH)
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
-@click.option(
-    "--strategy",
-    type=_PATH,
-    metavar="FILE",
-    help="File for optimal strategies, as JSON.",
-)
+@click.option("--strategy", type=_PATH, metavar="FILE", help="File of optimal strategies, as JSON.")
 @click.option(
     "--tolerance",
     default=1e-6,
@@ -330,6 +325,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 )
 @click.option("--relative", is_flag=True, help="Width relative to the value in any case.")
 @click.option("--exact", is_flag=True, help="Values as fractions, of models of moderate size.")
+@click.option("--fair", is_flag=True, help="Probabilities over the fair strategies of an MDP.")
 @_as_json
 @click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
 @click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
@@ -357,6 +353,7 @@ def solve(
     tolerance: float,
     relative: bool,
     exact: bool,
+    fair: bool,
     as_json: bool,
     constants: str | None,
     max_states: int | None,
@@ -385,6 +382,7 @@ def solve(
         ("--relative", relative or None, False),
         ("--certificate", certificate, False),
         ("--exact", exact or None, False),
+        ("--fair", fair or None, False),
         ("--checkpoint", checkpoint, True),
     )
     for option, value, with_mesh in options:
@@ -395,8 +393,10 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (program is None or strategy or relative or certificate or exact):
-        others = "--strategy, --relative, --exact and --certificate"
+    if method == "partial" and (
+        not program or strategy or relative or certificate or exact or fair
+    ):
+        others = "--strategy, --relative, --exact, --fair and --certificate"
         raise ValueError(f"--method partial is for programs, without {others}.")
     from jaxltl.core.files import atomic_write
 
@@ -411,7 +411,9 @@ def solve(
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            answers = solving.solve(model, questions, tolerance, relative=relative, exact=exact)
+            answers = solving.solve(
+                model, questions, tolerance, relative=relative, exact=exact, fair=fair
+            )
         else:
             from jaxltl.app import solve_on_mesh
 
@@ -458,12 +460,7 @@ def solve(
     type=click.Choice(["seen", "complete"]),
     help="Assumption on possible transitions: those in the log, or all (the default).",
 )
-@click.option(
-    "--least-probability",
-    type=float,
-    metavar="P",
-    help="Assume that no possible transition is less likely than P.",
-)
+@click.option("--least-probability", type=float, metavar="P", help="Least chance of a transition.")
 @click.option(
     "--method",
     default="anytime",

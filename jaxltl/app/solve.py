@@ -191,15 +191,18 @@ def solve(
     queries: Sequence[PropertyQuery],
     tolerance: float,
     max_states: int | None = None,
+    *,
     relative: bool = False,
     exact: bool = False,
+    fair: bool = False,
 ) -> Iterator[PropertyResult]:
     """Yields the result of each property; of a program, some states are explored for each."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
     def answer(prop: Property) -> AnyAnswer:
         if not isinstance(model, Program):
-            return solve_property(model, prop, tolerance=tolerance, relative=relative, exact=exact)
+            how = {"relative": relative, "exact": exact, "fair": fair}
+            return solve_property(model, prop, tolerance=tolerance, **how)
         from jaxltl.core.programs.build import MAX_STATES
         from jaxltl.core.programs.partial import solve_program
 

@@ -400,3 +400,18 @@ def test_no_number_is_given_where_the_bounds_exclude_nothing(low, high):
     assert "0.25" not in text and f"in [{low}, {high}]" in text and "PRECISION" in text
     assert module.result_entry(result)["value"] is None
     assert f"lower=[{low:g}], upper=[{high:g}]" in repr(answer) and "PRECISION" in repr(answer)
+
+
+def test_fair_strategies_leave_a_loop(tmp_path):
+    model = tmp_path / "wait.prism"
+    model.write_text(
+        """mdp module m s : [0..2]; [wait] s=0 -> true; [go] s=0 -> 0.5:(s'=1) + 0.5:(s'=2);
+        [] s>0 -> true; endmodule"""
+    )
+    question = "Pmin=? [ F s=1 ]"
+    for options, value in (((), 0.0), (("--fair",), 0.5)):
+        done = run(model, question, *options, "--json")
+        assert done.exit_code == 0, done.output
+        (found,) = json.loads(done.stdout.splitlines()[-1])["results"]
+        assert abs(found["value"] - value) < 1e-6
+    assert run(model, "Rmin=? [ F s=1 ]", "--fair").exit_code == 2
