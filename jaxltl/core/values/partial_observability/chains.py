@@ -191,7 +191,7 @@ def controlled_chain(pomdp: POMDP, policy: FiniteMemoryPolicy) -> SparseMDP:
       >>> pomdp = jl.models.make_pomdp(world, [0, 0])
       >>> alternate = jl.FiniteMemoryPolicy(np.array([[0, 1]]), np.array([0]), np.array([[1, 0]]))
       >>> chain = controlled_chain(pomdp, alternate)
-      >>> jl.solve_property(chain, 'P=? [ F G "b" ]').value.tolist()
+      >>> jl.solve_property(chain, 'P=? [ G F "b" ]').value.tolist()
       [1.0]
     """
     from scipy.sparse import csr_array
