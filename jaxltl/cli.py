@@ -195,7 +195,7 @@ def synthesize(
         place = report.place_of(solved, environment)
         progress("writing")
         written = report.write(solved, out, place, time.perf_counter() - begin)
-    click.echo(report.report_of(solved).table(written))
+    click.echo(report.report_of(solved).table(written, out))
     click.echo(f"\nwrote {out}/result.json and the files beside it")
     if as_json:
         _print_json(written)

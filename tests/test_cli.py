@@ -193,6 +193,7 @@ def test_learn_writes_its_results(learned):
     page = (place / "out" / "report.html").read_text()
     (proof,) = written["certificates"]
     assert run("verify", place / "out" / proof["file"]).output.endswith("\nACCEPTED\n")
+    assert f"jaxltl verify {place / 'out' / proof['file']}" in result.stdout
     assert len(proof["claims"]) == 2 and all("of a given policy" in x for x in proof["claims"])
     assert "on trust: that the model and policy are those meant" in page and "jaxltl verify" in page
     # What has a live part is not shown twice; the steps have none.

@@ -119,7 +119,7 @@ def learn(task_file: Path, options: RunOptions, console: Console) -> Finished | 
         result = result or run.interruptible(task)
     if not group.is_first or result is None:
         return None
-    return Finished(out, result, job.report.table(result), before)
+    return Finished(out, result, job.report.table(result, out), before)
 
 
 def directory(out: Path | None, name: str) -> Path:

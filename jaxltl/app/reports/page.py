@@ -8,6 +8,7 @@ import json
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,11 +52,11 @@ class Report:
         values = {"remarks": self.remarks(result), **self.values(result)}
         return render_page(f"{self.name}.html", result, parts, pictures, file_text, **values)
 
-    def table(self, result: Result) -> str:
-        """The result as text for the terminal."""
+    def table(self, result: Result, out: Path = Path()) -> str:
+        """The result, in a directory, as text for the terminal."""
         lines = render_text(f"{self.name}.txt", result=result, **self.values(result))
         remarks = self.remarks(result) if self.has_remarks else []
-        proofs = certificate_lines(result.get("certificates", ()))
+        proofs = certificate_lines(result.get("certificates", ()), out)
         return "\n".join(lines + remark_lines(remarks) + ([""] if proofs else []) + proofs)
 
     def remarks(self, result: Result) -> list[Remark]:
