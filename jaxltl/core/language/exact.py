@@ -53,8 +53,13 @@ def is_inexact(expression: Expression) -> bool:
     return expression.operator in ("/", "pow", "log") or any(map(is_inexact, expression.operands))
 
 
-def _written(value: float, text: str, place: int) -> Fraction:
-    """The decimal at a place of a text, if it rounds to the value; else its shortest decimal."""
+def _written(value: float, text: str, place: int) -> Fraction | float:
+    """The decimal at a place of a text, if it rounds to the value; else its shortest decimal.
+
+    Infinite values, of a division by zero, remain doubles.
+    """
+    if not math.isfinite(value):
+        return value
     match = _NUMBER.match(text, place) if place >= 0 else None
     if match is not None:
         exponent = re.split("[eE]", match[0])[1:] or ["0"]

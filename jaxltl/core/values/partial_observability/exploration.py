@@ -249,13 +249,19 @@ def explore(
     )
 
 
+def _scores(state: Exploration, mass: Floats) -> Floats:
+    """Gaps of leaves, weighted by visits; the visits alone where a gap is infinite or undefined."""
+    with np.errstate(invalid="ignore"):
+        score = np.where(state.graph.expanded, 0, mass * np.abs(state.outer - state.inner))
+    return np.where(np.isfinite(score), score, mass)
+
+
 def _grow(state: Exploration, rows: BeliefRows, bound: NodeValues, room: int, deepest: int) -> bool:
     """Expands leaves of the greatest gaps, weighted by visits, and some beliefs below them."""
     graph = state.graph
     amount = min(room, max(_ROUND, int(_SHARE * graph.expanded.sum())))
     mass = visits(rows, bound.row)
-    score = np.where(graph.expanded, 0, mass * np.abs(state.outer - state.inner))
-    score = np.where(np.isfinite(score), score, mass)
+    score = _scores(state, mass)
     if not (score > 0).any():
         # The policy reaches no leaf: it stays in end components of inexact beliefs. The oldest leaves follow.
         score = np.where(graph.expanded, 0, 1 / (1 + np.arange(graph.size)))
@@ -293,5 +299,4 @@ def _below(
     best = np.zeros(node.size, bool)
     best[order[np.append(True, node[order][1:] != node[order][:-1])]] = True
     arriving = np.bincount(to[best[row]], (by * mass[node[row]])[best[row]], minlength=graph.size)
-    score = np.where(graph.expanded, 0, arriving * np.abs(state.outer - state.inner))
-    return np.where(np.isfinite(score), score, arriving), mass + arriving
+    return _scores(state, arriving.astype(np.float64)), mass + arriving

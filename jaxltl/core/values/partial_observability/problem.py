@@ -91,7 +91,8 @@ class BeliefProblem:
                 total = total * outwards
                 better = total < bound[a] if self.maximize else total > bound[a]
                 better &= legal[a]
-                change = max(change, float(np.abs(total - bound[a])[better].max(initial=0)))
+                step = np.abs(total[better] - bound[a][better])
+                change = max(change, float(step.max(initial=0)))
                 bound[a] = np.where(better, total, bound[a])
             if change < _STILL * max(1.0, float(np.abs(finite).max(initial=0))):
                 break

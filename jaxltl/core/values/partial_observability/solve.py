@@ -19,6 +19,7 @@ from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward, Rewards, choice_reward
+from jaxltl.core.values.engine.state_quantities import nonnegative_reward
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.types import Solution, Status, check, require_states
@@ -107,11 +108,7 @@ def belief_bounds(
                 "belief_bounds: rewards have a minimum until a target; there is no upper bound of a maximum "
                 "here. Ask for objective='min', without stay, or evaluate a controller by controlled_chain."
             )
-        earned = choice_reward(model, reward)
-        if not (earned >= 0).all():
-            raise ValueError(
-                "reward: total rewards are at least 0; give rewards without negative parts."
-            )
+        earned = nonnegative_reward(model, reward, "total rewards")
         problem = reward_problem(pomdp, earned, goal, maximize=False)
     limit = validation.integer("max_beliefs", max_beliefs, least=1)
     seconds = np.inf if max_seconds is None else float(max_seconds)

@@ -68,6 +68,11 @@ def expression_bounds(
                 known[key] = _bounds(tree, dict(zip(columns, key, strict=True)), {})
             except LanguageError as error:
                 raise ValueError(f"{value.text}: {error.message}") from None
+            if any(x != x for x in known[key]):
+                raise ValueError(
+                    f"{value.text}: the value is no number, such as 0/0; write a condition, A ? B : C, for "
+                    "the states where it is undefined."
+                )
         bounds.append(known[key])
     return bounds
 

@@ -138,3 +138,17 @@ def test_a_controller_as_a_chain():
     for bad in (wrong, policy.replace(next_memory=update[:2], action=action[:2]), None):
         with pytest.raises(ValueError, match=r"policy"):
             jl.values.controlled_chain(pomdp, bad)
+
+
+def test_infinite_rewards_are_decided_without_warnings_and_rewards_are_finite():
+    # The target may be missed from the start, so that every controller has an infinite reward.
+    world = jl.make_sparse(
+        [0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2], [0.5, 0.5, 1, 1, 1], initial=[1, 0, 0]
+    )
+    pomdp, goal = jl.models.make_pomdp(world, [0, 1, 1]), np.arange(3) == 1
+    ask = lambda reward: jl.total_reward(pomdp, np.array(reward), goal, objective="min")  # noqa: E731
+    found = ask([1.0, 0, 0])
+    assert found.value == found.lower == found.upper == np.inf and found.status == 0
+    for wrong in (np.nan, np.inf, -1.0):
+        with pytest.raises(ValueError, match="finite rewards of at least 0"):
+            ask([wrong, 0, 0])

@@ -13,6 +13,7 @@ import pytest
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.comparisons import program_definitions
 from jaxltl.core.logic.properties import MalformedProperty, parse_each, parse_properties
+from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties import exact_thresholds
 from jaxltl.core.values.properties.solve_property import solve_property
@@ -644,3 +645,14 @@ def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models):
             elif i % 20 == 0:
                 with contextlib.suppress(ValueError):
                     solve_property(model, item)
+
+
+def test_quotients_by_zero_are_infinite_or_refused():
+    coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
+    coin = coin.replace(label=np.array([[False], [True], [False]]), propositions=("g",))
+    for text, value in (("1/0", np.inf), ("-1/0", -np.inf), ('P=? [ F "g" ] + 1/0', np.inf)):
+        found = solve_property(coin, text)
+        assert found.value.tolist() == found.lower.tolist() == found.upper.tolist() == [value]
+    for text in ("0/0", "1/0 - 1/0"):
+        with pytest.raises(ValueError, match="no number"):
+            solve_property(coin, text)
