@@ -63,6 +63,7 @@ class Refusal(Exception):
 
 
 def need(condition: object, why: str, error: type[Exception] = ValueError) -> None:
+    """Raises an error with a reason unless a condition holds."""
     if not condition:
         raise error(why)
 
@@ -135,6 +136,7 @@ def read_numbers(contents: dict, name: str, dtype: str, count: int, default: Any
 
 
 def to_fraction(text: str) -> Fraction:
+    """The number that a text of bounded length denotes, a decimal or a quotient."""
     number = r"-?\d{1,4000}(\.\d{1,4000})?(e[+-]?\d{1,3}|/0*[1-9]\d{0,3999})?"
     need(re.fullmatch(number, text, re.ASCII), f"{text!r:.40} is no number such as 0.25 or 1/4")
     return Fraction(text)
@@ -471,29 +473,21 @@ def excludes(method: str, k: int, n: int, x: Fraction, chance: Fraction) -> bool
             term = (term * y >> 64) // i
         return total * chance >= 2**65
     need(method in ("anytime", "clopper-pearson"), f"the method {method!r:.40} is unknown")
-    anytime = (
-        method == "anytime"
-    )  # the likelihood over the mixture of Jeffreys, its inverse a martingale
-    factors = [
-        (2 * (j + i) * a, (2 * i - 1) * d) if anytime else ((j + i) * a, i * d)
-        for i in range(1, k + 1)
-    ]
-    factors += [
-        (2 * i * (d - a), (2 * i - 1) * d) if anytime else (d - a, d) for i in range(1, j + 1)
-    ]
+    # The tail of Clopper and Pearson, or the likelihood over the mixture of Jeffreys, a martingale.
+    c = 2 if method == "anytime" else 1
+    factors = [(c * (j + i) * a, (c * i + 1 - c) * d) for i in range(1, k + 1)]
+    factors += [(c * i * (d - a), (c * i + 1 - c) * d) for i in range(1, j + 1)]
     mantissa, exponent = 2**320, -320  # of the product of the factors, rounded up to 320 bits
     for above, below in factors:
         mantissa = -(-mantissa * above // below)
         shift = mantissa.bit_length() - 320
-        mantissa, exponent = (
-            -(-mantissa >> shift) if shift > 0 else mantissa << -shift,
-            exponent + shift,
-        )
+        mantissa = -(-mantissa >> shift) if shift > 0 else mantissa << -shift
+        exponent += shift
     total = term = mantissa
-    for i in range(k, n if not anytime else k):  # the tail P(Bin(n, x) >= k), term by term
+    for i in range(k, n if c == 1 else k):  # P(Bin(n, x) >= k), term by term
         term = -(-term * (n - i) * a // ((i + 1) * (d - a)))
         total += term
-    return total * Fraction(2) ** exponent <= (chance if anytime else chance / 2)
+    return total * Fraction(2) ** exponent <= chance * c / 2
 
 
 # --- the question ---------------------------------------------------------------------------------
