@@ -31,11 +31,13 @@ from jaxltl.core.language.expressions import (
 from jaxltl.core.language.parser import ExpressionParser, parse_program
 from jaxltl.core.language.syntax import (
     Assignment,
+    Command,
     Constant,
     Declaration,
     Module,
     Program,
     RenamedModule,
+    RewardItem,
     RewardStructure,
     Syntax,
     Variable,
@@ -43,6 +45,7 @@ from jaxltl.core.language.syntax import (
 
 Change = Callable[[Expression], Expression]
 Tree = TypeVar("Tree")
+Guarded = TypeVar("Guarded", Command, RewardItem)
 
 
 def read_program(
@@ -130,24 +133,16 @@ def _with_exact_guards(
         whole = exact_comparisons(rational, largest)
         return e if is_inexact(whole) else whole
 
+    def guarded(parts: Sequence[Guarded], rational: Sequence[Guarded]) -> tuple[Guarded, ...]:
+        both = zip(parts, rational, strict=True)
+        return tuple([replace(x, guard=compared(x.guard, y.guard)) for x, y in both])
+
     modules = tuple(
-        replace(
-            m,
-            commands=tuple(
-                replace(c, guard=compared(c.guard, d.guard))
-                for c, d in zip(m.commands, n.commands, strict=True)
-            ),
-        )
+        replace(m, commands=guarded(m.commands, n.commands))
         for m, n in zip(program.modules, exact.modules, strict=True)
     )
     rewards = tuple(
-        replace(
-            r,
-            items=tuple(
-                replace(i, guard=compared(i.guard, j.guard))
-                for i, j in zip(r.items, s.items, strict=True)
-            ),
-        )
+        replace(r, items=guarded(r.items, s.items))
         for r, s in zip(program.rewards, exact.rewards, strict=True)
     )
     initial = program.initial

@@ -32,7 +32,7 @@ from jaxltl.core.values.door.question import (
 )
 from jaxltl.core.values.interval import satisfaction as interval_satisfaction
 from jaxltl.core.values.interval.sides import refuse_environment, refuse_nature
-from jaxltl.core.values.partial_observability import answers as partial_answers
+from jaxltl.core.values.partial_observability import belief_engines
 from jaxltl.core.values.undiscounted import (
     acceptance,
     compiled_engines,
@@ -68,7 +68,7 @@ _DISCOUNT = Engine(row_engines.discount, instead=_SWEPT, column="traced rows")
 _DISCOUNTED_GAME = Engine(minimax.discounted_game)
 _AVERAGE = Engine(average.average, ("max_steps",))
 _ACCEPT = Engine(interval_satisfaction.accept_with_nature)
-_PARTIAL_REACH = Engine(partial_answers.reach)
+_PARTIAL_REACH = Engine(belief_engines.reach)
 _COMPILED_ACCEPT = Engine(acceptance.accept_padded, ("method", *_LIMITED))
 
 CONCRETE = ("padded", "rows", "intervals", "padded game", "rows game", "intervals game")
@@ -103,7 +103,7 @@ ENGINES: dict[type[Path], dict[str, Engine]] = {
         "intervals": _ROBUST_EARN,
         "padded game": _ROBUST_EARN,
         "rows game": _ROBUST_EARN,
-        "rows pomdp": Engine(partial_answers.earn),
+        "rows pomdp": Engine(belief_engines.earn),
         "intervals game": _ROBUST_EARN,
         "traced padded": _COMPILED_EARN,
         "mesh padded": _COMPILED_EARN,

@@ -12,7 +12,7 @@ from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.values.partial_observability.beliefs import BeliefGraph
 from jaxltl.core.values.partial_observability.bounds import BeliefRows, NodeValues, visits
-from jaxltl.core.values.partial_observability.library import (
+from jaxltl.core.values.partial_observability.certified_controllers import (
     Evaluated,
     Library,
     MemorySteps,

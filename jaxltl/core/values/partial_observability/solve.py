@@ -25,7 +25,10 @@ from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.types import Solution, Status, check, require_states
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.values.partial_observability.ascent import SoftmaxAscent, first_controllers
+from jaxltl.core.values.partial_observability.controller_gradient import (
+    SoftmaxAscent,
+    first_controllers,
+)
 from jaxltl.core.values.partial_observability.chains import controlled_chain
 from jaxltl.core.values.partial_observability.exploration import BeliefBounds, explore
 from jaxltl.core.values.partial_observability.problem import (
