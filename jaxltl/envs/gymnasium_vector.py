@@ -38,13 +38,14 @@ def gymnasium_vector(
     Raises:
       ValueError: gymnasium is not installed, or an argument is out of range.
 
+    >>> from gymnasium.vector import VectorEnv
     >>> import jaxltl as jl
     >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], label={"heads": [1]})
     >>> task = jl.task_environment(jl.environments.model_environment(coin), "X heads")
     >>> lanes = gymnasium_vector(task, 3)
     >>> seen, info = lanes.reset(seed=0)
-    >>> lanes.step(np.zeros(3, int))[2].shape, info["verdict"].tolist()
-    ((3,), [0, 0, 0])
+    >>> isinstance(lanes, VectorEnv), lanes.step(np.zeros(3, int))[2].shape, info["verdict"].tolist()
+    (True, (3,), [0, 0, 0])
     """
     environment = require_environment(environment)
     count = validation.integer("num_envs", num_envs, least=1)
