@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jaxltl.core.values.door.table import ENGINES, NAMES
 
-# Columns of the page, by those of the table, and what they are called.
+# Kinds of models, by the columns of the table, and their names on the page.
 COLUMNS = {
     "padded": "MDP, DenseMDP",
     "rows": "SparseMDP, chain",
@@ -21,14 +21,12 @@ COLUMNS = {
 
 
 def listing() -> str:
-    """A table in Markdown: a row for each question, and "yes" where an engine answers it."""
-    lines = [
-        "| question | " + " | ".join(COLUMNS.values()) + " |",
-        "|---|" + "---|" * len(COLUMNS),
-    ]
+    """A table in Markdown: a row for each question, with the kinds of models that it is not for."""
+    lines = [f"Kinds of models: {', '.join(COLUMNS.values())}.", ""]
+    lines += ["| question | function | not for |", "|---|---|---|"]
     for path, engines in ENGINES.items():
         quantity = (path.__doc__ or "").strip().rstrip(".")
         names = " and ".join(f"`{name}`" for name in NAMES[path].split(" and "))
-        cells = ["yes" if column in engines else "" for column in COLUMNS]
-        lines.append(f"| {quantity}: {names} | " + " | ".join(cells) + " |")
+        missing = ", ".join(kind for column, kind in COLUMNS.items() if column not in engines)
+        lines.append(f"| {quantity} | {names} | {missing} |")
     return "\n".join(lines)
