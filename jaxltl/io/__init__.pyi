@@ -1,3 +1,8 @@
+from .cassandra import (
+    DiscountedPOMDP as DiscountedPOMDP,
+    read_cassandra as read_cassandra,
+    write_cassandra as write_cassandra,
+)
 from .certificate.certificates import write_certificate as write_certificate
 from .certificate.storm_text import write_storm_certificate as write_storm_certificate
 from .colored_world import read_world as read_world, write_world as write_world

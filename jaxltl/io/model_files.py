@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
+from jaxltl.io.cassandra import read_cassandra, write_cassandra
 from jaxltl.io.files import decompressed, opened, suffix_of
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.npz import read_npz, write_npz
@@ -18,22 +20,33 @@ from jaxltl.io.umb.umb import read_umb, write_umb
 _BEGINNING = 4096  # bytes inspected to detect the format
 
 
+def _read_cassandra(path: str | os.PathLike[str]) -> POMDP:
+    return read_cassandra(path).pomdp
+
+
 @dataclass(frozen=True)
 class Format:
     """File format: name, suffixes, reader, writer and supported kinds of models."""
 
     name: str
     suffixes: tuple[str, ...]
-    read: Callable[[str | os.PathLike[str]], SparseMDP | IntervalMDP | Game]
+    read: Callable[[str | os.PathLike[str]], SparseMDP | IntervalMDP | Game | POMDP]
     write: Callable[..., None]  # of a path and a model of this kind
-    holds_games: bool
+    holds: tuple[type, ...]  # kinds of models, with SparseMDP for all that ``to_sparse`` takes
 
 
 FORMATS = (
-    Format("UMB", (".umb",), read_umb, write_umb, True),
-    Format("PRISM's explicit files", (".tra", ".pexp"), read_prism, write_prism, False),
-    Format("DRN", (".drn",), read_drn, write_drn, False),
-    Format("numpy", (".npz",), read_npz, write_npz, True),
+    Format("UMB", (".umb",), read_umb, write_umb, (SparseMDP, IntervalMDP, Game, POMDP)),
+    Format(
+        "PRISM's explicit files",
+        (".tra", ".pexp"),
+        read_prism,
+        write_prism,
+        (SparseMDP, IntervalMDP),
+    ),
+    Format("DRN", (".drn",), read_drn, write_drn, (SparseMDP, IntervalMDP, POMDP)),
+    Format("numpy", (".npz",), read_npz, write_npz, (SparseMDP, IntervalMDP, Game)),
+    Format("Cassandra's POMDP format", (".pomdp",), _read_cassandra, write_cassandra, (POMDP,)),
 )
 
 
@@ -47,8 +60,9 @@ def read_model(
     """Model of a file, with the format detected by suffix or contents.
 
     Formats: programs in the PRISM language (``.prism``, ``.pm``, ``.nm``, ``.sm``, ``.smg``), UMB
-    (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN (``.drn``) and
-    ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
+    (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN (``.drn``),
+    ``.npz`` and Cassandra's POMDP format (``.pomdp``); all but ``.npz`` may be compressed (``.gz``,
+    ``.xz``).
 
     Args:
       path: the file.
@@ -81,12 +95,12 @@ def read_model(
     return (_by_name(path) or _by_beginning(path)).read(path)
 
 
-def write_model(path: str | os.PathLike[str], model: Model) -> None:
+def write_model(path: str | os.PathLike[str], model: Model | POMDP) -> None:
     """Writes a model in the format of the file suffix, atomically.
 
     Args:
       path: the file.
-      model: a model that ``to_sparse`` takes, a Game or an IntervalMDP.
+      model: a model that ``to_sparse`` takes, a Game, an IntervalMDP or a POMDP.
 
     Raises:
       ValueError: the format is unknown or cannot represent the model, or the file cannot be
@@ -109,12 +123,17 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
             f"{str(path)!r}: files hold games of two players; write model.game([...]), the game of a "
             "coalition."
         )
-    if isinstance(model, Game) and not form.holds_games:
-        raise ValueError(
-            f"{str(path)!r}: {form.name} holds no games; write "
-            f"{_listed((x for x in FORMATS if x.holds_games), ' or ')}."
+    kind = next((x for x in (Game, IntervalMDP, POMDP) if isinstance(model, x)), SparseMDP)
+    if kind not in form.holds:
+        noun = {Game: "games", POMDP: "POMDPs", IntervalMDP: "interval models"}.get(
+            kind, "fully observable models"
         )
-    form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
+        raise ValueError(
+            f"{str(path)!r}: {form.name} holds no {noun}; write "
+            f"{_listed((x for x in FORMATS if kind in x.holds), ' or ')}."
+        )
+    is_other = isinstance(model, Game | IntervalMDP | POMDP)
+    form.write(path, model if is_other else to_sparse(cast(Model, model)))
 
 
 def _by_name(path: str | os.PathLike[str]) -> Format | None:

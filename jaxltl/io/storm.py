@@ -11,24 +11,24 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from jaxltl.core.models import Game, IntervalMDP, SparseMDP, to_sparse
+from jaxltl.core.models import POMDP, Game, IntervalMDP, SparseMDP, to_sparse
 from jaxltl.core.models.protocols import Model
 from jaxltl.io.umb.umb import read_umb, write_umb
 
 StormModel: TypeAlias = Any  # a sparse model of the optional package stormpy
 
 
-def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
+def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game | POMDP:
     """Model of a sparse stormpy model, bit for bit.
 
     Keeps the order of states and choices, labels (``"init"`` becomes the initial distribution),
     rewards, choice labels as action names, and state valuations; exact probabilities are rounded.
 
     Args:
-      model: a `SparseDtmc`, `SparseMdp` or `SparseSmg`, or one of the first two with intervals.
+      model: a `SparseDtmc`, `SparseMdp`, `SparsePomdp` or `SparseSmg`, or one of the first two with intervals.
 
     Returns:
-      A SparseMDP, a Game over one, or an IntervalMDP.
+      A SparseMDP, a Game or POMDP over one, or an IntervalMDP.
 
     Raises:
       ValueError: stormpy (version 2 or later) is missing, or the model has another type.
@@ -58,14 +58,14 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
             raise ValueError(f"from_stormpy: {reason}") from None
 
 
-def to_stormpy(model: Model) -> StormModel:
+def to_stormpy(model: Model | POMDP) -> StormModel:
     """Sparse stormpy model of a model, bit for bit; keeps the support of the initial distribution.
 
     Args:
-      model: a model that ``to_sparse`` takes, a Game or an IntervalMDP.
+      model: a model that ``to_sparse`` takes, a Game, an IntervalMDP or a POMDP.
 
     Returns:
-      A `SparseDtmc` if every state has one choice, else a `SparseMdp` or `SparseSmg`; with
+      A `SparseDtmc` if every state has one choice, else a `SparseMdp`, `SparseSmg` or `SparsePomdp`; with
       intervals for an interval model.
 
     Raises:
@@ -79,6 +79,7 @@ def to_stormpy(model: Model) -> StormModel:
     """
     storm = _stormpy()
     base = model.mdp if isinstance(model, Game) else model
+    base = base.fully_observable if isinstance(base, POMDP) else base
     sparse = to_sparse(base.nominal if isinstance(base, IntervalMDP) else base)
     options = storm.io.UmbImportOptions()
     options.build_state_valuations = bool(
@@ -89,9 +90,8 @@ def to_stormpy(model: Model) -> StormModel:
         path = Path(folder) / "model.umb"
         if isinstance(model, Game):
             model = replace(model, mdp=sparse)
-        write_umb(
-            path, model if isinstance(model, Game | IntervalMDP) else sparse, compression=None
-        )
+        is_whole = isinstance(model, Game | IntervalMDP | POMDP)
+        write_umb(path, model if is_whole else sparse, compression=None)
         return storm.build_model_from_umb(str(path), options=options)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.models.pomdp import POMDP, make_pomdp
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from tests.sparse_models import random_sparse
 
 PARTS = ("state", "choice", "transition")
@@ -121,3 +122,47 @@ def refuses(write, path, model, more):
         with pytest.raises(ValueError, match=message):
             write(path, replace(model, **parts))
     assert not list(path.parent.iterdir())
+
+
+def random_pomdp(rng, num_states=8, *, all_actions=False, begins=None):
+    """A random POMDP with four observations, named actions, labels, rewards and observables."""
+    number = np.arange(num_states) % 4
+    sets = [np.sort(rng.choice(3, size=rng.integers(1, 4), replace=False)) for _ in range(4)]
+    if all_actions:
+        sets = [np.arange(3)] * 4
+    action = np.concatenate([sets[o] for o in number])
+    size = action.size
+    width = rng.integers(1, 4, size)
+    successor = np.concatenate([rng.choice(num_states, k, replace=False) for k in width])
+    chance = np.concatenate([rng.dirichlet(np.ones(k)) for k in width])
+    start = np.concatenate([[0], np.cumsum(width)])
+    initial = (np.arange(num_states) < 3) if begins is None else number == begins
+    world = make_sparse(
+        np.concatenate([[0], np.cumsum([sets[o].size for o in number])]),
+        start,
+        successor,
+        chance,
+        initial=initial / initial.sum(),
+        label=(rng.random((num_states, 2)) < 0.5) | (np.arange(num_states) == 1)[:, None],
+        propositions=("a", "b"),
+        action=action,
+        action_names=("left", "right", "stay"),
+        rewards={
+            "cost": Rewards(state=rng.random(num_states), choice=rng.random(size)),
+            "steps": Rewards(transition=rng.random(chance.size)),
+        },
+        valuation={"x": rng.integers(0, 9, num_states).astype(np.int32)},
+    )
+    observables = {"seen": np.arange(4, dtype=np.int32), "name": np.array(list("abcd"))}
+    return make_pomdp(world, number, observables=observables)
+
+
+def assert_same_pomdp(found: POMDP, pomdp: POMDP, *, whole=True):
+    """The same observations and actions, and the same model; with the variables if `whole`."""
+    assert isinstance(found, POMDP)
+    assert found.observation.tolist() == pomdp.observation.tolist()
+    assert found.row_of_action.tolist() == pomdp.row_of_action.tolist()
+    assert_same(found.fully_observable, pomdp.fully_observable, valuation=whole)
+    assert list(found.observables) == (list(pomdp.observables) if whole else [])
+    for name, values in found.observables.items():
+        assert values.tolist() == pomdp.observables[name].tolist()

@@ -100,9 +100,27 @@ def test_blocks_do_not_matter(tmp_path, monkeypatch):
     assert (tmp_path / "n.drn").read_bytes() == (tmp_path / "m.drn").read_bytes()
 
 
+def test_observations(tmp_path):
+    text = MDP.replace("@type: MDP", "@type: POMDP")
+    for state, seen in enumerate((1, 0, 2, 3)):
+        text = text.replace(f"state {state}", f"state {state} {{{seen}}}")
+    for line, message in (
+        ("state 1 {0}", "state 1"),
+        ("state 1 {0}", "state 1 {x}"),
+        ("state 1 {0}", "state 1 0"),
+        ("state 1 {0}", "state 1 {4}"),
+        ("state 1 {0}", "state 1 {1}"),
+    ):
+        with pytest.raises(ValueError, match=r"m\.drn'.*(line 27|states 0 and 1 have the obs)"):
+            read(tmp_path, text.replace(line, message))
+    pomdp = read(tmp_path, text)
+    assert pomdp.observation.tolist() == [1, 0, 2, 3]
+    assert_same(pomdp.fully_observable, read(tmp_path, MDP))
+
+
 WRONG = [
     ("@type: MDP", "@type: CTMC", r"m.drn', line 3: a model of type 'CTMC' is not supported"),
-    ("@type: MDP", "@type: POMDP", "line 3: a model of type 'POMDP' is not supported"),
+    ("@type: MDP", "@type: POMDP", "line 18: 'state 0 .*; expected 'state number {observation}'"),
     ("@type: MDP", "@type: MA", "line 3: a model of type 'MA' is not supported"),
     ("@type: MDP", "", "line 17: expected a line '@type: MDP'"),
     ("@type: MDP", "@kind: MDP", "line 3: '@kind: MDP'; expected @type, @value_type"),

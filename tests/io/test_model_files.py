@@ -11,7 +11,7 @@ from jaxltl.core.models.mdp import from_dense, make_mdp
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.io.model_files import read_model, write_model
 from jaxltl.io.npz import read_npz, write_npz
-from tests.io.same import assert_same, full_model
+from tests.io.same import assert_same, assert_same_pomdp, full_model, random_pomdp
 
 WHOLE = (".umb", ".umb.xz", ".npz", ".tra", ".tra.gz", ".pexp", ".pexp.xz")
 
@@ -48,6 +48,21 @@ def test_games_and_other_models(tmp_path, suffix):
     assert found.successor.tolist() == [0, 1, 0, 1] and found.propositions == ("a",)
 
 
+@pytest.mark.parametrize("suffix", [".umb", ".umb.xz", ".drn", ".drn.gz"])
+def test_formats_with_observations_keep_a_pomdp(tmp_path, suffix):
+    for seed in range(4):
+        pomdp = random_pomdp(np.random.default_rng(seed))
+        if "drn" in suffix:
+            world = pomdp.fully_observable
+            world = replace(world, rewards={"cost": world.rewards["cost"]})
+            pomdp = replace(pomdp, fully_observable=world)
+        write_model(tmp_path / f"m{suffix}", pomdp)
+        assert_same_pomdp(read_model(tmp_path / f"m{suffix}"), pomdp, whole="umb" in suffix)
+    for other in (".tra", ".npz"):
+        with pytest.raises(ValueError, match=r"holds no POMDPs; write UMB \(\.umb\) or DRN"):
+            write_model(tmp_path / f"m{other}", pomdp)
+
+
 def test_a_file_is_known_by_how_it_begins(tmp_path):
     model = held_by_all(1)
     for suffix in (".umb", ".umb.xz", ".npz", ".drn", ".drn.xz"):
@@ -61,7 +76,7 @@ def test_a_file_is_known_by_how_it_begins(tmp_path):
             ValueError,
             match=(
                 r"model': neither the suffix nor the contents name a known format; .*UMB \(\.umb\), PRISM's explicit "
-                r"files \(\.tra, \.pexp\), DRN \(\.drn\), numpy \(\.npz\)"
+                r"files \(\.tra, \.pexp\), DRN \(\.drn\), numpy \(\.npz\), Cassandra's"
             ),
         ):
             read_model(other)

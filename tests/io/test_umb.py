@@ -421,8 +421,14 @@ INTERVAL = {"type": "double-interval", "size": 128}
             r"time is 'stochastic'; expected discrete",
         ),
         (
-            system_edit("#observations", 3),
-            r"the model has 3 observations; POMDPs are not supported",
+            lambda index, system, members: system.update({"#observations": 3, "#players": 2}),
+            r"the model has observations and 2 players; expected one player",
+        ),
+        (
+            lambda index, system, members: system.update(
+                {"#observations": 3, "observations-apply-to": "branches"}
+            ),
+            r"the observations apply to 'branches', or are random; expected one",
         ),
         (
             system_edit("branch-probability-type", INTERVAL),

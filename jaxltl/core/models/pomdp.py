@@ -134,7 +134,7 @@ def make_pomdp(
             f"make_pomdp: the model is {type(model).__name__}; give an MDP, a DenseMDP or a SparseMDP."
         )
     refuse_traced("make_pomdp", [("model", model), ("observation", observation)])
-    sparse = _ordered(to_sparse(model))
+    sparse = to_sparse(model)
     number = cast(Integers, np.asarray(observation))
     size = sparse.num_states
     if number.shape != (size,) or number.dtype.kind not in "iu":
@@ -147,7 +147,9 @@ def make_pomdp(
             f"observation[{state}] is {number[state]}; number the observations from 0 on, at most "
             f"{size - 1} of {size} states."
         )
-    _require_equal_actions(sparse, number)
+    if _different_actions(sparse, number).any():
+        sparse = _ordered(sparse)
+        _require_equal_actions(sparse, number)
     count = int(number.max()) + 1
     values = {name: np.asarray(x) for name, x in (observables or {}).items()}
     for name, x in values.items():
@@ -180,22 +182,34 @@ def _ordered(model: SparseMDP) -> SparseMDP:
     )
 
 
-def _require_equal_actions(model: SparseMDP, observation: Integers) -> None:
-    """Raises ValueError that names two states of equal observation with different actions."""
+def _first_alike(observation: Integers) -> Integers:
+    """The first state of equal observation of each state, ``int[S]``."""
+    _, first, number = np.unique(observation, return_index=True, return_inverse=True)
+    return cast(Integers, first[number.ravel()])
+
+
+def _row_actions(model: SparseMDP) -> Integers:
+    return model.action_number if model.action is None else np.asarray(model.action)
+
+
+def _different_actions(model: SparseMDP, observation: Integers) -> Booleans:
+    """Mask of the states with other actions than the first state of equal observation."""
     host = model.host
-    count = np.diff(host.row_start)
-    action = model.action_number if model.action is None else np.asarray(model.action)
-    _, first = np.unique(observation, return_index=True)
-    first_state = np.zeros(int(observation.max()) + 1, np.int64)
-    first_state[observation[first]] = first
-    like = cast(Integers, first_state[observation])
+    count, action = np.diff(host.row_start), _row_actions(model)
+    like = _first_alike(observation)
     different = count != count[like]
     same = ~different[host.state]
     row = host.row_start[like[host.state]] + model.rank
     wrong = np.flatnonzero(same)
     wrong = wrong[action[wrong] != action[row[wrong]]]
     different[host.state[wrong]] = True
-    for state in first_true(different):
+    return cast(Booleans, different)
+
+
+def _require_equal_actions(model: SparseMDP, observation: Integers) -> None:
+    """Raises ValueError that names two states of equal observation with different actions."""
+    host, like, action = model.host, _first_alike(observation), _row_actions(model)
+    for state in first_true(_different_actions(model, observation)):
         listed = []
         for s in (int(like[state]), state):
             numbers = action[host.row_start[s] : host.row_start[s + 1]].tolist()

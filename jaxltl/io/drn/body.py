@@ -30,7 +30,8 @@ NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
 INTERVALS = ("double-interval", "rational-interval")  # types of values
 _MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
 _LINE = re.compile(
-    rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)", re.DOTALL
+    rb"(?:state|action)\s+\S+?\s*(?:\{\d+\}\s*)?(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)",
+    re.DOTALL,
 )
 _NUMBER = re.compile(rb"0|[1-9]\d{0,8}|1\d{9}")
 _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
@@ -40,7 +41,7 @@ _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 class DrnHeader:
     """Header of a DRN file, up to ``@model``."""
 
-    kind: str  # "DTMC" or "MDP"
+    kind: str  # "DTMC", "MDP" or "POMDP"
     value_type: str  # @value_type, or ""
     parameters: tuple[str, ...]  # names of the parameters
     placeholders: dict[bytes, bytes]  # value of each $name
@@ -72,6 +73,7 @@ class Body:
     # state_reward, choice_reward: pairs of a first state or action and rewards [n, rewards]
     state_reward: list[tuple[int, Numbers]] = field(default_factory=list)
     choice_reward: list[tuple[int, Numbers]] = field(default_factory=list)
+    observation: list[Integers] = field(default_factory=list)  # of each state of a POMDP
     num_states: int = 0  # num_states, num_rows: counts so far
     num_rows: int = 0
     after_action: bool = False  # True if the last line other than a transition was an action
@@ -143,9 +145,9 @@ def _kind(text: Text, entries: dict[str, tuple[int, str]], line: int) -> str:
     if "@type" not in entries:
         raise text.error(line, "expected a line '@type: MDP' or '@type: DTMC' before '@model'.")
     line, kind = entries["@type"]
-    if kind.upper() not in ("DTMC", "MDP"):
+    if kind.upper() not in ("DTMC", "MDP", "POMDP"):
         raise text.error(
-            line, f"a model of type {kind[:60]!r} is not supported; expected DTMC or MDP."
+            line, f"a model of type {kind[:60]!r} is not supported; expected DTMC, MDP or POMDP."
         )
     return kind.upper()
 
@@ -180,6 +182,9 @@ def read_body(header: DrnHeader, probabilities: Values, numbers: Values) -> Body
     for block in (point_rewards(text) if is_interval else text).blocks(b"//"):
         at = block.first[:-1]
         is_state, is_action = _begins(block, at, b"state"), _begins(block, at, b"action")
+        if header.kind == "POMDP":
+            block = _read_observations(block, body, np.flatnonzero(is_state), header.num_states)
+            at = block.first[:-1]
         if is_interval:
             block = joined_brackets(block, 2, ~is_state & ~is_action)
             at = block.first[:-1]
@@ -207,6 +212,26 @@ def read_body(header: DrnHeader, probabilities: Values, numbers: Values) -> Body
             body.after_action = bool(is_action[order[-1]])
     _check_counts(header, body)
     return body
+
+
+def _read_observations(
+    block: TokenBlock, body: Body, lines: Integers, num_states: int
+) -> TokenBlock:
+    """Reads the observations of states, ``{3}``; returns the block without these tokens."""
+    token = np.minimum(block.first[:-1][lines] + 2, block.start.size - 1)
+    start, end = block.start.copy(), block.end.copy()
+    valid = (block.count[lines] >= 3) & (block.data[start[token]] == ord("{"))
+    valid &= block.data[end[token] - 1] == ord("}")
+    block.require_form(valid, "'state number {observation}'", lines)
+    start[token] += 1
+    end[token] -= 1
+    inner = replace(block, start=start, end=end)
+    body.observation.append(inner.integers(token, "an observation", num_states))
+    removed = np.zeros(block.num_lines + 1, np.int64)
+    removed[lines + 1] = 1
+    kept = np.delete(np.arange(start.size), token)
+    first = block.first - np.cumsum(removed)
+    return replace(block, start=block.start[kept], end=block.end[kept], first=first)
 
 
 def _begins(block: TokenBlock, at: Integers, word: bytes) -> Booleans:

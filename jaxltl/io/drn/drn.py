@@ -1,4 +1,4 @@
-"""DRN files of Markov chains and MDPs, in Storm's text format."""
+"""DRN files of Markov chains, MDPs and POMDPs, in Storm's text format."""
 
 from __future__ import annotations
 
@@ -6,13 +6,24 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.models import IntervalMDP, Rewards, SparseMDP, interval_rows, make_sparse
+from jaxltl.core.array_types import Integers
+from jaxltl.core.models import (
+    POMDP,
+    IntervalMDP,
+    Rewards,
+    SparseMDP,
+    interval_rows,
+    make_pomdp,
+    make_sparse,
+)
 from jaxltl.core.models.exact_numbers import decimal_numbers
 from jaxltl.core.models.number_source import NumberSource
+from jaxltl.core.validation import errors_in
 from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,
@@ -33,22 +44,24 @@ _Reward = tuple[ArrayLike | None, ArrayLike | None]  # of states and of choices
 _STEP = 2**16  # states per piece
 
 
-def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
-    """Markov chain, MDP or interval model from a DRN file.
+def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | POMDP:
+    """Markov chain, MDP, interval model or POMDP from a DRN file.
 
     States labelled ``init`` are initial, with equal probability. Decimals, fractions (``1/3``) and
     placeholders (``$name``) become the nearest doubles. Actions have no names if all are numbers or
     ``__NOLABEL__``. Comments, which hold Storm's state variables, are ignored. The value types
-    ``double-interval`` and ``rational-interval`` give an interval model.
+    ``double-interval`` and ``rational-interval`` give an interval model. The observation of a state of a
+    POMDP follows its number, ``state 0 {3}``.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
 
     Returns:
-      A SparseMDP or an IntervalMDP.
+      A SparseMDP, an IntervalMDP or a POMDP.
 
     Raises:
-      ValueError: with file and line, for malformed text, parameters, observations or rates.
+      ValueError: with file and line, for malformed text, parameters, rates, intervals with observations,
+        or states of equal observation with different actions.
 
     Example:
       >>> import pathlib, tempfile
@@ -68,6 +81,8 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
             f"its probabilities have parameters, {', '.join(header.parameters)}; "
             "jaxltl.io.drn.parametric.read_parametric reads it.",
         )
+    if header.kind == "POMDP" and header.value_type in INTERVALS:
+        refuse(name, "it is a POMDP with intervals; expected single probabilities.")
     placeholders = _placeholders(header)
     try:
         body = read_body(
@@ -94,7 +109,7 @@ def _placeholders(header: DrnHeader) -> dict[bytes, float]:
     return values
 
 
-def _model(header: DrnHeader, body: Body) -> SparseMDP | IntervalMDP:
+def _model(header: DrnHeader, body: Body) -> SparseMDP | IntervalMDP | POMDP:
     text = header.body
     state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
     probability = np.concatenate(body.value)
@@ -110,7 +125,11 @@ def _model(header: DrnHeader, body: Body) -> SparseMDP | IntervalMDP:
     if header.value_type in INTERVALS:
         return interval_rows(*rows, *probability.T, rewards=rewards, **options)
     model = make_sparse(*rows, probability, rewards=rewards, **options)
-    return replace(model, numbers=NumberSource(decimal_numbers))
+    model = replace(model, numbers=NumberSource(decimal_numbers))
+    if header.kind != "POMDP":
+        return model
+    with errors_in(f"{text.name!r}: "):
+        return make_pomdp(model, np.concatenate(body.observation))
 
 
 def _rewards(header: DrnHeader, body: Body) -> dict[str, Rewards]:
@@ -124,11 +143,11 @@ def _rewards(header: DrnHeader, body: Body) -> dict[str, Rewards]:
 # --- writing --------------------------------------------------------------------------------
 
 
-def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> None:
+def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP | POMDP) -> None:
     """Writes a model as a DRN file; :func:`read_drn` and Storm read back the same doubles.
 
-    State variables, labels of no state and the order of labels are lost. Rewards of interval models
-    are written as numbers, since Storm does not read point intervals.
+    State variables, names of observations, labels of no state and the order of labels are lost. Rewards
+    of interval models are written as numbers, since Storm does not read point intervals.
 
     Args:
       path: the file, compressed if it ends in ``.gz`` or ``.xz``.
@@ -150,8 +169,11 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> N
         file.writelines(lines)
 
 
-def _written(source: SparseMDP | IntervalMDP) -> Iterator[bytes]:
+def _written(source: SparseMDP | IntervalMDP | POMDP) -> Iterator[bytes]:
     """The file in pieces; validates the model before the first piece."""
+    observation = None
+    if isinstance(source, POMDP):
+        observation, source = np.asarray(source.observation), source.fully_observable
     model = exact_part(source)
     labels, actions = _label_texts(model), _action_texts(model)
     rewards = []
@@ -167,7 +189,7 @@ def _written(source: SparseMDP | IntervalMDP) -> Iterator[bytes]:
         raise ValueError("only the first reward may have the name ''; give the others names.")
     head = [
         "// Written by jaxltl",
-        f"@type: {'DTMC' if model.is_chain else 'MDP'}",
+        f"@type: {'POMDP' if observation is not None else 'DTMC' if model.is_chain else 'MDP'}",
         f"@value_type: {'double' if model is source else 'double-interval'}",
         "@parameters",
         "",
@@ -181,14 +203,15 @@ def _written(source: SparseMDP | IntervalMDP) -> Iterator[bytes]:
         "",
     ]
     values = value_texts(source, ", ")
-    return _pieces("\n".join(head).encode(), model, values, labels, actions, rewards)
+    lines = partial(_state_lines, labels=labels, rewards=rewards, observation=observation)
+    return _pieces("\n".join(head).encode(), model, values, lines, actions, rewards)
 
 
 def _pieces(
     head: bytes,
     model: SparseMDP,
     values: Callable[[slice], list[str]],
-    labels: list[tuple[str, NDArray[np.bool_]]],
+    state_lines: Callable[[slice], list[str]],
     actions: Callable[[int], str] | None,
     rewards: list[_Reward],
 ) -> Iterator[bytes]:
@@ -215,17 +238,23 @@ def _pieces(
             for t, p in zip(host.successor[entries].tolist(), values(entries), strict=True)
         ]
         lines[at_row] = _action_lines(model, rows, actions, rewards)
-        lines[at_state] = _state_lines(states, labels, rewards)
+        lines[at_state] = state_lines(states)
         yield "".join(lines.tolist()).encode()
 
 
 def _state_lines(
-    states: slice, labels: list[tuple[str, NDArray[np.bool_]]], rewards: list[_Reward]
+    states: slice,
+    labels: list[tuple[str, NDArray[np.bool_]]],
+    rewards: list[_Reward],
+    observation: Integers | None,
 ) -> list[str]:
     after = _bracketed([state for state, _ in rewards], states, states.stop - states.start)
     for text, holds in labels:
         for i in np.flatnonzero(holds[states]).tolist():
             after[i] += text
+    if observation is not None:
+        seen = observation[states].tolist()
+        after = [f" {{{o}}}{text}" for o, text in zip(seen, after, strict=True)]
     return [f"state {s}{text}\n" for s, text in enumerate(after, states.start)]
 
 

@@ -71,6 +71,8 @@ def read_parametric(
         raise ValueError(f"{str(path)!r} is no program; constants and max_states are for programs.")
     name, data = str(path), read_bytes(path)
     header = read_header(Text(name, data, 0, len(data)))
+    if header.kind == "POMDP":
+        refuse(name, "it is a POMDP; expected a Markov chain or an MDP with parameters.")
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
     index_of_text = {b"0": 0}

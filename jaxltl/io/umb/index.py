@@ -29,7 +29,8 @@ PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as
 OTHER_LABELS = "other-aps"
 INITIAL = "initial"  # an initial distribution that is not uniform
 TEXTS = "texts"  # our parameter: names of the variables that are string indices
-ACTIONS, VALUATIONS = "actions/choices", "valuations/states"  # folders
+ACTIONS = "actions/choices"  # a folder
+OBSERVATIONS = "observations/states/values.bin"
 _MAX_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
 _MAX_STRING = 2**10  # average bytes of a string
 _STRINGS_ALLOWED = 2**20
@@ -86,8 +87,21 @@ class Record:
 
 
 @dataclass(frozen=True)
+class VariableLayout:
+    """Variables of states or observations: a record layout for each class."""
+
+    entity: str  # "states" or "observations"
+    records: tuple[Record, ...]
+    texts: int  # number of strings
+
+    @property
+    def folder(self) -> str:
+        return f"valuations/{self.entity}"
+
+
+@dataclass(frozen=True)
 class Items:
-    """Layout of a member."""
+    """VariableLayout of a member."""
 
     part: str  # "states", "choices" or "branches"
     bits: int  # bits per element
@@ -112,8 +126,8 @@ class Index:
     actions: int
     probability: Type | None
     annotations: tuple[Annotation, ...]
-    records: tuple[Record, ...]
-    texts: int  # number of strings of the variables
+    observations: int = 0
+    layouts: tuple[VariableLayout, ...] = ()
     player_names: tuple[str, ...] = ()
     begins: tuple[int, int, int] = (0, 0, 0)
 
@@ -130,7 +144,7 @@ class Index:
         )
 
     def items(self) -> dict[str, Items]:
-        """Layout of each member with elements per state, choice or branch."""
+        """VariableLayout of each member with elements per state, choice or branch."""
         layouts = {
             "state-to-choices.bin": Items("states", 64, 1),
             "state-is-initial.bin": Items("states", 1),
@@ -141,6 +155,8 @@ class Index:
             layouts["state-to-player.bin"] = Items("states", 32)
         if self.probability:
             layouts["branch-to-probability.bin"] = Items("branches", self.probability.size)
+        if self.observations:
+            layouts[OBSERVATIONS] = Items("states", 64)
         if self.actions:
             layouts[f"{ACTIONS}/values.bin"] = Items("choices", 32)
         for one in self.annotations:
@@ -154,16 +170,21 @@ class Index:
         counts = self.counts
         sizes = {name: x.size(counts[x.part]) for name, x in self.items().items()}
         bounds = {name: (size, size) for name, size in sizes.items()}
-        if self.records:
-            widths = [record.size for record in self.records]
-            largest = self.states * max(widths)
-            bounds[f"{VALUATIONS}/valuations.bin"] = (self.states * min(widths), largest)
-            bounds[f"{VALUATIONS}/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
-        for folder, count in ((ACTIONS, self.actions), (VALUATIONS, self.texts)):
+        folders = [(ACTIONS, self.actions)]
+        for one in self.layouts:
+            widths, size = [record.size for record in one.records], self.num_records(one)
+            bounds[f"{one.folder}/valuations.bin"] = (size * min(widths), size * max(widths))
+            bounds[f"{one.folder}/valuation-to-class.bin"] = (4 * size, 4 * size)
+            folders.append((one.folder, one.texts))
+        for folder, count in folders:
             if count:
                 bounds[f"{folder}/string-mapping.bin"] = (8 * (count + 1), 8 * (count + 1))
                 bounds[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MAX_STRING * count)
         return bounds
+
+    def num_records(self, layout: VariableLayout) -> int:
+        """Number of records of a layout."""
+        return self.states if layout.entity == "states" else self.observations
 
 
 def bit_bytes(count: int) -> int:
@@ -190,7 +211,7 @@ def parse_index(content: bytes) -> Index:
         with errors_in("branch-probability-type: "):
             probability = system.type("branch-probability-type")
             _check_type(probability, _REALS)
-    players, states, choices, branches, actions, _ = counts.values()
+    players, states, choices, branches, actions, observations = counts.values()
     return Index(
         players,
         states,
@@ -199,7 +220,8 @@ def parse_index(content: bytes) -> Index:
         actions,
         probability,
         _annotations(index.table("annotations", {})),
-        *_records(index),
+        observations,
+        _layouts(index),
         tuple(names),
     )
 
@@ -270,9 +292,17 @@ def _check_type(kind: Type, names: Sequence[str]) -> None:
 def _check_kind(system: _IndexTable, counts: Mapping[str, int]) -> None:
     system.get("time", "discrete, models with rates are not supported", lambda x: x == "discrete")
     if counts["observations"]:
-        raise ValueError(
-            f"the model has {counts['observations']} observations; POMDPs are not supported."
-        )
+        place = system.data.get("observations-apply-to", "states")
+        if place != "states" or "observation-probability-type" in system.data:
+            raise ValueError(
+                f"the observations apply to {_shown(place)}, or are random; expected one observation for "
+                "each state."
+            )
+        if counts["players"] != 1:
+            raise ValueError(
+                f"the model has observations and {counts['players']} players; expected one player."
+            )
+        system.count("#observations", below=_MAX_STATES + 1)
     if not counts["states"]:
         raise ValueError("#states is 0; a model needs at least one.")
     for name in ("states", "choices", "choice-actions"):
@@ -315,20 +345,24 @@ def _annotation(group: str, key: str, data: object) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _records(index: _IndexTable) -> tuple[tuple[Record, ...], int]:
-    """Record layouts of the classes of states, and the number of strings."""
+def _layouts(index: _IndexTable) -> tuple[VariableLayout, ...]:
+    """Record layouts of states and of observations."""
     valuations = index.table("valuations", {})
-    if "states" not in valuations.data:
-        return (), 0
     # Integer variables that jaxltl uses as string indices; Storm refuses the type string.
     ours: object = index.data
     for key in ("file-data", "parameters", TEXTS):
         ours = ours.get(key, []) if isinstance(ours, dict) else []
-    with errors_in(f"{VALUATIONS}: "):
-        states = valuations.table("states")
-        classes = states.get("classes", "a list", lambda x: isinstance(x, list) and bool(x))
-        texts = states.count("#strings", 0, below=_MAX_STATES + 1)
-        return tuple(_record(one, ours if isinstance(ours, list) else []) for one in classes), texts
+    names, layouts = ours if isinstance(ours, list) else [], []
+    for entity in ("states", "observations"):
+        if entity in valuations.data:
+            with errors_in(f"valuations/{entity}: "):
+                table = valuations.table(entity)
+                classes = table.get("classes", "a list", lambda x: isinstance(x, list) and bool(x))
+                texts = table.count("#strings", 0, below=_MAX_STATES + 1)
+                layouts.append(
+                    VariableLayout(entity, tuple(_record(one, names) for one in classes), texts)
+                )
+    return tuple(layouts)
 
 
 def _record(data: object, names_of_texts: Sequence[object]) -> Record:

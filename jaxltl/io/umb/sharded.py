@@ -95,10 +95,12 @@ def read_sharded(
 
 
 def _check_kind(index: Index) -> None:
-    """Raises ValueError for games and interval models."""
+    """Raises ValueError for games, POMDPs and interval models."""
     problem = None
     if index.players > 1:
         problem = f"the model is a game of {index.players} players"
+    elif index.observations:
+        problem = "the model is a POMDP"
     elif index.probability is not None and index.probability.end is not None:
         problem = "the probabilities are intervals"
     if problem is not None:

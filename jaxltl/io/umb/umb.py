@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,16 +20,17 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.pomdp import POMDP, make_pomdp
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io.files import Compression, compression_by_name, decompressed, raw_bytes, write_bytes
 from jaxltl.io.umb.index import (
     ACTIONS,
     INITIAL,
+    OBSERVATIONS,
     OTHER_LABELS,
     PARTS,
     TEXTS,
-    VALUATIONS,
     Index,
     ids_for,
 )
@@ -65,13 +66,14 @@ _INTERVAL = {"type": "double-interval", "size": 128}
 Members = list[tuple[str, Bytes | bytes]]
 
 
-def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """Markov chain, MDP, interval model or turn-based game of a UMB file.
+def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game | POMDP:
+    """Markov chain, MDP, interval model, turn-based game or POMDP of a UMB file.
 
     Reads labels, rewards on states, choices and branches, action names and state variables.
     Rational numbers become the nearest doubles, and branches of a choice with equal targets are
     merged. Player 0 of a game is the system. Without initial states the initial distribution is
     uniform. A variable that is absent in some states is a double (NaN there) or an empty string.
+    Observations of states give a POMDP, whose `observables` are the variables of observations.
 
     Ignored: metadata, names of players, branch actions, other annotations, variables of choices and
     branches, and integers of more than 64 bits.
@@ -80,11 +82,12 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
       path: the file, plain or compressed by gzip or xz.
 
     Returns:
-      A SparseMDP, an IntervalMDP, or a Game over a SparseMDP.
+      A SparseMDP, an IntervalMDP, or a Game or POMDP over a SparseMDP.
 
     Raises:
       ValueError: with file and member, for unreadable, damaged or inconsistent files, interval
-        games, rates, observations, more than two players with choices, and missing probabilities.
+        games, rates, random observations or those of branches, more than two players with choices, and
+        missing probabilities.
     """
     data = raw_bytes(path)
     with errors_in(f"{str(path)!r}: "):
@@ -101,24 +104,14 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
             raise ValueError("the model does not fit into the memory.") from None
 
 
-def _model(contents: dict[str, Bytes], index: Index) -> SparseMDP | IntervalMDP | Game:
+def _model(contents: dict[str, Bytes], index: Index) -> SparseMDP | IntervalMDP | Game | POMDP:
     row_start = starts_of(contents, "state-to-choices.bin", index.states, index.choices)
     entry_start = starts_of(contents, "choice-to-branches.bin", index.choices, index.branches)
     target = needed(contents, "branch-to-target.bin").view("<u8")
     if index.players == 0:
         check_chain(row_start)
     annotations = annotations_of(contents, index)
-    if (member := f"{VALUATIONS}/valuations.bin") in contents:
-        of_class = contents.get(f"{VALUATIONS}/valuation-to-class.bin")
-        texts = texts_of(contents, VALUATIONS)
-        with errors_in(f"{member}: "):
-            annotations["valuation"] = read_variables(
-                contents.pop(member),
-                None if of_class is None else of_class.view("<u4"),
-                index.records,
-                index.states,
-                texts,
-            )
+    annotations["valuation"] = _variables(contents, index, "states")
     probability = probability_of(contents, index, entry_start)
     initial = _initial(contents, index)
     owner = _owners(contents, index, row_start)
@@ -134,7 +127,45 @@ def _model(contents: dict[str, Bytes], index: Index) -> SparseMDP | IntervalMDP 
         model = replace(model, initial=exact)
     if interval is not None:
         return replace(interval, nominal=model)
+    if index.observations:
+        return _observed(contents, index, model)
     return model if owner is None else make_game(model, owner)
+
+
+def _variables(contents: dict[str, Bytes], index: Index, entity: str) -> dict[str, Array]:
+    """Variables of states or observations."""
+    for one in index.layouts:
+        member = f"{one.folder}/valuations.bin"
+        if one.entity == entity and member in contents:
+            of_class = contents.get(f"{one.folder}/valuation-to-class.bin")
+            texts = texts_of(contents, one.folder)
+            with errors_in(f"{member}: "):
+                return read_variables(
+                    contents.pop(member),
+                    None if of_class is None else of_class.view("<u4"),
+                    one.records,
+                    index.num_records(one),
+                    texts,
+                )
+    return {}
+
+
+def _observed(contents: dict[str, Bytes], index: Index, model: SparseMDP) -> POMDP:
+    """The POMDP with the observations of states, which are 0 if the member is missing."""
+    seen = contents.get(OBSERVATIONS, np.zeros(8 * index.states, np.uint8)).view("<u8")
+    if seen.max() >= index.observations:
+        raise ValueError(
+            f"{OBSERVATIONS}: a state has the observation {seen.max()}; expected 0 to "
+            f"{index.observations - 1}."
+        )
+    observables = _variables(contents, index, "observations")
+    used = int(seen.max()) + 1
+    with errors_in(f"{OBSERVATIONS}: "):
+        return make_pomdp(
+            model,
+            seen.astype(np.int64),
+            observables={name: x[:used] for name, x in observables.items()},
+        )
 
 
 def _initial(contents: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
@@ -176,7 +207,7 @@ def _owners(
 
 def write_umb(
     path: str | os.PathLike[str],
-    model: Model,
+    model: Model | POMDP,
     *,
     compression: Compression | Literal["by name"] | None = "by name",
 ) -> None:
@@ -189,8 +220,8 @@ def write_umb(
 
     Args:
       path: the file.
-      model: a model that ``to_sparse`` takes, a game, or an interval model; its rewards are written
-        as point intervals.
+      model: a model that ``to_sparse`` takes, a game, a POMDP, or an interval model; the rewards of
+        the last are written as point intervals.
       compression: "gzip", "xz", None for none, or by suffix: xz for ``.xz``, else gzip.
 
     Raises:
@@ -221,19 +252,22 @@ def write_umb(
                 file.write(piece)
 
 
-def umb_contents(model: Model) -> Members:
+def umb_contents(model: Model | POMDP) -> Members:
     """Members of the output, the index first."""
     system: NDArray[np.bool_] | None = None
-    interval = None
+    interval = pomdp = None
+    if isinstance(model, POMDP):
+        pomdp = model
+        model = pomdp.fully_observable
     if isinstance(model, Game):
         system = np.asarray(model.system, np.bool_).ravel()
         model = model.mdp
     if isinstance(model, IntervalMDP):
         refuse_ball(model, "the format holds intervals")
         interval, model = model.host, model.nominal
-    sparse = to_sparse(model)
+    sparse = to_sparse(cast(Model, model))
     host, initial = sparse.host, np.asarray(sparse.initial, np.float64)
-    players = 2 if system is not None else 0 if host.is_chain else 1
+    players = 2 if system is not None else 0 if host.is_chain and pomdp is None else 1
     counts = {
         "time": "discrete",
         "#players": players,
@@ -257,6 +291,9 @@ def umb_contents(model: Model) -> Members:
         ("branch-to-target.bin", _packed(host.successor, "<u8")),
         ("branch-to-probability.bin", chances),
     ]
+    if pomdp is not None:
+        counts |= {"#observations": pomdp.num_observations, "observations-apply-to": "states"}
+        contents.append((OBSERVATIONS, _packed(pomdp.observation, "<u8")))
     if system is not None:
         counts["player-names"] = list(_PLAYERS)
         contents.append(("state-to-player.bin", _packed(~system, "<u4")))
@@ -275,16 +312,23 @@ def umb_contents(model: Model) -> Members:
         "annotations": annotations,
     }
     contents += more
-    if sparse.valuation:
-        variables = write_variables(sparse.valuation)
-        classes = [{"variables": variables.variables}]
-        states: dict[str, object] = {"unique": False, "classes": classes}
-        if variables.named:
-            states["#strings"] = len(variables.texts)
-            metadata["parameters"] = {TEXTS: variables.named}
-        index["valuations"] = {"states": states}
-        contents.append((f"{VALUATIONS}/valuations.bin", variables.records))
-        contents += _written_texts(variables.texts, VALUATIONS)
+    valuations: dict[str, object] = {}
+    named: list[str] = []
+    observables = {} if pomdp is None else pomdp.observables
+    for entity, valuation in (("states", sparse.valuation), ("observations", observables)):
+        if valuation:
+            variables, folder = write_variables(valuation), f"valuations/{entity}"
+            classes = [{"variables": variables.variables}]
+            layout: dict[str, object] = {"unique": False, "classes": classes}
+            if variables.named:
+                layout["#strings"] = len(variables.texts)
+                named += variables.named
+                metadata["parameters"] = {TEXTS: named}
+            valuations[entity] = layout
+            contents.append((f"{folder}/valuations.bin", variables.records))
+            contents += _written_texts(variables.texts, folder)
+    if valuations:
+        index["valuations"] = valuations
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
 
 
