@@ -43,7 +43,10 @@ class RandomGame:
             np.concatenate([row[e] for row, e in zip(flat, entries, strict=True)]),
             label=self.label,
             propositions=["a", "b"],
-            rewards={"r": jl.models.Rewards(choice=[x for xs in self.reward for x in xs])},
+            rewards={
+                "r": jl.models.Rewards(choice=[x for xs in self.reward for x in xs]),
+                "w": jl.models.Rewards(state=self.label[:, 0].astype(float)),
+            },
         )
         return jl.models.make_multiplayer_game(sparse, self.owner, ["p1", "p2", "p3"])
 
@@ -98,8 +101,14 @@ class RandomGame:
             value = np.where(infinite, 0, value)
         return np.where(infinite, np.inf, value)
 
-    def average(self) -> np.ndarray:
-        matrix, reward = self.chains
+    def discounted(self, target: np.ndarray, factor: float) -> np.ndarray:
+        """Discounted rewards ``[J, S]`` until a target."""
+        matrix, reward = self.absorbing(target)
+        return np.linalg.solve(np.eye(self.size) - factor * matrix, reward[..., None])[..., 0]
+
+    def average(self, reward: np.ndarray | None = None) -> np.ndarray:
+        matrix, earned = self.chains
+        reward = earned if reward is None else np.broadcast_to(reward, earned.shape)
         return np.einsum("jst,jt->js", _limit(matrix), reward)
 
     def maximised(self, members: set[int]) -> set[int]:
@@ -109,14 +118,24 @@ class RandomGame:
     # --- steps ---
 
     def backward(
-        self, value: np.ndarray, members: set[int], num_steps: int, earn: bool = False
+        self,
+        value: np.ndarray,
+        members: set[int],
+        num_steps: int,
+        *,
+        earn: bool = False,
+        factor: float = 1.0,
+        kept: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Optimal expected values after some steps, with the rewards of the steps."""
+        """Optimal expected values after some steps, with rewards of the steps; states of `kept` keep theirs."""
+        kept = np.zeros(self.size, bool) if kept is None else kept
         for _ in range(num_steps):
             value = np.array(
                 [
-                    (max if self.owner[s] in members else min)(
-                        row @ value + earn * c
+                    value[s]
+                    if kept[s]
+                    else (max if self.owner[s] in members else min)(
+                        row[row > 0] @ value[row > 0] * factor + earn * c
                         for row, c in zip(self.rows[s], self.reward[s], strict=True)
                     )
                     for s in range(self.size)

@@ -38,7 +38,7 @@ _KINDS: dict[str, Kind] = {
     **dict.fromkeys(("dtmc", "probabilistic"), "dtmc"),
     **dict.fromkeys(("mdp", "nondeterministic"), "mdp"),
     "pomdp": "pomdp",
-    "smg": "smg",
+    **dict.fromkeys(("smg", "stpg"), "smg"),
 }
 _REFUSED = {
     **dict.fromkeys(("ctmc", "stochastic"), "continuous-time Markov chains"),

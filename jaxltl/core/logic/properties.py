@@ -29,6 +29,8 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     and the sum of its rewards in place of infinity; `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`; until
     any co-safe formula is proven, `[ X F "goal" ]`, infinite where that has a probability below one.
     Of the graph: `E [ PATH ]` and `A [ PATH ]`, of some and of all paths, nested as in CTL.
+    `C{discount=0.9}`, `C{discount=0.9}<=10` and `F{discount=0.9} "goal"` discount each step; a run without a
+    target then earns its sum.
     Expected steps: `Tmin=? [ F "goal" ]`. Time in the long run: `LRAmax=? [ "up" ]`. Several at once:
     `multi(P, P, ...)`.
     State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
@@ -271,13 +273,16 @@ class _Parser(PathParser):
     def operator_property(self) -> Property:
         start = self.token
         if self.accept("<<"):
-            players = self.coalition()
-            inner = self.property_()
+            players, first = self.coalition(), self.token
+            expected = "P, R, T or LRA after a coalition"
             self.require(
-                inner.operator != "multi" and inner.aggregate is None and inner.coalition is None,
-                "P, R, T or LRA after a coalition",
-                start,
+                first.text != "(",
+                f"{expected}; several objectives of a game at once are not solved for",
+                first,
             )
+            inner = self.property_()
+            is_one = inner.operator in _CONTENT and inner.coalition is None
+            self.require(is_one and first.text != "filter", expected, start)
             return replace(inner, text=self.written(start), coalition=players)
         if self.accept("multi"):
             return self.multi(start)
@@ -293,6 +298,9 @@ class _Parser(PathParser):
         if match[1] == "R" and self.accept("{"):
             fields["reward"] = self.reward_name()
             self.expect("}")
+            self.require(
+                self.token.text != "/", "one reward; averages of a ratio of two are not solved for"
+            )
         elif match[1] == "R" and len(self.known.rewards) > 1:
             fields["reward"] = self.known.rewards[0] or None  # as in PRISM
         # R{"name"}max has max after the name.
@@ -304,6 +312,11 @@ class _Parser(PathParser):
         if match[1] == "R" and (variant := self.accept("F0", "Fc")):
             fields["unreached"] = "zero" if variant == "F0" else "sum"
             content = _Parser.eventual_state
+        following = [token.text for token in self.tokens[self.place + 1 :][:2]]
+        if match[1] == "R" and following == ["{", "discount"] and self.token.text in ("C", "F"):
+            content = _Parser.eventual_state if self.take().text == "F" else _Parser.collected
+            if (factor := self.discount()) is not None:
+                fields |= {"discount": factor, "unreached": "sum"}
         fields["path"], fields["definitions"] = self.scoped(lambda: content(self))
         if self.accept("{"):
             fields["aggregate"], fields["among"], more = self.state_filter()
@@ -323,6 +336,9 @@ class _Parser(PathParser):
             known = quoted or self.token.kind in ("word", "number")
             self.require(known, "a player, by its name or its number from 1")
             players.append(self.quoted() if quoted else self.take().text)
+            self.require(
+                self.token.text != ":", "one coalition; equilibria of several are not solved for"
+            )
         self.expect(">>", " or ','")
         return tuple(players)
 
@@ -429,8 +445,21 @@ class _Parser(PathParser):
         if self.accept("I"):
             self.expect("=", " and a number of steps after I")
             return Earned("instantaneous", self.steps())
-        if not self.accept("C"):
-            return self.reach_content()
+        return self.collected() if self.accept("C") else self.reach_content()
+
+    def discount(self) -> Fraction | None:
+        """The factor in ``{discount=d}``; None for 1."""
+        self.expect("{")
+        self.take()
+        self.expect("=", " after discount")
+        start = self.token
+        factor = self.number(signed=True)
+        self.require(0 <= factor <= 1, "a discount in the range from 0 to 1", start)
+        self.expect("}")
+        return None if factor == 1 else factor
+
+    def collected(self) -> Earned:
+        """What stands after C."""
         relation = self.accept("<=", "<")
         if relation is None:
             self.require(

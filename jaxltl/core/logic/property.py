@@ -44,6 +44,8 @@ class Property:
       coalition: of a game, the players that choose for the objective, as in `<<system>> Pmax=?`, or None.
       unreached: of a reward until `F`, that of a run that never arrives: infinite (`F`), zero (`F0`) or the sum
         of its rewards (`Fc`).
+      discount: of a reward `C{discount=d}` or `F{discount=d}`, the factor d of each step in [0, 1), or None; a run
+        that never arrives is then worth the sum of its rewards.
       definitions: propositions of the formulas that are no labels: comparisons and nested properties.
       expression: of `"value"`, the expression.
       aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
@@ -71,6 +73,7 @@ class Property:
     coalition: tuple[str, ...] | None = None
     expression: Comparison | None = None
     unreached: Literal["infinite", "zero", "sum"] = "infinite"
+    discount: Fraction | None = None
 
     @property
     def direction(self) -> Literal["max", "min"] | None:

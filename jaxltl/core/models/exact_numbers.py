@@ -87,8 +87,7 @@ def exact_state_reward(
 ) -> list[Fraction]:
     """Rewards of states."""
     state = _agreeing(numbers.rewards.get(name or "", (None,))[0], reward.state)
-    assert state is not None
-    return list(state)
+    return [ZERO] * numbers.mdp.num_states if state is None else list(state)
 
 
 def _agreeing(written: Part, values: object) -> Part:

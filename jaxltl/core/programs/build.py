@@ -297,10 +297,10 @@ def as_chain(explored: Explored, weights: Numbers) -> Explored:
 
 
 def _owners(program: Program, explored: Explored) -> Integers:
-    """The player of each state, the first one in deadlocks.
+    """The player of each state: of its choices with a player, the first one where there is one choice.
 
     Raises:
-      LanguageError: a state with choices of several players, or of none.
+      LanguageError: a state with choices of several players, or with several choices and no player.
     """
     modules = [m.name for m in program.modules]
     of_module = np.full(len(modules) + 1, -1)
@@ -310,11 +310,9 @@ def _owners(program: Program, explored: Explored) -> Integers:
         of_action[[explored.actions.index(a) for a in player.actions]] = i
     of_row = np.where(explored.action > 0, of_action[explored.action], of_module[explored.owner])
     state = np.repeat(np.arange(explored.row_count.size), explored.row_count)
-    owner = np.zeros(explored.row_count.size, np.int64)
-    owner[state] = of_row
-    wrong = of_row < 0
-    if not wrong.any():
-        wrong = owner[state] != of_row
+    owner = np.where(explored.row_count > 1, -1, 0)
+    owner[state[of_row >= 0]] = of_row[of_row >= 0]
+    wrong = (owner[state] < 0) | ((of_row >= 0) & (owner[state] != of_row))
     if wrong.any():
         row = int(np.argmax(wrong))
         i, action = int(state[row]), int(explored.action[row])

@@ -176,12 +176,19 @@ module o [b] true -> true; [] turn=0 & x=1 -> (turn'=1); endmodule"""
 
 
 def test_games_have_an_owner_for_each_state():
+    """As in PRISM-games: a choice without a player is made by the state's player, or it is the only one."""
+    smg = built(GAME)
+    assert smg.owner.tolist() == [0, 0, 1, 1]  # turn, x: 0, 0; 0, 1; 1, 1; 2, 1
+    alone = built(GAME.replace("player two n, [b]", "player two n"))
+    assert alone.owner.tolist() == [0, 0, 1, 0]
     with pytest.raises(
-        ValueError, match=r"command of module o in the state .*belongs to no player"
+        ValueError, match=r"command of module n in the state \(turn=1,x=1\) belongs to no player"
     ):
-        built(GAME)
-    with pytest.raises(ValueError, match=r"action \[b\] in the state .*belongs to no player"):
-        built(GAME.replace("n, [b] endplayer", "n, o endplayer"))
+        built(
+            GAME.replace("player two n, [b]", "player two [b]").replace(
+                "[] turn=1 ->", "[] turn=1 -> true; [] turn=1 ->"
+            )
+        )
     with pytest.raises(ValueError, match=r"\(turn=0,x=1\) belong to several players"):
         built(GAME.replace("player two n", "player two n, o"))
     smg = built(

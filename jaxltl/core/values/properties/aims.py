@@ -50,10 +50,14 @@ def of_coalition(model: SourceModel, prop: Property) -> tuple[CheckableModel, Pr
     """The model of one or two players in which a property of a multi-player game is asked.
 
     A coalition whose players, or whose opponents, have no choices leaves a decision process; without
-    a coalition all players are one.
+    a coalition all players are one. Two directions, as in ``Pmaxmin=?``, are those of two players.
     """
     if not isinstance(model, MultiplayerGame):
         return model, prop
+    two_players = len(model.players) == 2 and not isinstance(model.mdp, IntervalMDP)
+    if prop.coalition is None and prop.nature is not None and two_players:
+        together = prop.nature == prop.objective
+        prop = replace(prop, nature=None, coalition=None if together else model.players[:1])
     if prop.coalition is None or prop.direction is None:
         if prop.coalition is not None:
             ask = f"<<{', '.join(prop.coalition)}>> {prop.operator}max=?"

@@ -39,6 +39,8 @@ from jaxltl.core.sparse.bounded.reward_bounded import in_units
 from jaxltl.core.sparse.solvers.reward_if_reached import level_ends
 from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.values.engine.state_quantities import transition_reward
+from jaxltl.core.values.properties.aims import graph_of_model
+from jaxltl.core.values.properties.discounting import without_discount
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     reachability_problem,
     sparse_satisfaction,
@@ -64,6 +66,10 @@ def exact_values(
       rows: of a game, the rows ``int[S]`` of optimal strategies of both players.
       effort: the multiple of the limits on states, transitions and work.
     """
+    if prop.discount is not None:
+        model, prop = without_discount(model, prop)
+        maximize = np.append(maximize, True) if np.ndim(maximize) else maximize
+        rows = None if rows is None else np.append(rows, graph_of_model(model).num_rows - 1)
     inner = model.mdp if isinstance(model, Game) else model
     if not isinstance(inner, SparseMDP):
         return None

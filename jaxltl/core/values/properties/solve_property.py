@@ -32,7 +32,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import Reward, SparseMDP
+from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.sparse.exact.model import double_bounds
 from jaxltl.core.sparse.solvers.shortest_path_problem import RelativeTolerance
 from jaxltl.core.types import Solution, Status
@@ -60,6 +60,7 @@ from jaxltl.core.values.properties.answers import (
     filtered,
     with_definitions,
 )
+from jaxltl.core.values.properties.discounting import rounding_of_discount, without_discount
 from jaxltl.core.values.properties.expressions import expression_bounds
 from jaxltl.core.values.properties.model_query import ModelQuery, QueryResult
 from jaxltl.core.values.properties.partially_observable import solve_partially_observable
@@ -464,12 +465,28 @@ def meets(
     return True if lower > threshold else False if upper <= threshold else None
 
 
+def _without_end(result: QueryResult, margin: float) -> QueryResult:
+    """The result without the last state of the model, with bounds that are wider by a margin."""
+    solution, strategy = result
+    lower: Array = np.asarray(solution.lower)
+    upper: Array = np.asarray(solution.upper)
+    wide: Array = np.where((lower == 0) & (upper == 0), 0, margin)  # nothing can be earned
+    lower = np.where(wide, np.nextafter(lower - wide, -np.inf), lower)
+    upper = np.where(wide, np.nextafter(upper + wide, np.inf), upper)
+    strategy = strategy and strategy._replace(row=strategy.row[:-1])
+    return QueryResult(replace(solution, lower=lower, upper=upper), strategy)
+
+
 # --- which solver -----------------------------------------------------------------------------
 
 
 def _solved(query: ModelQuery, prop: Property, aim: PropertyAim, tolerance: float) -> QueryResult:
     """The solution of a property at some states."""
     model, path = query.model, prop.path
+    if prop.discount is not None:
+        larger, simple = without_discount(model, prop)
+        result = _solved(ModelQuery(larger, query.states, query.text), simple, aim, tolerance)
+        return _without_end(result, rounding_of_discount(model, prop))
     if prop.operator == "P":
         assert not isinstance(path, Earned)
         return query.probability(path, aim, tolerance)
@@ -488,6 +505,8 @@ def _solved(query: ModelQuery, prop: Property, aim: PropertyAim, tolerance: floa
         target = query.where(path.operands[0])
     elif isinstance(path, Earned) and path.steps is not None:
         cumulative = path.kind == "cumulative"
+        if not cumulative and reward_structure(graph_of_model(model), reward).state is None:
+            reward = np.zeros(graph_of_model(model).num_states)  # only those of states count
         solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
         return query.result(solve(model, reward, path.steps, **aim.directions), by="steps")
     inner = model.mdp if isinstance(model, Game) else model

@@ -257,6 +257,63 @@ def test_a_game_of_modules(text, value):
     check(game(RELAY), text, value)
 
 
+# Ann may rest or pass to Ben, who sends back or stays; discounted values solve x = 1 + d max(x, ...).
+LOOP = """stpg
+player ann [rest], [pass] endplayer
+player ben [back], [stay] endplayer
+module m
+  s : [0..2];
+  [rest] s=0 -> true;
+  [pass] s=0 -> 1/2 : (s'=1) + 1/2 : (s'=2);
+  [back] s=1 -> (s'=0);
+  [stay] s=1 -> (s'=1);
+  [] s=2 -> true;
+endmodule
+label "end" = s=2;
+rewards "r" [rest] true : 1; [pass] true : 3; [stay] true : 2; endrewards
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        # At 1/2: rest for ever 2; pass 3 + V(1)/4, where back is V(0)/2 and stay 4.
+        ('<<ann>> R{"r"}max=? [ C{discount=1/2} ]', "24/7"), ('<<*>> R{"r"}max=? [ C{discount=0.5} ]', 4),
+        ('<<ann>> R{"r"}min=? [ C{discount=1/2} ]', 2), ('<<ben>> R{"r"}max=? [ C{discount=1/2} ]', 2),
+        ('<<ann>> R{"r"}>=24/7 [ C{discount=1/2} ]', True), ('<<ann>> R{"r"}>24/7 [ C{discount=1/2} ]', False),
+        # A run without a target earns its discounted sum.
+        ('<<ann>> R{"r"}max=? [ F{discount=1/2} "end" ]', "24/7"), ('<<ann>> R{"r"}max=? [ F{discount=0.5} s>0 ]', 3),
+        ('<<ann>> R{"r"}min=? [ F{discount=1/2} s>0 ]', 2), ('<<ann>> R{"r"}max=? [ F s>0 ]', "inf"),
+        ('<<ann>> R{"r"}max=? [ C{discount=1/2}<=3 ]', "27/8"), ('<<ann>> R{"r"}min=? [ C{discount=1/2}<=3 ]', "7/4"),
+        ('<<*>> R{"r"}max=? [ C{discount=1/2}<3 ]', "7/2"), ('<<ann>> R{"r"}max=? [ C{discount=0} ]', 3),
+        ('<<ann>> R{"r"}max=? [ C{discount=1}<=2 ]', 4), ('<<ann>> R{"r"}max=? [ C{discount=1} ]', "inf"),
+        ('<<ann>> R{"r"}max=? [ C{discount=1/2}<=0 ]', 0), ('R{"r"}max=? [ C{discount=1/2} ] - 1', 3),
+        # Two directions are those of the first and of the second player.
+        ('R{"r"}maxmin=? [ C{discount=1/2} ]', "24/7"), ('R{"r"}maxmax=? [ C{discount=1/2} ]', 4),
+        ('Pmaxmin=? [ F "end" ]', "1/2"), ('Pminmax=? [ F "end" ]', 0), ('Pmaxmin=? [ F s=1 & X s=1 ]', 0),
+        ('<<ann>> R{"r"}max=? [ I=2 ]', 0), ('<<ann>> P>0.4 [ X s=1 {s=0} ]', True),
+        ('<<1>> Pmax=? [ F "end" {s=1}{min} ]', 0),
+    ],
+)  # fmt: skip
+def test_discounted_rewards_and_two_directions(text, value):
+    check(game(LOOP), text, value)
+
+
+def test_discounted_rewards_of_chains_and_strategies():
+    reward = {"r": jl.models.Rewards(transition=[1, 3, 0])}
+    chain = jl.make_sparse(
+        None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1], initial=[1, 0], rewards=reward
+    )
+    # x = 2 + 0.9 x / 2.
+    check(chain, "R=? [ C{discount=0.9} ]", "40/11")
+    check(chain, "R>=40/11 [ C{discount=0.9} ]", True)
+    check(chain, "R>40/11 [ C{discount=0.9} ]", False)
+    found = jl.solve_property(game(LOOP), '<<ann>> R{"r"}max=? [ C{discount=1/2} ]')
+    assert found.strategy.row.tolist() == [0, 2, 4]  # pass, back
+    exact = jl.solve_property(game(LOOP), 'R{"r"}max=? [ C{discount=0.3} ]', exact=True)
+    assert exact.exact == (Fraction(24, 7),)
+
+
 def test_games_of_the_literature():
     """With one throw x > y in 15 of 36; with two, the first player keeps an x with (x-1)/6 > 55/216."""
     assert jl.solve_property(dice(10), '<<one>> P>=0.5 [ F "one" ]').holds == [True]
@@ -286,6 +343,12 @@ def test_games_of_the_literature():
         ('<<1>> <<2>> Pmax=? [ F "goal" ]', "after a coalition"), ("<<1 Pmax=? [ X true ]", "expected '>>'"),
         ('multi(R{"steps"}max=? [ Fc "goal" ], P>=0.5 [ F "goal" ])', r"only probabilities, R \[ F"),
         ('multi(R{"steps"}max=? [ F0 "goal" ], P>=0.5 [ F "goal" ])', r"only probabilities, R \[ F"),
+        ('<<1>> (P>=1/2 [ F "goal" ] & R{"cost"}>=1 [ C ])', "several objectives of a game"),
+        ('<<1>> R{"cost"}/{"steps"}max=? [ S ]', "ratio"), ("<<1:2>> max=? (P[X true]+P[X true])", "equilibria"),
+        ('<<1>> filter(max, Pmax=? [ F "goal" ])', "after a coalition"), ('Pmaxmin=? [ F "goal" ]', "no intervals"),
+        ('R{"cost"}max=? [ C{discount=1.5} ]', "range from 0 to 1"), ('R{"cost"}max=? [ C{discount=-1} ]', "range"),
+        ('R{"cost"}max=? [ F{discount=0.5} X "goal" ]', "a state formula"),
+        ('multi(R{"cost"}min=? [ C{discount=0.5} ], P>=0.5 [ F "goal" ])', r"only probabilities, R \[ F"),
         ('<<1>> R{"time"}max=? [ C ]', "time"), ('<<1>> P>=1/2 [ Fc "goal" ]', "Fc"),
     ],
 )  # fmt: skip

@@ -17,25 +17,49 @@ COALITIONS = [set(c) for k in range(4) for c in itertools.combinations(range(3),
 def references(game: RandomGame):
     """Texts of paths and rewards, with functions from a coalition to the values of all states."""
     a, b = game.label.T
+    zero, nowhere = np.zeros(game.size), np.zeros(game.size, bool)
 
     def of(quantity):
         return lambda members: game.coalition_value(quantity, members)
 
+    def within(target, stay, steps):
+        return lambda m: game.backward(target.astype(float), m, steps, kept=target | ~stay)
+
+    def ahead(quantity, earn=False):  # one step before a value
+        return lambda m: game.backward(game.coalition_value(quantity, m), m, 1, earn=earn)
+
+    steps = RandomGame(game.rows, [[1.0] * len(x) for x in game.rows], game.owner, game.label)
+    until_a = game.total(a, unreached="infinite")
     return {
         'P{} [ X "a" ]': lambda m: game.backward(a.astype(float), m, 1),
         'P{} [ F "a" ]': of(game.reached(a)),
         'P{} [ G !"b" ]': of(1 - game.reached(b)),
         'P{} [ !"b" U "a" ]': of(game.reached(a, ~b)),
+        'P{} [ "a" W "b" ]': of(1 - game.reached(~a & ~b, ~b)),
+        'P{} [ "a" R !"b" ]': of(1 - game.reached(b, ~a)),
+        'P{} [ F<=3 "a" ]': within(a, ~nowhere, 3),
+        'P{} [ !"b" U<=4 "a" ]': within(a, ~b, 4),
+        'P{} [ X F "a" ]': ahead(game.reached(a)),
+        'P{} [ F[1,3] "a" ]': lambda m: game.backward(within(a, ~nowhere, 2)(m), m, 1),
         'P{} [ G F "a" ]': of(game.recurrent(lambda after: (after & a).any(2))),
         'P{} [ F G "a" ]': of(game.recurrent(lambda after: (~after | a).all(2))),
         'P{} [ (F G "a") | (G F "b") ]': of(
             game.recurrent(lambda after: (~after | a).all(2) | (after & b).any(2))
         ),
-        'R{{"r"}}{} [ F "a" ]': of(game.total(a, unreached="infinite")),
+        'R{{"r"}}{} [ F "a" ]': of(until_a),
+        'R{{"r"}}{} [ X F "a" ]': ahead(until_a, earn=True),
         'R{{"r"}}{} [ Fc "a" ]': of(game.total(a, unreached="sum")),
-        'R{{"r"}}{} [ C ]': of(game.total(np.zeros(game.size, bool), unreached="sum")),
+        'R{{"r"}}{} [ C ]': of(game.total(nowhere, unreached="sum")),
         'R{{"r"}}{} [ S ]': of(game.average()),
-        'R{{"r"}}{} [ C<=3 ]': lambda m: game.backward(np.zeros(game.size), m, 3, earn=True),
+        'R{{"r"}}{} [ C<=3 ]': lambda m: game.backward(zero, m, 3, earn=True),
+        'R{{"w"}}{} [ I=2 ]': lambda m: game.backward(a.astype(float), m, 2),
+        'R{{"r"}}{} [ C{{discount=0.9}} ]': of(game.discounted(nowhere, 0.9)),
+        'R{{"r"}}{} [ F{{discount=0.9}} "a" ]': of(game.discounted(a, 0.9)),
+        'R{{"r"}}{} [ C{{discount=0.9}}<=3 ]': lambda m: game.backward(
+            zero, m, 3, earn=True, factor=0.9
+        ),
+        'T{} [ F "b" ]': of(steps.total(b, unreached="infinite")),
+        'LRA{} [ "a" ]': of(game.average(a.astype(float))),
     }
 
 
@@ -60,7 +84,7 @@ def check_game(seed: int, most: int = 8) -> int:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_every_form_for_every_coalition(seed):
-    assert check_game(seed, most=6) == 96
+    assert check_game(seed, most=6) == 200
 
 
 def check_reached(seed: int, most: int, limit: int) -> None:
