@@ -16,7 +16,7 @@ from .adapters.minigrid import from_navix as from_navix
 from .adapters.pgx import from_pgx as from_pgx
 from .adapters.minigrid import from_xminigrid as from_xminigrid
 from .flat_world import flat_world as flat_world
-from .gridworld import gridworld as gridworld
+from .gridworld import gridworld as gridworld, partial_gridworld as partial_gridworld
 from .gymnasium_runner import run_policy as run_policy
 from .gymnasium_tables import from_gymnasium as from_gymnasium
 from .gymnasium_task import gymnasium_task as gymnasium_task

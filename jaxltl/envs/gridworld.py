@@ -1,4 +1,4 @@
-"""Gridworlds from text maps."""
+"""Gridworlds from text maps, fully or partially observable."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.pomdp import POMDP, make_pomdp, observation_numbers
 from jaxltl.core.models.protocols import Array
-from jaxltl.envs.text_map import parse_map
+from jaxltl.envs.text_map import parse_map, plain_kind
 
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -73,6 +74,129 @@ def gridworld(
     if initial is None or isinstance(initial, str):
         initial = _initial(initial, label, propositions, ~is_wall)
     return make_mdp(successor, probability, initial=initial, label=label, propositions=propositions)
+
+
+def partial_gridworld(
+    text: str,
+    observations: int | Collection[str] = 3,
+    *,
+    hidden: Collection[str] = (),
+    slip: float = 0.0,
+    absorbing: Collection[str] = (),
+    legend: Mapping[str, Collection[str]] | None = None,
+    wall: str = "#",
+    initial: str | Array | None = None,
+) -> POMDP:
+    """Partially observable gridworld: a robot that sees a window around its cell, or senses a few facts.
+
+    Equal windows are one observation, so that look-alike places are told apart by memory alone. The
+    border of the map looks like a wall.
+
+    Args:
+      text: the map, see :func:`parse_map`.
+      observations: the odd side of a square window in cells, 3 for the eight neighbours; or what is
+        sensed: ``"wall"`` (in each of the four directions) and propositions of the robot's own cell.
+      hidden: kinds of cells that look like plain floor in a window.
+      slip, absorbing, legend, wall, initial: as in :func:`gridworld`.
+
+    Returns:
+      :class:`~jaxltl.core.models.pomdp.POMDP` whose ``fully_observable`` is the gridworld. Its
+      `observables` are the kinds in the window (``"up 1, left 1"``, numbered in alphabetical order), or
+      what is sensed, 0 or 1 (``"wall up"``, ``"a"``).
+
+    Raises:
+      ValueError: a window that is no odd number, an unknown proposition or kind, or an argument that
+        :func:`gridworld` refuses.
+
+    >>> world = partial_gridworld("a . . . b", 3)
+    >>> world.observation.tolist()  # the middle cells look alike
+    [2, 0, 1, 1, 3]
+    >>> partial_gridworld("a . . b", ["wall"]).observables["wall left"].tolist()
+    [0, 0, 1]
+    """
+    world = gridworld(
+        text, slip=slip, absorbing=absorbing, legend=legend, wall=wall, initial=initial
+    )
+    cells = parse_map(text)
+    names = [hidden] if isinstance(hidden, str) else list(hidden)
+    for kind in names:
+        if kind not in cells:
+            raise ValueError(
+                f"hidden: {kind!r} is not a kind of cell of the map; it has "
+                f"{', '.join(np.unique(cells))}."
+            )
+    if isinstance(observations, int | np.integer):
+        side = validation.integer("observations", observations, least=1)
+        if side % 2 == 0:
+            raise ValueError(
+                f"observations is {side}; the side of a window is odd, such as {side + 1}, so that the "
+                "robot is in its middle."
+            )
+        looks = np.where(np.isin(cells, names), plain_kind(cells), cells)
+        columns = _windows(looks, side // 2, wall)
+    else:
+        if names:
+            raise ValueError(
+                "hidden is for windows; leave it out, and name in observations what is sensed."
+            )
+        listed = [observations] if isinstance(observations, str) else list(observations)
+        columns = _sensed(cells, np.asarray(world.label), world.propositions, listed, wall)
+    is_wall = (cells == wall).ravel()
+    first = np.flatnonzero(is_wall)[:1]
+    # Walls are never entered, and have one observation.
+    for values in columns.values():
+        values[is_wall] = values[first]
+    number, observables = observation_numbers(columns)
+    return make_pomdp(world, number, observables=observables)
+
+
+def _windows(looks: np.ndarray, radius: int, wall: str) -> dict[str, np.ndarray]:
+    """The kind in each cell of the window, numbered, by its place relative to the robot."""
+    rows, columns = looks.shape
+    wide = looks.astype(f"<U{max(len(wall), looks.itemsize // 4)}")  # room for the name of walls
+    _, number = np.unique(np.pad(wide, radius, constant_values=wall), return_inverse=True)
+    number = number.reshape(rows + 2 * radius, columns + 2 * radius)
+    seen = {}
+    for down in range(-radius, radius + 1):
+        for right in range(-radius, radius + 1):
+            there = number[radius + down :, radius + right :][:rows, :columns]
+            seen[_place_name(down, right)] = there.ravel().copy()
+    return seen
+
+
+def _place_name(down: int, right: int) -> str:
+    parts = [f"{'down' if down > 0 else 'up'} {abs(down)}"] if down else []
+    parts += [f"{'right' if right > 0 else 'left'} {abs(right)}"] if right else []
+    return ", ".join(parts) or "here"
+
+
+def _sensed(
+    cells: np.ndarray,
+    label: np.ndarray,
+    propositions: tuple[str, ...],
+    observations: list[str],
+    wall: str,
+) -> dict[str, np.ndarray]:
+    """Walls in the four directions, and propositions of the robot's cell, as 0 or 1."""
+    seen = {}
+    for name in observations:
+        if name == "wall":
+            blocked = np.pad(cells == wall, 1, constant_values=True)
+            for action, (down, right) in zip(ACTIONS, _MOVES, strict=True):
+                there = blocked[1 + down :, 1 + right :][: cells.shape[0], : cells.shape[1]]
+                seen[f"wall {action}"] = there.ravel().astype(int)
+        elif name in propositions:
+            seen[name] = label[:, propositions.index(name)].astype(int)
+        else:
+            known = ", ".join(("wall", *propositions))
+            raise ValueError(
+                f"observations: {name!r} is neither 'wall' nor a proposition of the map; it has {known}."
+            )
+    if not seen:
+        raise ValueError(
+            "observations is empty; give the side of a window, such as 3, or a list such as ['wall']."
+        )
+    return seen
 
 
 def _labels(

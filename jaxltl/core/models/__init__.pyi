@@ -62,7 +62,7 @@ from .parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,
 )
-from .pomdp import POMDP as POMDP, make_pomdp as make_pomdp
+from .pomdp import POMDP as POMDP, belief_filter as belief_filter, make_pomdp as make_pomdp
 from .product import Product as Product, occurring_letters as occurring_letters, product as product
 from .sparse import (
     Rewards as Rewards,

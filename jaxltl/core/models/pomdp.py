@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import struct
-from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
@@ -19,6 +19,7 @@ from jaxltl.core.models.number_source import NumberSource
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.refusals import refuse_traced
 from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import first_true
 
@@ -229,3 +230,69 @@ def observation_numbers(columns: Mapping[str, Array]) -> tuple[Integers, dict[st
     return cast(Integers, number.ravel()), {
         name: np.asarray(x)[first] for name, x in columns.items()
     }
+
+
+def belief_filter(pomdp: POMDP, observation: ArrayLike, action: ArrayLike) -> Floats:
+    """Beliefs along a trajectory of observations and actions, by the Bayes filter.
+
+    ``b_0(s)`` is the initial belief given the first observation, and ``b_{t+1}(s')`` is proportional to
+    ``sum_s b_t(s) P(s' | s, a_t)`` in the states s' of observation ``o_{t+1}`` (Kaelbling, Littman and
+    Cassandra 1998).
+
+    Args:
+      pomdp: the model.
+      observation: ``int[T]``, observed at each step.
+      action: ``int[T - 1]`` or more, taken between them; later ones are not read.
+
+    Returns:
+      ``float64[T, S]``, probabilities of the states.
+
+    Raises:
+      ValueError: an observation or action that is impossible after those before.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> coin = from_dense([[[0, 0.5, 0.5]], [[1.0, 0, 0]], [[1.0, 0, 0]]], initial=[1, 0, 0])
+      >>> belief_filter(make_pomdp(coin, [0, 1, 1]), [0, 1, 0], [0, 0]).tolist()
+      [[1.0, 0.0, 0.0], [0.0, 0.5, 0.5], [1.0, 0.0, 0.0]]
+    """
+    seen, did = np.atleast_1d(np.asarray(observation)), np.atleast_1d(np.asarray(action))
+    if not seen.size or did.size < seen.size - 1:
+        raise ValueError(
+            f"action has {did.size} steps for {seen.size} observations; give one observation at least, and "
+            "an action between any two."
+        )
+    of_state, table = np.asarray(pomdp.observation), pomdp.row_of_action
+    matrix, belief = pomdp.fully_observable.host.matrix, np.asarray(pomdp.initial, np.float64)
+    beliefs = np.zeros((seen.size, pomdp.num_states))
+    for t, o in enumerate(seen.tolist()):
+        if t:
+            a = int(did[t - 1])
+            row = table[:, a] if 0 <= a < pomdp.num_actions else np.full(pomdp.num_states, -1)
+            held = np.flatnonzero(belief > 0)
+            if (row[held] < 0).any():
+                raise ValueError(f"action[{t - 1}] is {a}, which is not available there.")
+            belief = belief[held] @ matrix[row[held]]
+        belief = np.where(of_state == o, belief, 0)
+        if not belief.any():
+            raise ValueError(f"observation[{t}] is {o}, which cannot follow the steps before it.")
+        belief = belief / belief.sum()
+        beliefs[t] = belief
+    return beliefs
+
+
+def policy_of_states(pomdp: POMDP, policy: FiniteMemoryPolicy) -> FiniteMemoryPolicy:
+    """The policy of a POMDP's observations as one of its states; it acts alike in look-alike states."""
+    if policy.num_states != pomdp.num_observations:
+        raise ValueError(
+            f"the policy is of {policy.num_states} observations, and the POMDP has {pomdp.num_observations}."
+        )
+    seen = np.asarray(pomdp.observation)
+    table = policy.on_host()
+    return table.replace(
+        action=table.action[..., seen, :, :] if table.is_random else table.action[..., seen, :],
+        initial_memory=table.initial_memory[seen],
+        next_memory=table.next_memory[seen],
+        letter=None if table.letter is None else np.asarray(table.letter)[seen],
+        states=(),
+    )

@@ -16,9 +16,11 @@ from jaxltl.core import struct, validation
 from jaxltl.core.validation import first_true
 
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
+from jaxltl.core.models.pomdp import POMDP, policy_of_states
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 
@@ -170,7 +172,7 @@ def _check_steps(
 
 
 def rollout(
-    model: ActionModel,
+    model: ActionModel | POMDP,
     policy: jax.Array | FiniteMemoryPolicy,
     key: chex.PRNGKey,
     *,
@@ -181,9 +183,10 @@ def rollout(
     """Simulated trajectories of a policy.
 
     Args:
-      model: an MDP, a DenseMDP or a Product (states then numbered ``s * Q + q``).
+      model: an MDP, a DenseMDP, a POMDP or a Product (states then numbered ``s * Q + q``).
       policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product; or a
-        :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy` of the model.
+        :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy` of the model, in a POMDP of its
+        observations.
       key: a PRNG key, consumed.
       num_trajectories, num_steps: N, and the length T of the longest; static under ``jit``.
       stop: ``bool[S]`` (or ``bool[S, Q]``): a trajectory ends with the pair that enters such a state,
@@ -202,6 +205,13 @@ def rollout(
       >>> rollout(path, policy, key, num_trajectories=2, num_steps=3).state.tolist()
       [[0, 1, 0], [0, 1, 0]]
     """
+    if isinstance(model, POMDP):
+        if not isinstance(policy, FiniteMemoryPolicy):
+            raise ValueError(
+                f"rollout: the policy is {type(policy).__name__}; in a POMDP, give a FiniteMemoryPolicy "
+                "whose states are the observations."
+            )
+        policy, model = policy_of_states(model, policy), to_padded(model.fully_observable)
     if not isinstance(policy, FiniteMemoryPolicy):
         distribution = policy_distribution(model, policy).reshape(-1, 1, model.num_actions)
         zeros = np.zeros((len(distribution), 1), np.int32)

@@ -45,6 +45,11 @@ from .multi_objective.multi_objective import (
 )
 from .multi_objective.objectives import Objective as Objective
 from .partial_observability.chains import controlled_chain as controlled_chain
+from .partial_observability.reduction import (
+    MealyTransition as MealyTransition,
+    mealy_machine as mealy_machine,
+    reduced_controller as reduced_controller,
+)
 from .partial_observability.solve import belief_bounds as belief_bounds
 from .partial_observability.supports import (
     SupportShield as SupportShield,

@@ -242,22 +242,30 @@ def partially_observable_satisfaction(
 
     The automaton's state is hidden as far as labels are; the controller reads observations alone.
     """
-    world = product(pomdp.fully_observable, formula)
-    automaton: Automaton = world.automaton
-    if not automaton.has_final_states:
+    joint, final, automaton = task_pomdp(pomdp, formula)
+    if final is None:
         raise ValueError(
             f"{formula}: the formula is neither co-safe nor safe. Optimal probabilities of such formulas "
             "under partial observability are undecidable; evaluate a controller by "
             "solve_property(controlled_chain(pomdp, policy), ...), a lower bound of the maximum, and ask for "
             "the fully observable model's maximum, pomdp.fully_observable, an upper bound."
         )
-    flat = to_sparse(world)
-    seen = np.repeat(np.asarray(pomdp.observation), world.num_memory)
-    joint = POMDP(flat, seen, pomdp.observables)
-    final = np.asarray(world.final).ravel()
     width = TOLERANCE if tolerance is None else float(tolerance)
     bounds = partial(belief_bounds, joint, tolerance=width, max_beliefs=max_beliefs)
     if automaton.is_safety:
         opposite = "min" if objective == "max" else "max"
         return complement_event(bounds(~final, objective=opposite))
     return bounds(final, objective=objective)
+
+
+def task_pomdp(pomdp: POMDP, formula: FormulaLike) -> tuple[POMDP, Booleans | None, Automaton]:
+    """The product with a formula's automaton, whose state is hidden, its final states, and the automaton.
+
+    Its observations are those of the POMDP. A co-safe formula is satisfied by reaching a final state, a
+    safe one by staying in them; of other formulas they are None.
+    """
+    world = product(pomdp.fully_observable, formula)
+    seen = np.repeat(np.asarray(pomdp.observation), world.num_memory)
+    automaton: Automaton = world.automaton
+    final = np.asarray(world.final).ravel() if automaton.has_final_states else None
+    return POMDP(to_sparse(world), seen, pomdp.observables), final, automaton
