@@ -18,7 +18,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.number_source import NumberSource, Part, RationalNumbers
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.sparse.exact.model import ExactMDP
+from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.sparse.rows import row_entries
@@ -68,38 +68,57 @@ def transition_graph(model: SparseMDP) -> SparseMDP:
     )
 
 
-def _unrolled(model: SparseMDP, product: SparseProduct) -> SparseMDP:
-    """The model of a product, with the labels, rewards and exact numbers of the model."""
-    row, state = product.base_row, product.base_state
-    entry, _ = row_entries(model.host.entry_start, row)
-    initial = np.bincount(product.start, minlength=state.size) / product.start.size
-    label = np.column_stack([np.asarray(model.label)[state], product.memory == 1])
+def model_of_product(model: SparseMDP, product: SparseProduct) -> SparseMDP:
+    """The product as a model, with the labels and exact probabilities of the model, without rewards."""
+    row, state, still = product.base_row, product.base_state, product.still
 
     def read(larger: SparseMDP) -> RationalNumbers:
         numbers = exact_numbers(model)
-        successor, starts = product.host.successor, product.host.entry_start
+        host = product.host
         rows: list[dict[int, Fraction]] = []
-        for base, (first, last) in zip(row.tolist(), _pairs(starts), strict=True):
-            after = successor[first:last].tolist()
-            rows.append({t: numbers.mdp.rows[base][int(state[t])] for t in after})
-        rewards = {
-            name: (_taken(parts[0], state), _taken(parts[1], row), _taken(parts[2], entry))
-            for name, parts in numbers.rewards.items()
-        }
-        return RationalNumbers(ExactMDP(product.host.row_start.tolist(), rows), rewards)
+        for base, s, (first, last) in zip(
+            row.tolist(), host.state.tolist(), _pairs(host.entry_start), strict=True
+        ):
+            after = host.successor[first:last].tolist()
+            entries = {t: numbers.mdp.rows[base].get(int(state[t]), ZERO) for t in after}
+            rows.append({s: ONE} if still[s] else entries)
+        return RationalNumbers(ExactMDP(host.row_start.tolist(), rows), {})
 
     return replace(
         model,
         row_start=product.host.row_start,
         entry_start=product.host.entry_start,
         successor=product.host.successor,
-        probability=np.asarray(model.probability)[entry],
-        initial=initial,
-        label=label,
-        propositions=(*model.propositions, END),
-        rewards={name: x.gathered(state, row, entry) for name, x in model.rewards.items()},
+        probability=product.host.probability,
+        initial=np.bincount(product.start, minlength=state.size) / product.start.size,
+        label=np.asarray(model.label)[state],
+        rewards={},
         action=None if model.action is None else np.asarray(model.action)[row],
         valuation={name: np.asarray(x)[state] for name, x in model.valuation.items()},
+        numbers=NumberSource(read),
+    )
+
+
+def _unrolled(model: SparseMDP, product: SparseProduct) -> SparseMDP:
+    """The model of a product in which all states go on, with the rewards of the model."""
+    row, state = product.base_row, product.base_state
+    entry, _ = row_entries(model.host.entry_start, row)
+    plain = model_of_product(model, product)
+
+    def read(larger: SparseMDP) -> RationalNumbers:
+        numbers, mdp = exact_numbers(model), exact_numbers(plain).mdp
+        rewards = {
+            name: (_taken(parts[0], state), _taken(parts[1], row), _taken(parts[2], entry))
+            for name, parts in numbers.rewards.items()
+        }
+        return RationalNumbers(mdp, rewards)
+
+    return replace(
+        plain,
+        probability=np.asarray(model.probability)[entry],
+        label=np.column_stack([plain.label, product.memory == 1]),
+        propositions=(*model.propositions, END),
+        rewards={name: x.gathered(state, row, entry) for name, x in model.rewards.items()},
         numbers=NumberSource(read),
     )
 

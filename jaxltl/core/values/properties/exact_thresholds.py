@@ -14,12 +14,14 @@ from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.array_types import Booleans
+from jaxltl.core.models.construct.property_models import model_of_product
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward, exact_state_reward
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.number_source import NumberSource, RationalNumbers
+from jaxltl.core.models.product_policy import ProductPolicy
 from jaxltl.core.models.sparse import SparseMDP, default_reward, reward_structure
 from jaxltl.core.sparse.exact import bounded
 from jaxltl.core.sparse.exact.average import average
@@ -56,25 +58,34 @@ def exact_values(
     prop: Property,
     states: np.ndarray,
     maximize: bool | Booleans,
-    rows: np.ndarray | None = None,
+    rows: np.ndarray | ProductPolicy | None = None,
     effort: int = 1,
 ) -> list[Fraction | float] | None:
     """Values at some states, fractions or infinite; None if it is large or has intervals.
 
     Args:
       maximize: the direction; in a game ``bool[S]``, True in the states of the maximiser.
-      rows: of a game, the rows ``int[S]`` of optimal strategies of both players.
+      rows: of a game, optimal strategies of both players: rows ``int[S]``, or those of a product.
       effort: the multiple of the limits on states, transitions and work.
     """
     if prop.discount is not None:
         model, prop = without_discount(model, prop)
         maximize = np.append(maximize, True) if np.ndim(maximize) else maximize
-        rows = None if rows is None else np.append(rows, graph_of_model(model).num_rows - 1)
+        if isinstance(rows, np.ndarray):
+            rows = np.append(rows, graph_of_model(model).num_rows - 1)
     inner = model.mdp if isinstance(model, Game) else model
     if not isinstance(inner, SparseMDP):
         return None
     if max(inner.num_states * 10, inner.num_transitions) > MAX_TRANSITIONS * effort:
         return None
+    if isinstance(rows, ProductPolicy):
+        product = rows.product
+        if max(product.still.size * 10, product.host.num_transitions) > MAX_TRANSITIONS * effort:
+            return None
+        place = np.where(product.still, 0, rows.row - inner.host.row_start[product.base_state])
+        rows = product.host.row_start[:-1] + place
+        inner, states = model_of_product(inner, product), product.start
+        maximize = np.broadcast_to(maximize, graph_of_model(model).num_states)[product.base_state]
     levels = prop.unreached == "zero"
     if isinstance(model, Game) and not levels and not _is_of_few_steps(prop):
         return _between_answers(inner, prop, states, maximize, rows, effort)

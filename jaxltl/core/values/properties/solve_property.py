@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
+from jaxltl.core.array_types import Integers
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.good_prefixes import is_plain_reachability
@@ -31,6 +32,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.pomdp import POMDP
+from jaxltl.core.models.product_policy import ProductPolicy
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.sparse.exact.model import double_bounds
@@ -243,8 +245,9 @@ def _of_model(
     result = solve(tolerance)
 
     def in_fractions(effort: int = 1) -> list[Fraction | float] | None:
-        strategy = result.strategy
-        rows = strategy.row if strategy is not None and strategy.memory is None else None
+        rows: Integers | ProductPolicy | None = None
+        if isinstance(model, Game) and result.strategy is not None:
+            rows = result.strategy.memory or result.strategy.row
         return exact_values(model, prop, states, maximizers(model, aim), rows, effort)
 
     if exact:

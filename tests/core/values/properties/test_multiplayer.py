@@ -257,6 +257,21 @@ def test_a_game_of_modules(text, value):
     check(game(RELAY), text, value)
 
 
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('<<1,2>> P>=1/3 [ F G "goal" ]', True), ('<<1,2>> P>1/3 [ F G "goal" ]', False),
+        ('<<3>> P>=1/3 [ G F "goal" ]', True), ('<<3>> P>1/3 [ G F "goal" ]', False),
+        ('<<1,2>> P<1/3 [ G F "goal" ]', False), ('<<bob>> P<=1/2 [ G F "goal" ]', True),
+        ('<<bob>> P<1/2 [ F G "goal" ]', False), ('<<1,2>> P>=1/3 [ X F ("goal" & X "goal") ]', True),
+        ('<<1,2>> P>1/3 [ X F ("goal" & X "goal") ]', False), ('<<1,2>> P>=2/3 [ F G "lost" ]', True),
+        ('<<1,2>> P>2/3 [ F G "lost" ]', False), ('<<1,2>> P>1/3 [ !(F G "lost") & F[0,9] "goal" ]', False),
+    ],
+)  # fmt: skip
+def test_thresholds_of_formulas_at_the_value_are_decided(text, value):
+    check(game(VAULT), text, value)
+
+
 # Ann may rest or pass to Ben, who sends back or stays; discounted values solve x = 1 + d max(x, ...).
 LOOP = """stpg
 player ann [rest], [pass] endplayer
