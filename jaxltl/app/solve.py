@@ -9,7 +9,8 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.app.reports.certificate import Certifiable
 from jaxltl.app.wording import Record
+from jaxltl.core.automata import Automaton
 from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, program_definitions
@@ -80,24 +82,39 @@ class PropertyResult:
 
 
 def parse_queries(
-    arguments: Sequence[str], definitions: Definitions | None = None
+    arguments: Sequence[str], definitions: Definitions | None = None, model: Path | None = None
 ) -> list[PropertyQuery]:
     """Parses arguments: properties, or names of property files; errors are kept by property."""
     queries = []
     for argument in arguments:
         place, text = "", argument
+        known = replace(
+            definitions or Definitions(), automaton=partial(_automaton, argument, model)
+        )
         if argument.lower().endswith(PROPERTY_FILES):
             try:
                 place, text = f"{argument}: ", _text_of(Path(argument))
             except ValueError as error:
                 queries.append(PropertyQuery(argument, error=str(error)))
                 continue
-        for one in parse_each(text, definitions):
+        for one in parse_each(text, known):
             if isinstance(one, Property):
                 queries.append(PropertyQuery(one.text, one))
             else:
                 queries.append(PropertyQuery(one.text, error=f"{place}{one.error}"))
     return queries
+
+
+def _automaton(argument: str, model: Path | None, name: str) -> Automaton:
+    """The automaton of a HOA file that a property names, beside the file of properties."""
+    from jaxltl.io.hoa.hoa import read_hoa
+
+    beside = Path(argument).parent if argument.lower().endswith(PROPERTY_FILES) else Path()
+    folders = {"$PROPERTY_DIR/": beside, "$MODEL_DIR/": model.parent if model else beside}
+    for start, folder in folders.items():
+        if name.startswith(start):
+            return read_hoa(_text_of(folder / name.removeprefix(start)))
+    return read_hoa(_text_of(beside / name))
 
 
 def _text_of(path: Path) -> str:
@@ -120,7 +137,7 @@ def read_queries(
     program, definitions = _read_source(path, constants, arguments)
     if program is not None and mesh is not None:
         raise ValueError(f"--mesh takes built models; {path} is a program.")
-    queries = parse_queries(arguments, definitions)
+    queries = parse_queries(arguments, definitions, path)
     if all(one.parsed is None for one in queries):
         raise ValueError("\n".join(str(one.error) for one in queries))
     return program, queries

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Literal
 
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 
 
@@ -58,6 +59,24 @@ class Conditional:
 
     def __str__(self) -> str:
         return f"{self.event} || {self.condition}"
+
+
+@dataclass(frozen=True)
+class Recognized:
+    """The paths that a deterministic automaton accepts, `HOA: {"file.hoa", "a" <- x=1}`.
+
+    Attributes:
+      automaton: an :class:`~jaxltl.core.automata.automaton.Automaton` over labels and definitions.
+      negated: whether it must reject them.
+      text: as it was written.
+    """
+
+    automaton: PyTree  # of a module above
+    negated: bool
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclass(frozen=True)

@@ -150,9 +150,11 @@ class Definitions:
     Attributes:
       names: the value of each constant and the expression of each formula.
       variables: the variables of the model.
+      integers: those of the variables that are known to be integers.
       rewards: the names of the reward structures in their order, for ``R{2}``.
       constant_values: values of constants that a property file declares without one.
       rational: the rational values of the names, and those of the constants of a property file.
+      automaton: reads the file of an automaton, ``HOA: {"file.hoa"}``, in a path, as ``jaxltl solve`` does.
 
     Example:
       >>> sorted(Definitions(variables=("x", "y")).known)
@@ -161,9 +163,11 @@ class Definitions:
 
     names: Mapping[str, Expression] = field(default_factory=dict)
     variables: tuple[str, ...] = ()
+    integers: frozenset[str] = frozenset()
     rewards: tuple[str, ...] = ()
     constant_values: Mapping[str, Value] = field(default_factory=dict)
     rational: Callable[[], RationalNames] = field(default=lambda: ({}, {}), repr=False)
+    automaton: Callable[[str], PyTree] | None = field(default=None, repr=False)
 
     @cached_property
     def rational_names(self) -> RationalNames:
@@ -209,6 +213,7 @@ def program_definitions(
     return Definitions(
         names | program.formulas,
         tuple(v.name for v in program.variables),
+        frozenset(v.name for v in program.variables if v.type == "int"),
         tuple(r.name for r in program.rewards),
         values,
         rational,

@@ -9,12 +9,12 @@ from typing import Any, Literal, NamedTuple
 
 from jaxltl.core.language.exact import is_inexact
 from jaxltl.core.language.expressions import FUNCTIONS, Expression
-from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized
 from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula, offending_subformula
 from jaxltl.core.logic.property import FILTERS, Property as Property
-from jaxltl.core.logic.property_paths import OPERATOR, PathParser
+from jaxltl.core.logic.property_paths import COALITION, OPERATOR, PathParser
 from jaxltl.core.logic.property_tokens import AFTER_OPERAND, BOUNDS, Token
 
 
@@ -121,7 +121,7 @@ _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
 _SIGNS = {"&": "forall", "|": "exists", "+": "sum"}  # of filters
 _DECLARE = ("const", "label", "formula")
 _ITEMS = (*_DECLARE, "E", "A", "filter", "multi")
-_BEGINS = ("<<", "(", "!", "-")
+_BEGINS = (*COALITION, "(", "!", "-")
 _CONTINUES = (*AFTER_OPERAND, "&", "|", "=>", "<=>")
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
@@ -199,7 +199,7 @@ class _Parser(PathParser):
                 OPERATOR.fullmatch(token.text) or token.text in _ITEMS
             )
             if "\n" in self.text[before.end : token.start] and (
-                starts == ":" or operator or token.text == "<<"
+                starts == ":" or operator or token.text in COALITION
             ):
                 return i
         return len(self.tokens) - 1
@@ -272,8 +272,8 @@ class _Parser(PathParser):
 
     def operator_property(self) -> Property:
         start = self.token
-        if self.accept("<<"):
-            players, first = self.coalition(), self.token
+        if sign := self.accept(*COALITION):
+            players, first = self.coalition(COALITION[sign]), self.token
             expected = "P, R, T or LRA after a coalition"
             self.require(
                 first.text != "(",
@@ -283,7 +283,8 @@ class _Parser(PathParser):
             inner = self.property_()
             is_one = inner.operator in _CONTENT and inner.coalition is None
             self.require(is_one and first.text != "filter", expected, start)
-            return replace(inner, text=self.written(start), coalition=players)
+            text, universal = self.written(start), sign == "[["
+            return replace(inner, text=text, coalition=players, universal=universal)
         if self.accept("multi"):
             return self.multi(start)
         if self.accept("filter"):
@@ -324,10 +325,10 @@ class _Parser(PathParser):
         self.expect("]", " or an operator")
         return Property(self.written(start), **fields)
 
-    def coalition(self) -> tuple[str, ...]:
+    def coalition(self, end: str) -> tuple[str, ...]:
         """The players of a coalition, and the sign after it."""
         players: list[str] = []
-        while self.token.text != ">>" and (not players or self.accept(",")):
+        while self.token.text != end and (not players or self.accept(",")):
             if self.accept("*"):
                 self.require(not players, "no other players with *, which is all", self.last)
                 players.append("*")
@@ -339,13 +340,15 @@ class _Parser(PathParser):
             self.require(
                 self.token.text != ":", "one coalition; equilibria of several are not solved for"
             )
-        self.expect(">>", " or ','")
+        self.expect(end, " or ','")
+        if end == "]":
+            self.expect(end, " twice")
         return tuple(players)
 
     def of_paths(self, start: Token) -> Property:
         """``E [ PATH ]`` or ``A [ PATH ]`` of computation tree logic."""
         self.expect("[")
-        path, defined = self.scoped(self.path)
+        path, defined = self.scoped(lambda: self.recognized() or self.path())
         self.expect("]", " or an operator")
         some: Literal["E", "A"] = "E" if start.text == "E" else "A"
         return Property(
@@ -439,6 +442,46 @@ class _Parser(PathParser):
             raise self.error(_STATE, start)
         return path
 
+    def event(self) -> Formula | Bounded | Conditional | Recognized:
+        """A path, or the automaton of one."""
+        return self.recognized() or self.condition()
+
+    def recognized(self) -> Recognized | None:
+        """`HOA: {"file.hoa", "a" <- x=1}`: a file and the meaning of its propositions; None for another path."""
+        start, before = self.token, self.place
+        negated = False
+        while self.accept("!"):
+            negated = not negated
+        if not (self.accept("HOA") and self.accept(":")):
+            self.place = before
+            return None
+        self.expect("{", " and the file of an automaton")
+        place, read = self.token, self.known.automaton
+        name = self.quoted()
+        hint = "a formula; automata are read by `jaxltl solve`, or by Definitions(automaton=...)"
+        if read is None:
+            raise self.error(hint, place)
+        try:
+            automaton = read(name)
+        except ValueError as error:
+            raise self.error(f"an automaton: {str(error).rstrip('.')}", place) from None
+        meanings = {x: x for x in automaton.propositions}
+        while self.accept(","):
+            place = self.token
+            proposition = self.quoted()
+            wanted = f"a proposition of the automaton: {', '.join(meanings)}"
+            self.require(proposition in meanings, wanted, place)
+            self.require(bool(self.accept("<") and self.accept("-")), "'<-' and a state formula")
+            meaning = self.state_property()
+            meanings[proposition] = f"[{proposition} <- {meaning.text}]"
+            self.definitions[meanings[proposition]] = meaning
+        for proposition in meanings.keys() & self.labels.keys():
+            if meanings[proposition] == proposition:
+                meanings[proposition] = self.define(self.labels[proposition])
+        self.expect("}", " or ','")
+        names = tuple(meanings[x] for x in automaton.propositions)
+        return Recognized(replace(automaton, propositions=names), negated, self.written(start))
+
     def reward_content(self) -> Formula | Earned:
         if self.accept("S", "LRA"):
             return Earned("average")
@@ -462,8 +505,9 @@ class _Parser(PathParser):
         """What stands after C."""
         relation = self.accept("<=", "<")
         if relation is None:
-            self.require(
-                self.token.text != "{",
+            following = [x.text for x in self.tokens[self.place + 2 : self.place + 4]]
+            self.require(  # {s=2} after C is a filter
+                self.token.text != "{" or following[:1] != ["}"] or following[1] not in ("<=", "<"),
                 "<= and a number of steps after C; the steps are bounded, not a reward",
             )
             return Earned("total")
@@ -502,8 +546,8 @@ def _is_expression(prop: Property) -> bool:
     return is_variable or (len(prop.definitions) > 1 and any(map(is_inexact, meanings)))
 
 
-_CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Conditional | Earned]] = {
-    "P": _Parser.condition,
+_CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Conditional | Earned | Recognized]] = {
+    "P": _Parser.event,
     "R": _Parser.reward_content,
     "T": _Parser.reach_content,
     "LRA": _Parser.state_content,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
-from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized
 from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.pretty_print import brief
@@ -37,11 +37,13 @@ class Property:
         within intervals; None where only one is said, or none.
       relation, threshold: the comparison, None for `=?`.
       reward: for `"R"`, the name, or None for the one without a name, or the only one of the model.
-      path: for `"P"` a formula, a bounded or a conditional one, for `"T"` and `"R"` `F` of a state formula or
+      path: for `"P"` a formula, a bounded or a conditional one, or a
+        :class:`~jaxltl.core.logic.bounded.Recognized`, for `"T"` and `"R"` `F` of a state formula or
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
       coalition: of a game, the players that choose for the objective, as in `<<system>> Pmax=?`, or None.
+      universal: whether all strategies of the coalition are meant, `[[system]] P>=0.5`, and not one of them.
       unreached: of a reward until `F`, that of a run that never arrives: infinite (`F`), zero (`F0`) or the sum
         of its rewards (`Fc`).
       discount: of a reward `C{discount=d}` or `F{discount=d}`, the factor d of each step in [0, 1), or None; a run
@@ -63,7 +65,7 @@ class Property:
     relation: Relation | None = None
     threshold: Fraction | None = None
     reward: str | None = None
-    path: Formula | Bounded | Conditional | Earned = TRUE
+    path: Formula | Bounded | Conditional | Earned | Recognized = TRUE
     parts: tuple[Property, ...] = ()
     name: str | None = None
     nature: Literal["max", "min"] | None = None
@@ -71,6 +73,7 @@ class Property:
     aggregate: str | None = None
     among: Formula = TRUE
     coalition: tuple[str, ...] | None = None
+    universal: bool = False
     expression: Comparison | None = None
     unreached: Literal["infinite", "zero", "sum"] = "infinite"
     discount: Fraction | None = None
@@ -83,7 +86,8 @@ class Property:
         """
         if self.objective is not None or self.relation is None:
             return self.objective
-        return "min" if (self.relation in (">", ">=")) == (self.coalition is None) else "max"
+        exists = self.coalition is not None and not self.universal
+        return "max" if (self.relation in (">", ">=")) == exists else "min"
 
     @property
     def is_number(self) -> bool:

@@ -21,6 +21,7 @@ from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
 from jaxltl.core.logic.property_tokens import AFTER_OPERAND
 from jaxltl.core.logic.property_tokens import Token, TokenStream, instead_of
 
+COALITION = {"<<": ">>", "[[": "]"}  # signs before its players, and after them
 OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
 _BRACKETS = {"E": "[", "A": "[", "filter": "(", "multi": "("}  # after other operators
 Path = Formula | Bounded
@@ -73,7 +74,7 @@ class PathParser(TokenStream, ABC):
         if token.kind == "quoted":
             return token.text in self.places
         if token.kind != "word" or token.text in self.known.known | self.names.keys():
-            return token.text == "<<"
+            return token.text in COALITION
         following = self.tokens[min(self.place + 1, len(self.tokens) - 1)].text
         return following == _BRACKETS.get(token.text) or bool(OPERATOR.fullmatch(token.text))
 

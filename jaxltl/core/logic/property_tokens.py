@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeVar, cast
 
 from jaxltl.core.language.exact import exact_tree, exact_value, is_inexact
 from jaxltl.core.language.expressions import (
+    RELATIONS,
     TRUE,
     Expression,
     LanguageError,
@@ -28,6 +29,8 @@ _Definitions = tuple[tuple[str, Comparison | Property], ...]
 _Content = TypeVar("_Content")
 
 
+_RELATIONS = (*RELATIONS, "=", "!=")
+_CONNECTIVES = ("!", "&", "|", "=>", "<=>")
 _OPERATORS = ("+", "-", "*", "/", "^")  # that continue a number as an expression
 AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")
 BOUNDS = ("<=", "<", ">=", ">", "=", "[", "{", "^")  # what follows a bounded operator
@@ -47,7 +50,7 @@ _TOKEN = re.compile(
   | (?P<quoted>"(?:\\["\\]|[^"])*+")
   | (?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
-  | (?P<sign><=>|<<|>>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*%^'])
+  | (?P<sign><=>|<<|>>|\[\[|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*%^'])
   | (?P<unknown>.)
 """,
     re.VERBOSE,
@@ -199,6 +202,7 @@ class TokenStream:
         else:
             if kind != "const":
                 self.expect("=")
+            begin = self.token
             comparison = self.state_expression(0)
             value = substitute(self.tree, self.names)
             plain = kind == "label" or not comparison.definitions
@@ -206,6 +210,13 @@ class TokenStream:
             constant = kind != "const" or value.is_literal
             self.require(constant, "an expression of constants", start)
             exact = exact_value(*self.rational_tree()) if kind == "const" else None
+            if kind == "const":
+                is_truth = isinstance(value.value, bool)
+                whole = type_ != "int" or (exact if exact is not None else value.value) == int(
+                    cast(int, value.value)
+                )
+                wanted = {"bool": "true or false", "int": "an integer"}.get(str(type_), "a number")
+                self.require(is_truth == (type_ == "bool") and whole, wanted, begin)
         if kind == "label":
             self.labels[name] = replace(comparison, text=f'"{name}"')
         else:
@@ -262,6 +273,7 @@ class TokenStream:
             self.require(self.token.kind != "unknown", "an expression")
             parser = self.operands()
             self.tree = tree = parser.expression(level)
+            self.kind(tree)
             tree = substitute(tree, {**self.names, **self.meanings})
         except LanguageError as error:
             place = bisect.bisect_left(self.starts, error.place)
@@ -269,6 +281,44 @@ class TokenStream:
             raise self.error(_expected(error.message), token) from None
         self.place = bisect.bisect_left(self.starts, parser.end)
         return tree
+
+    def kind(self, e: Expression) -> bool | None:
+        """True for a truth value, False for a number, None if unknown; LanguageError for a wrong operand."""
+        kinds = [self.kind(x) for x in e.operands]
+        truths, is_choice = e.operator in _CONNECTIVES, e.operator == "?:"
+        for operand, kind in zip(e.operands[: 1 if is_choice else None], kinds, strict=False):
+            if kind is not None and kind != (truths or is_choice) and e.operator not in ("=", "!="):
+                actual, wanted = (
+                    ("a truth value", "a number") if kind else ("a number", "a truth value")
+                )
+                sign = "-" if e.operator == "neg" else e.operator
+                raise LanguageError(
+                    operand.place, f"expected {wanted}; {sign} is applied to {actual}."
+                )
+        cases = kinds[1:] if is_choice else kinds
+        if e.operator in ("=", "!=", "?:") and {True, False} <= set(cases):
+            raise LanguageError(
+                e.place, "expected two numbers or two truth values, not one of each."
+            )
+        if e.operator == "name":
+            name = str(e.value)
+            if (meaning := self.definitions.get(name)) is not None:
+                tree = meaning.expression  # of an expression a comparison, else None
+                tree = tree.expression if isinstance(tree, Comparison) else tree
+                is_known = (
+                    meaning.is_number or tree is None or tree.operator in _RELATIONS + _CONNECTIVES
+                )
+                return not meaning.is_number if is_known else None
+            if name in self.names:
+                return self.kind(self.names[name])
+            return True if name.startswith('"') else False if name in self.known.integers else None
+        if e.operator == "literal":
+            return isinstance(e.value, bool)
+        return (
+            next((x for x in cases if x is not None), None)
+            if is_choice
+            else truths or e.operator in _RELATIONS
+        )
 
     def reward_name(self) -> str:
         """A name in quotes, or the number of a reward structure from 1."""

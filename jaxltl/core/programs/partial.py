@@ -12,7 +12,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.language.expressions import LanguageError, compile_expressions
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.logic.bounded import Bounded, Conditional, Earned
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized
 from jaxltl.core.logic.comparisons import Comparison, program_definitions
 from jaxltl.core.logic.labels import is_boolean, require_known, satisfying
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
@@ -170,7 +170,11 @@ def _answer(
 def _event(program: Program, prop: Property) -> _Event:
     """The event of a property; ValueError for properties of another kind."""
     path, steps = prop.path, None
-    if prop.operator != "P" or prop.aggregate is not None or isinstance(path, Earned | Conditional):
+    if (
+        prop.operator != "P"
+        or prop.aggregate is not None
+        or isinstance(path, Earned | Conditional | Recognized)
+    ):
         raise _unsupported(prop)
     if prop.direction is None and program.kind == "mdp":
         raise ValueError(f"{prop.text}: ask for Pmax=? or Pmin=? of an mdp.")

@@ -109,7 +109,7 @@ def write_certificate(
     """
     with errors_in("write_certificate: "), _no_collection():
         prop = parse_property(question)
-        if isinstance(model, MultiplayerGame) and prop.coalition:
+        if isinstance(model, MultiplayerGame) and prop.coalition and not prop.universal:
             model, prop = model.game(prop.coalition), replace(prop, coalition=None)
         if isinstance(model, MultiplayerGame | POMDP):
             raise ValueError(
@@ -173,7 +173,7 @@ def question_problem(
     model: Model, prop: Property, reward: Rewards | chex.Array | None, discount: float | None
 ) -> tuple[Certified, Formula | None]:
     """Validates the model and the question; with the formula that needs an automaton."""
-    if prop.coalition not in (None, ("system",)):
+    if prop.coalition not in (None, ("system",)) or prop.universal:
         raise ValueError(f"{prop.text}: certificates are written for the system of a game.")
     inner = model.mdp if isinstance(model, Game) else model
     if isinstance(inner, IntervalMDP):

@@ -52,8 +52,22 @@ def of_coalition(model: SourceModel, prop: Property) -> tuple[CheckableModel, Pr
     A coalition whose players, or whose opponents, have no choices leaves a decision process; without
     a coalition all players are one. Two directions, as in ``Pmaxmin=?``, are those of two players.
     """
+    if prop.coalition is not None and isinstance(model, SparseMDP):
+        # All players are one, whose strategies a coalition without players may not choose.
+        exists = prop.universal != bool(prop.coalition)
+        alone = replace(prop, coalition=() if exists else None, universal=False)
+        return model, replace(alone, coalition=None, objective=alone.direction)
+    if prop.universal and prop.relation is None:
+        ask = f"<<{', '.join(prop.coalition or ())}>>"
+        raise ValueError(f"{prop.text}: [[...]] is for thresholds; ask for the number of {ask}.")
+    if prop.universal and isinstance(model, Game):
+        raise ValueError(f"{prop.text}: ask whether the other player can meet it, <<environment>>.")
     if not isinstance(model, MultiplayerGame):
         return model, prop
+    if prop.universal:  # determined: the coalition cannot prevent what its opponents can enforce
+        members = model.members(prop.coalition or ())
+        others = (x for i, x in enumerate(model.players) if i not in members)
+        prop = replace(prop, coalition=tuple(others), universal=False)
     two_players = len(model.players) == 2 and not isinstance(model.mdp, IntervalMDP)
     if prop.coalition is None and prop.nature is not None and two_players:
         together = prop.nature == prop.objective

@@ -9,7 +9,9 @@ from typing import cast
 
 import numpy as np
 
-from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
+from jaxltl.core.automata.automaton import Automaton, complement
+from jaxltl.core.automata.translate import FormulaLike
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
 from jaxltl.core.logic.properties import Property
@@ -218,8 +220,12 @@ class _ExactQuery:
         structure = reward_structure(self.model, prop.reward)
         return exact_reward(self.model, self.numbers, structure, self.reward_name(prop.reward))
 
-    def probability(self, path: Formula | Bounded | Conditional, maximize: bool) -> Values:
+    def probability(
+        self, path: Formula | Bounded | Conditional | Recognized, maximize: bool
+    ) -> Values:
         """The probability of a path formula."""
+        if isinstance(path, Recognized):
+            return self.automaton(acceptor(path), maximize)
         if isinstance(path, Conditional):
             both = self.probability(path.event & path.condition, maximize)
             alone = self.probability(path.condition, maximize)
@@ -280,7 +286,7 @@ class _ExactQuery:
             rows[r][t] = c
         return bounded.until_at_cost(self.mdp, target, stay, (rows, limit), maximize, self.work)
 
-    def automaton(self, path: Formula, maximize: bool) -> Values:
+    def automaton(self, path: FormulaLike, maximize: bool) -> Values:
         """The probability of an LTL formula, on the product with an automaton."""
         objective = "max" if maximize else "min"
         result = sparse_satisfaction(
@@ -295,6 +301,12 @@ class _ExactQuery:
         value = reachability(mdp, problem.goal, None, problem.maximize, self.work)
         at_start = [value[s] for s in policy.product.start.tolist()]
         return [1 - x for x in at_start] if problem.complement else at_start
+
+
+def acceptor(path: Recognized) -> Automaton:
+    """The automaton that accepts the paths of a property."""
+    automaton: Automaton = path.automaton
+    return complement(automaton) if path.negated else automaton
 
 
 def reward_limit(path: Bounded) -> float:

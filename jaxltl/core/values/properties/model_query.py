@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.deferred import Deferred
-from jaxltl.core.logic.bounded import Bounded, Conditional, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Recognized, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS
@@ -21,7 +22,7 @@ from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.properties.aims import CheckableModel, PropertyAim, graph_of_model
 from jaxltl.core.values.properties.answers import PropertyStrategy
-from jaxltl.core.values.properties.exact_thresholds import reward_limit
+from jaxltl.core.values.properties.exact_thresholds import acceptor, reward_limit
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.undiscounted.fastest import QUICK_LIMIT, certified_fastest_rows
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -59,9 +60,11 @@ class ModelQuery(NamedTuple):
         return QueryResult(at_states(solution, self.states), strategy)
 
     def probability(
-        self, path: Formula | Bounded | Conditional, aim: PropertyAim, tolerance: float
+        self, path: Formula | Bounded | Conditional | Recognized, aim: PropertyAim, tolerance: float
     ) -> QueryResult:
         """The probability of a path formula; simple ones need no automaton."""
+        if isinstance(path, Recognized):
+            return self.automaton(acceptor(path), aim, tolerance)
         if isinstance(path, Bounded):
             return self.within(path, aim, tolerance)
         if isinstance(path, Conditional):
@@ -180,7 +183,7 @@ class ModelQuery(NamedTuple):
         row = Deferred(lambda: certified_fastest_rows(host, target, stay, aim.policy, chosen))
         return result._replace(strategy=PropertyStrategy(row))  # type: ignore[arg-type]
 
-    def automaton(self, path: Formula, aim: PropertyAim, tolerance: float) -> QueryResult:
+    def automaton(self, path: FormulaLike, aim: PropertyAim, tolerance: float) -> QueryResult:
         result = optimal_satisfaction(
             self.model, path, states=self.states, tolerance=tolerance, **aim.directions
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, unfolded
+from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized, unfolded
 from jaxltl.core.logic.good_prefixes import is_plain_reachability
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
@@ -12,6 +12,7 @@ from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
+from jaxltl.core.values.properties.exact_thresholds import acceptor
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
@@ -74,6 +75,8 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
                 f"{MAX_UNFOLDED_STEPS} steps."
             )
         path = unfolded(path)
+    if isinstance(path, Recognized):
+        return {"formula": acceptor(path)}
     if isinstance(path, Conditional):
         raise ValueError(
             f"{prop.text}: inside multi(...) there are no conditional probabilities, ||; write "

@@ -476,7 +476,7 @@ def _without_end(result: QueryResult, margin: float) -> QueryResult:
     wide: Array = np.where((lower == 0) & (upper == 0), 0, margin)  # nothing can be earned
     lower = np.where(wide, np.nextafter(lower - wide, -np.inf), lower)
     upper = np.where(wide, np.nextafter(upper + wide, np.inf), upper)
-    strategy = strategy and strategy._replace(row=strategy.row[:-1])
+    strategy = strategy and strategy._replace(row=strategy.row[:-1], nature=None)
     return QueryResult(replace(solution, lower=lower, upper=upper), strategy)
 
 

@@ -548,9 +548,9 @@ REFUSED = {
     "filter(min, P=? [ F d=6 ], s>7)": "no state satisfies",
     "filter(state, s)": "13 states satisfy",
     "P=? [ F d=6 {s=2}{sum} ]": "column 19.*min or max",
-    "E [ F d=6 ] + 1": "is a Boolean",
+    "E [ F d=6 ] + 1": "column 1.*a number; .* is applied to a truth value",
     "filter(range, d) + 1": "several results",
-    "true + 1": "true is a Boolean",
+    "true + 1": "column 1.*a number; .* is applied to a truth value",
     "1 +": "the end",
     "(s": "the end",
 }
