@@ -15,8 +15,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn as job
-from jaxltl.app.protocols import Training
 
 _SIZE, _ROUNDS = 30, 2
 _TASK = """
@@ -63,8 +63,8 @@ def losses(place: Path) -> Iterator[tuple[str, int, float]]:
     for title, guarantee in (("until the mistake", setup.guarantee), ("all", every)):
         one = dataclasses.replace(setup, guarantee=guarantee)
         outcome = job.learn(one, Training(0, 1))
-        loss = float(outcome.learned.neg_log_likelihood[outcome.chosen])
-        yield title, int(np.sum(one.used.length)), loss
+        loss = float(outcome.kept.learned.neg_log_likelihood[outcome.kept.chosen])
+        yield title, int(np.sum(guarantee.until_lost(setup.demonstrations).length)), loss
 
 
 def main() -> None:

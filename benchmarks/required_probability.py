@@ -18,8 +18,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn as job
-from jaxltl.app.protocols import Training
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

@@ -24,9 +24,8 @@ from jaxltl.algos import cce, ppo, trust_region
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
+from jaxltl.algos.common.seeds import Algorithm, make_hparams
 from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentFile
-from jaxltl.app.job import settings
-from jaxltl.app.protocols import Algorithm
 from jaxltl.app.wording import Record
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments import Agent, Box, Finite, Timestep, Verdict
@@ -305,7 +304,7 @@ def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
     parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
     network = dataclasses.replace(default_network(environment.actions), **parts)
     problem = ppo.make_problem(environment, network=network)
-    hparams = settings(ppo.Hparams, spec)
+    hparams = make_hparams(ppo.Hparams, spec)
     return LearnerSetup(
         ppo,
         problem,
@@ -336,7 +335,7 @@ def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
     )
     first = diagonal_gaussian(jnp.zeros(network.num_parameters, jnp.float32), table.deviation)
     problem = cce.make_problem(score, first, limit=table.limit)
-    hparams = settings(cce.Hparams, _settings(task))
+    hparams = make_hparams(cce.Hparams, _settings(task))
     return LearnerSetup(
         cce,
         problem,
@@ -361,7 +360,7 @@ def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
         step = Partial(_costs_where_violated, environment.step)
         environment = dataclasses.replace(environment, step=step, outcomes=None)
     problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
-    hparams = settings(trust_region.Hparams, _settings(task))
+    hparams = make_hparams(trust_region.Hparams, _settings(task))
     return LearnerSetup(
         trust_region,
         problem,

@@ -1,104 +1,21 @@
-"""Shared parts of learning jobs: parallel seeds, fingerprints, result entries, files."""
+"""Shared parts of learning jobs: fingerprints, result entries, files."""
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import hashlib
-import inspect
 import json
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxltl
-from jaxltl.algos.common.chunks import Chunks, ChunkOptions, run_in_chunks
 from jaxltl.app.files.task import FormulaFile
-from jaxltl.app.protocols import Algorithm, Training
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
-from jaxltl.app.wording import Record, Result
-from jaxltl.core.models.protocols import PyTree
-
-Hparams = TypeVar("Hparams")
-
-
-def settings(kind: Callable[..., Hparams], values: Result) -> Hparams:
-    """A learner's Hparams with the given keys that it has; ``method`` names the learner."""
-    names = inspect.signature(kind).parameters.keys() - {"method"}
-    return kind(**{name: value for name, value in values.items() if name in names})
-
-
-def run_seeds(
-    algorithm: Algorithm,
-    problem: PyTree,
-    hparams: PyTree,
-    training: Training,
-    *,
-    num_steps: int,
-    options: ChunkOptions | None = None,
-) -> tuple[Chunks, dict[str, np.ndarray]]:
-    """Runs a learner from N seeds in parallel; returns chunks and metrics ``[T, N]`` by name."""
-    mesh = training.mesh if training.num_seeds > 1 else None
-    if mesh is None:
-        states = _first_states(algorithm.init, training.seed, training.num_seeds, problem, hparams)
-    else:
-        make = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
-        states = make(np.arange(training.num_seeds), np.int32(training.seed), problem, hparams)
-    report = training.report
-    chunks = run_in_chunks(
-        algorithm.step,
-        states,
-        problem,
-        hparams,
-        num_steps=num_steps,
-        options=dataclasses.replace(
-            options or ChunkOptions(),
-            lanes=True,
-            report=report and (lambda step, metrics: report(step, vars(metrics))),
-            checkpoint=training.checkpoint,
-            mesh=mesh,
-        ),
-    )
-    if mesh is not None:  # later work is done in each process
-        chunks = chunks._replace(state=jax.tree.map(jnp.asarray, on_host(chunks.state)))
-    return chunks, {"step": chunks.step, **vars(chunks.metrics)}
-
-
-@functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
-def _first_states(
-    init: Callable[..., PyTree], seed: int, num_seeds: int, problem: PyTree, hparams: PyTree
-) -> PyTree:
-    """The initial states of N seeds, by one program."""
-
-    def first(n: jax.Array | int) -> PyTree:
-        return _first_of(init)(n, seed, problem, hparams)
-
-    if num_seeds == 1:  # a smaller program than with vmap
-        return jax.tree.map(lambda x: x[None], first(0))
-    return jax.vmap(first)(jnp.arange(num_seeds))
-
-
-@functools.cache  # the same function for each learner, so that it is compiled once
-def _first_of(init: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """The initial state of lane n."""
-
-    def first(n: jax.Array | int, seed: int, problem: PyTree, hparams: PyTree) -> PyTree:
-        root = jax.random.fold_in(jax.random.key(seed), 1)
-        return init(jax.random.fold_in(root, n), problem, hparams)
-
-    return first
-
-
-def one_seed(learned: PyTree, i: int) -> PyTree:
-    """Seed i of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``."""
-    one = {k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
-    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
-    return dataclasses.replace(learned, **one, history=history)
+from jaxltl.app.wording import Record
 
 
 def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:

@@ -15,22 +15,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.algos.common.guarantees import check_formula
+from jaxltl.algos.common.seeds import Training, run_seeds
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.environment_setup import LearnerSetup, load_environment, load_world, make_method
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
 from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.app.files.task_environment import EnvironmentFile
-from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     about,
     automaton_picture,
     learning_picture,
     over_seeds,
     plain,
-    run_seeds,
 )
 from jaxltl.core.types import Status
 from jaxltl.core.automata import Automaton, to_automaton

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import grounding
+from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.grounding.problem import require_task
 from jaxltl.app.files.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
@@ -18,7 +19,6 @@ from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file
 from jaxltl.app.files.worlds import grid_options, MappedModel
 from jaxltl.app.job import about, automaton_picture, plain
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports.certificate import Certifiable, policy_certificate
 from jaxltl.app.reports.drawing import drawing, Picture
 from jaxltl.app.reports.explorer import Explorer

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
@@ -11,39 +10,16 @@ from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     import numpy as np
-    from jax.sharding import Mesh
 
+    from jaxltl.algos.common.seeds import Training
     from jaxltl.app.files.task import FormulaFile
     from jaxltl.app.reports.drawing import Picture
     from jaxltl.app.reports.explorer import Curves, Explorer
     from jaxltl.app.reports.page import Report
-    from jaxltl.core.array_types import PyTree
-
-Progress = Callable[[int, Mapping[str, "np.ndarray"]], None]  # steps, and metrics ``[T, N]``
 
 T = TypeVar("T", bound="FormulaFile")
 S = TypeVar("S")
 O = TypeVar("O")  # noqa: E741
-
-
-class Algorithm(Protocol):
-    """The functions of a learner that jobs call; implemented by its module."""
-
-    init: Callable[..., PyTree]
-    step: Callable[..., tuple[PyTree, PyTree]]
-
-
-@dataclass(frozen=True)
-class Training:
-    """Settings of a run of a job."""
-
-    seed: int  # seed, num_seeds: the first seed, and the number of seeds, which learn in parallel
-    num_seeds: int
-    report: Progress | None = None  # called with the steps made and the newest metrics
-    # called with the name of each stage after learning
-    stage: Callable[[str], None] = lambda name: None
-    checkpoint: Path | None = None  # file from which an interrupted run resumes
-    mesh: Mesh | None = None  # devices over which several seeds are distributed
 
 
 class Job(Protocol[T, S, O]):

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, cast
 
 from jaxltl.app.compilation import float64
-from jaxltl.app.protocols import Job, O, S, SomeJob, T, Training
+from jaxltl.app.protocols import Job, O, S, SomeJob, T
 from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
@@ -229,6 +229,7 @@ class _JobRun(Generic[T, S, O]):
 
     def _result(self, task: T, held: ExitStack) -> Result | None:
         from jaxltl.algos.common import checkpoint as files
+        from jaxltl.algos.common.seeds import Training
 
         start = time.perf_counter()
         job, group, say, options = self.job, self.console.group, self.console.say, self.options

@@ -9,8 +9,10 @@ import pytest
 
 import jaxltl as jl
 from benchmarks.mistakes import losses
+from jaxltl.algos import mlirl
+from jaxltl.algos.common.seeds import Training, make_hparams
+from jaxltl.algos.mlirl import guaranteed
 from jaxltl.app import learn as job
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import report
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
@@ -27,7 +29,7 @@ def learned(path, seed=0):
 
 
 def kept_policy(outcome):
-    return np.asarray(outcome.learned.policy[outcome.chosen])
+    return np.asarray(outcome.kept.policy)
 
 
 # --- the examples ------------------------------------------------------------------------------
@@ -193,16 +195,19 @@ def risky_task(rng, place, over):
 def weighed(outcome, weights_of_task):
     """What the same seed learns with given weights of the task."""
     setup = outcome.setup
-    problem = setup.problem
-    hparams = job.settings(job.mlirl.Hparams, setup.task.learner.specified())
+    table, demands = setup.task.learner, setup.demands
+    hparams = make_hparams(mlirl.Hparams, table.specified())
     for mu in weights_of_task:
-        yield job._train(setup, problem, replace(hparams, mu=float(mu)), Training(0, 1))
+        settings = guaranteed._Settings(
+            demands, replace(hparams, mu=float(mu)), table.steps, table.tolerance
+        )
+        yield settings.train(demands.problem, Training(0, 1))
 
 
 def check_risky(rng, place, over, weights_of_task):
     path, asked = risky_task(rng, place, over)
     outcome, result = learned(path)
-    attempt, model, task = outcome.attempt, outcome.setup.model, outcome.setup.task
+    attempt, model, task = outcome.kept.attempt, outcome.setup.model, outcome.setup.task
     assert (task.guarantee, task.over) == (pytest.approx(asked, rel=1e-15), over)
     value, _ = evaluate(model, kept_policy(outcome))
     attained, _ = at_starts(model, value, over)
@@ -223,7 +228,7 @@ def check_risky(rng, place, over, weights_of_task):
 
     found = loss(attempt.learned, attempt.neg_log_likelihood)
     np.testing.assert_allclose(
-        outcome.learned.neg_log_likelihood[outcome.chosen], attempt.neg_log_likelihood
+        outcome.kept.learned.neg_log_likelihood[outcome.kept.chosen], attempt.neg_log_likelihood
     )
     reaching = [
         loss(one, one.neg_log_likelihood[0])
@@ -336,7 +341,7 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
         "to": pytest.approx(0.8 * best[1, start] + 0.1 * best[3, start] + 0.1),
     }
     assert lost["from"] > lost["to"] + 0.01
-    counts = np.asarray(setup.problem.counts)
+    counts = np.asarray(setup.demands.problem.counts)
     assert counts.sum() == 3 and counts[4, start, 0] == 0
     texts = [text for kind, text in report.remarks(result) if kind == "note"]
     assert texts == [
@@ -478,7 +483,7 @@ def test_steps_after_the_formula_is_lost_are_not_used(write, asked):  # noqa: F8
     assert setup.guarantee.used.tolist() == [3]
     assert setup.guarantee.unused(setup.demonstrations).tolist() == [[False] * 3 + [True] * 2]
     counted = 2 if asked == '"best"' else 3  # the mistake itself is left out by the optimal actions
-    assert np.asarray(setup.problem.counts).sum() == counted
+    assert np.asarray(setup.demands.problem.counts).sum() == counted
 
 
 @pytest.mark.slow

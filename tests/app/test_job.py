@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos.common.chunks import ChunkOptions
-from jaxltl.app.job import run_seeds
-from jaxltl.app.protocols import Training
+from jaxltl.algos.common.seeds import Training, run_seeds
 from tests.algos.test_learner import case
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import mlirl
-from jaxltl.algos.mlirl import features
+from jaxltl.algos.common.seeds import Training
+from jaxltl.algos.mlirl import features, guaranteed
 from jaxltl.app import learn
 from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import report
 from tests.app.test_task import write  # noqa: F401
 
@@ -20,12 +20,12 @@ from tests.app.test_task import write  # noqa: F401
 def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
     """Whether or not the last evaluation was at them, before the first step too."""
     setup = learn.prepare(MlirlFile.read(write()), 0)
-    problem = setup.problem
+    problem = setup.demands.problem
     hparams = mlirl.Hparams(discount=0.9, optimizer=optimizer)
     state = mlirl.init(jax.random.key(0), problem, hparams)
     for _ in range(2):
         host = jax.device_get(dataclasses.replace(state, key=None))
-        policy, loss, status = learn._policy_and_likelihood(host, problem, hparams)
+        policy, loss, status = guaranteed.policy_and_likelihood(host, problem, hparams)
         expected = mlirl.solve(state.parameters, problem, hparams)
         np.testing.assert_allclose(policy, expected.policy, atol=1e-9)
         counts = np.asarray(problem.counts)
@@ -39,7 +39,7 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
 def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811
     monkeypatch.setattr(features, "expected_steps", lambda *_: None)
     setup = learn.prepare(MlirlFile.read(write()), 0)
-    assert "nearer" not in setup.features.names
+    assert "nearer" not in setup.demands.features.names
     outcome = learn.learn(setup, Training(0, 1))
     notes = [text for kind, text in report.remarks(learn.summary(outcome)) if kind == "note"]
     assert [text for text in notes if text.startswith("The feature nearer is left out")]

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn_grounding as job
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.job import took
-from jaxltl.app.protocols import Training
 from jaxltl.app.run_job import job_of
 
 TEXT = """

@@ -8,9 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from jaxltl.algos.common.guarantees import neg_log_likelihood, step_bound
+from jaxltl.algos.common.seeds import Training
+from jaxltl.algos.mlirl import guaranteed
 from jaxltl.app import learn as job
-from jaxltl.app.guarantee import neg_log_likelihood, step_bound
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps as report
 from jaxltl.app.reports.learn import report as learn_report
 from jaxltl.core.values.undiscounted.mixture import at_starts
@@ -108,13 +109,14 @@ def learned(path):
 def drawn(path, rng, scale):
     """As `learned`, with a random policy of optimal actions in place of learning."""
 
-    def train(setup, problem, *_):
-        logits = scale * rng.standard_normal((*setup.model.state_shape, setup.model.num_actions))
-        weight = np.exp(logits) * np.asarray(setup.guarantee.actions.allowed)
+    def train(settings, problem, *_):
+        demands, model = settings.demands, settings.demands.model
+        logits = scale * rng.standard_normal((*model.state_shape, model.num_actions))
+        weight = np.exp(logits) * np.asarray(demands.guarantee.actions.allowed)
         policy = weight / weight.sum(-1, keepdims=True)
         loss = np.array([neg_log_likelihood(policy, np.asarray(problem.counts))])
-        zero, names = np.zeros(1), setup.features.names
-        return job.LearnedPolicies(
+        zero, names = np.zeros(1), demands.features.names
+        return guaranteed.LearnedPolicies(
             policy=policy[None],
             weights=np.zeros((1, len(names))),
             names=names,
@@ -128,14 +130,14 @@ def drawn(path, rng, scale):
         )
 
     with pytest.MonkeyPatch.context() as patch:  # compiling a learner takes several seconds
-        patch.setattr(job, "_train", train)
+        patch.setattr(guaranteed._Settings, "train", train)
         return learned(path)
 
 
 def check(outcome, result, factor):
     """The bound holds for the kept policy, and the probability is the best one."""
     time = result["expected_steps"]
-    model, policy = outcome.setup.model, outcome.learned.policy[outcome.chosen]
+    model, policy = outcome.setup.model, outcome.kept.policy
     steps = satisfaction_steps(model, policy)
     assert [steps.lower, steps.upper] == pytest.approx(time["learned_bounds"], rel=1e-9)
     assert steps.upper <= factor * time["quickest_bounds"][1]
@@ -198,9 +200,9 @@ def test_the_bound_can_be_switched_off_or_changed(harbour, tmp_path):
         other = job.FILE.read(write(tmp_path, HARBOUR, "F a", "a", line))
         assert other.steps_factor == factor
     setup = outcome.setup
-    bound = step_bound(setup.model, setup.guarantee.actions, "best", "mean", None, None)
+    bound = step_bound(setup.model, setup.guarantee.actions, "best")
     assert np.isinf(bound.limit)
-    assert bound.keep(setup.model, outcome.learned.policy[0]).share == 0
+    assert bound.keep(setup.model, outcome.kept.policy).share == 0
 
 
 @pytest.mark.parametrize(
@@ -232,11 +234,11 @@ def test_safety_formulas_have_no_steps(tmp_path):
 @pytest.mark.parametrize("probability", [0.3, 0.8])
 def test_a_probability_and_fewer_steps_than_the_optimum_are_met_together(harbour, probability):
     _, outcome, _ = harbour
-    setup, policy = outcome.setup, outcome.learned.policy[0]
+    setup, policy = outcome.setup, outcome.kept.policy
     model, actions = setup.model, setup.guarantee.actions or optimal_actions(setup.model)
-    quickest = step_bound(model, actions, "best", "mean", None, 2).quickest.steps.value
+    quickest = step_bound(model, actions, "best", factor=2).quickest.steps.value
     limit = quickest * (0.5 + probability / 2)
-    bound = step_bound(model, actions, probability, "mean", limit, None)
+    bound = step_bound(model, actions, probability, steps=limit)
     kept = bound.keep(model, policy)
     assert kept.attained >= probability and kept.steps.upper <= limit < quickest
     assert satisfaction_steps(model, kept.policy).upper <= limit
@@ -249,7 +251,7 @@ def test_a_probability_has_a_bound_on_steps_too(tmp_path, line):
     path = write(tmp_path, HARBOUR, FORMULA, "ab", line, seed=1, detours=0.6)
     outcome, result = learned(path)
     time, asked = result["expected_steps"], result["guarantee"]
-    policy = outcome.learned.policy[outcome.chosen]
+    policy = outcome.kept.policy
     found = satisfaction_probability(outcome.setup.model, policy)
     lower = at_starts(outcome.setup.model, found.lower, "mean")[0]
     assert asked["attained"] == pytest.approx(lower, abs=1e-9) and lower >= 0.7

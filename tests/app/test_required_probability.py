@@ -1,13 +1,16 @@
 """The search for a required probability ends, with bounded work, and attains it."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import jaxltl as jl
 from benchmarks.required_probability import cases, write
+from jaxltl.algos.common.seeds import Training
+from jaxltl.algos.mlirl import guaranteed
 from jaxltl.app import learn as job
-from jaxltl.app.guarantee import GuaranteeSearch
-from jaxltl.app.protocols import Training
 from jaxltl.core.values.undiscounted import mixture
 from jaxltl.core.values.undiscounted.optimum import policy_reachability
 from tests.support import seeds
@@ -24,17 +27,14 @@ def check_case(case, place, monkeypatch):
         return call
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "_train", counted(job._train, runs))
-        patch.setattr(
-            job,
-            "_likelihood_and_policy",
-            counted(job._likelihood_and_policy, evaluations),
-        )
+        settings, evaluate = guaranteed._Settings, guaranteed.likelihood_and_policy
+        patch.setattr(settings, "train", counted(settings.train, runs))
+        patch.setattr(guaranteed, "likelihood_and_policy", counted(evaluate, evaluations))
         setup = job.prepare(job.FILE.read(write(case, case.probability, place)), 0)
         outcome = job.learn(setup, Training(0, 1))
-    assert len(runs) <= 2 and len(evaluations) <= job._EVALUATIONS
-    assert outcome.attempt.attained >= case.probability
-    lower = mixture.at_starts(setup.model, outcome.solution.lower, "mean")[0]
+    assert len(runs) <= 2 and len(evaluations) <= guaranteed._EVALUATIONS
+    assert outcome.kept.attempt.attained >= case.probability
+    lower = mixture.at_starts(setup.model, outcome.kept.solution.lower, "mean")[0]
     assert lower >= case.probability
     return outcome
 
@@ -44,17 +44,11 @@ def test_where_no_reward_attains_a_probability_none_is_searched(tmp_path):
     patrol = next(x for x in cases(8) if str(x.text["formula"]).startswith("G"))
     setup = job.prepare(job.FILE.read(write(patrol, patrol.probability, tmp_path)), 0)
     available = np.asarray(setup.model.available)
-    uniform, counts = available / available.sum(-1, keepdims=True), np.zeros(available.shape)
+    uniform = available / available.sum(-1, keepdims=True)
     best = np.eye(available.shape[-1])[np.asarray(setup.guarantee.best.policy)]
-    search = GuaranteeSearch(
-        setup.model,
-        setup.guarantee,
-        counts,
-        policy_of=lambda policy: policy,
-        constrained=lambda: pytest.fail("searched"),
-        within_steps=lambda policy: policy,
-    )
-    found = search.at_least(uniform, best, uniform)
+    free = SimpleNamespace(policy=uniform[None])
+    demands = replace(setup.demands, in_world=True, bound=None)  # without counts
+    found = guaranteed.most_likely(demands, free, best, free, lambda: pytest.fail("searched"))
     assert found.share == 1 and found.attained >= patrol.probability
 
 

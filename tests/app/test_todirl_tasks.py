@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.algos.common.seeds import Training
+from jaxltl.algos.todirl.transfer import world_performances
+from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app import learn_todirl as job
 from jaxltl.app.files.task_todirl import TodirlFile
-from jaxltl.app.protocols import Training
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.learn_todirl import report
 from jaxltl.app.reports.page import render_text
-from jaxltl.app.todirl_results import part_of
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.core.values.undiscounted.satisfaction_steps import quickest_policy, satisfaction_steps
@@ -78,7 +79,7 @@ def prepared(path, seed=0):
 
 def own(setup, w):
     """The product of a world without padding."""
-    return jl.product(setup.worlds.scenes[w].mdp, setup.automaton, label_on=setup.task.label_on)
+    return jl.product(setup.scenes[w].mdp, setup.worlds.automaton, label_on=setup.task.label_on)
 
 
 # --- tasks without end -------------------------------------------------------------------------
@@ -111,7 +112,7 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
     # What is in the file plans the same in a world that is given to it.
     learned, setup = load_reward(tmp_path / "out" / "network.npz"), prepared(path)
     for w in (0, 1):
-        scene = setup.worlds.scenes[w]
+        scene = setup.scenes[w]
         model, solution = plan_in(learned, scene.mdp, scene.observation)
         _, sure = evaluate(model, solution.policy)
         starts = np.flatnonzero(np.asarray(scene.mdp.initial) > 0)
@@ -123,10 +124,10 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
     few = ("steps = 40", "steps = 2"), ("[task]", "[task]\nsteps_factor = 1.1")
     setup = prepared(write(*few, ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
     outcome = job.learn(setup, Training(0, 1))
-    assert (outcome.evaluation.quick_share[: setup.num_training] > 0).all()
+    assert (outcome.kept.quick_share[: setup.worlds.num_training] > 0).all()
     summary = job.summary(outcome)
     worlds = [x for kind in ("training", "test") for x in summary[kind]["expected_steps"]["worlds"]]
-    policies = outcome.evaluation.policy
+    policies = outcome.kept.policy
     for w, (world, policy) in enumerate(zip(worlds, policies, strict=True)):
         found = satisfaction_steps(part_of(setup.worlds.model, w), policy)
         assert world["quickest"] is not None or w == 2
@@ -134,7 +135,7 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
             assert found.value == pytest.approx(world["steps"][0])
             assert found.upper <= 1.1 * world["quickest"] * (1 + 1e-6)
     save_reward(tmp_path / "network.npz", job.learned_reward(outcome))
-    scene = setup.worlds.scenes[1]
+    scene = setup.scenes[1]
     model, solution = plan_in(load_reward(tmp_path / "network.npz"), scene.mdp, scene.observation)
     quickest = quickest_policy(model).steps.upper
     assert satisfaction_steps(model, solution.policy).upper <= 1.1 * quickest
@@ -152,9 +153,9 @@ def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path
 )
 def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula, kind):
     setup = prepared(write((FORMULA, f'formula = "{formula}"')), seed=3)
-    assert setup.automaton.acceptance == kind and not setup.soft
-    found = np.asarray(job._probability(setup.worlds.task_model, setup.expert, None).value)
-    for w, scene in enumerate(setup.worlds.scenes):
+    assert setup.worlds.automaton.acceptance == kind and not setup.soft
+    found = np.asarray(world_performances(setup.worlds.task_model, setup.expert, None).value)
+    for w, scene in enumerate(setup.scenes):
         model, size = own(setup, w), scene.mdp.num_states
         best = jl.optimal_satisfaction(model)
         np.testing.assert_array_equal(setup.expert[w, :size], np.eye(4)[np.asarray(best.policy)])
@@ -166,7 +167,7 @@ def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula,
         np.testing.assert_array_equal(
             never[:size][starts], value[np.arange(size), memory][starts] == 0
         )
-    (shown,) = setup.demonstrations
+    (shown,) = setup.demands.demonstrations
     model = own(setup, 0)
     best = np.asarray(jl.optimal_satisfaction(model).policy)
     for states, actions, length in zip(
@@ -186,11 +187,11 @@ def test_the_learner_is_given_what_the_task_is_not(write):
         ("discount = 0.9", 'discount = 0.9\nmemory = "F a"'),
     )
     setup = prepared(path)
-    policy = np.full((3, 9, len(setup.memory.delta), 4), 0.25)
+    policy = np.full((3, 9, len(setup.worlds.memory.delta), 4), 0.25)
     policy[:] = np.random.default_rng(0).dirichlet(np.ones(4), policy.shape[:-1])
-    lifted = job.lift_memory_policy(jnp.asarray(policy), setup.automaton)
-    found = job._probability(setup.worlds.task_model, lifted, None)
-    same = job._probability(setup.worlds.task_model, setup.expert, None)
+    lifted = jl.core.models.lift_memory_policy(jnp.asarray(policy), setup.worlds.automaton)
+    found = world_performances(setup.worlds.task_model, lifted, None)
+    same = world_performances(setup.worlds.task_model, setup.expert, None)
     np.testing.assert_array_equal(same.mean, [1, 1, 0])
     for w in range(3):
         model = part_of(setup.worlds.task_model, w)
@@ -204,7 +205,10 @@ def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
     within = ("discount = 0.9", "discount = 0.9\nhorizon = 15")
     with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends an episode .* has buchi"):
         prepared(write(within))
-    assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).automaton.acceptance == "safety"
+    assert (
+        prepared(write(within, (FORMULA, 'formula = "G !c"'))).worlds.automaton.acceptance
+        == "safety"
+    )
 
 
 # --- a probability -----------------------------------------------------------------------------
@@ -275,8 +279,8 @@ def learned(path, seed=0):
 def check_reached(outcome, asked, over):
     """In every world that counts it has what was asked, and no more than the share gives it."""
     setup, mixed = outcome.setup, 0
-    evaluation = outcome.evaluation
-    for w in range(setup.num_training + 2):
+    evaluation = outcome.kept
+    for w in range(setup.worlds.num_training + 2):
         model = own(setup, w)
         policy = evaluation.policy[w][: model.mdp.num_states]
         np.testing.assert_allclose(policy.sum(-1), 1)
@@ -295,7 +299,10 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
     outcome, result = learned(write(text=RISKY))
     assert check_reached(outcome, 0.85, "mean") > 0
-    assert outcome.learned.weight > 0 and result["guarantee"]["weight"] == outcome.learned.weight
+    assert (
+        outcome.kept.learned.weight > 0
+        and result["guarantee"]["weight"] == outcome.kept.learned.weight
+    )
     counted = result["training"]["worlds"] + result["test"]["worlds"][:2]
     (text,) = (text for kind, text in report.remarks(result) if kind == "good")
     least = min(world["attained"] for world in counted)
@@ -308,14 +315,14 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     save_reward(tmp_path / "network.npz", job.learned_reward(outcome))
     reward = load_reward(tmp_path / "network.npz")
     assert (reward.guarantee, reward.over) == (0.85, "mean")
-    scene = outcome.setup.worlds.scenes[1]
+    scene = outcome.setup.scenes[1]
     _, solution = plan_in(reward, scene.mdp, scene.observation)
     np.testing.assert_allclose(
         solution.policy,
-        outcome.evaluation.policy[outcome.setup.num_training][: scene.mdp.num_states],
+        outcome.kept.policy[outcome.setup.worlds.num_training][: scene.mdp.num_states],
         atol=1e-6,
     )
-    scene = outcome.setup.worlds.scenes[3]
+    scene = outcome.setup.scenes[3]
     with pytest.raises(ValueError, match=r"guarantee = 0.85: the best .* is 0 .*least from state"):
         plan_in(reward, scene.mdp, scene.observation)
 
@@ -328,10 +335,10 @@ def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, ask
     worst = '\nover = "worst"' if over == "worst" else ""
     outcome, _ = learned(write(("guarantee = 0.85", f"guarantee = {asked}{worst}"), text=RISKY))
     mixed = check_reached(outcome, asked, over)
-    assert asked > 0.5 or (mixed, outcome.learned.weight) == (0, 0)
+    assert asked > 0.5 or (mixed, outcome.kept.learned.weight) == (0, 0)
     # Nothing that was learned with another weight makes the demonstrations likelier.
     setup = outcome.setup
-    assert setup.requested == asked
+    assert setup.demands.requested == asked
 
 
 @pytest.mark.slow
@@ -342,7 +349,7 @@ def test_a_task_without_end_has_its_probability_by_moves_that_lose_nothing(write
             ("[task]", "[task]\nguarantee = 0.7"), ("\n[test]", '\n[test]\nleave_out = ["map 2"]')
         )
     )
-    assert outcome.learned.weight == 0
+    assert outcome.kept.learned.weight == 0
     for world in result["training"]["worlds"] + result["test"]["worlds"][:1]:
         assert (world["share"], world["attained"]) == (1, 1)
 
@@ -364,7 +371,7 @@ def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, t
     with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):
         prepared(write(narrow, ("guarantee = 0.85", "guarantee = 0.999"), text=RISKY))
     sure = (("guarantee = 0.85", "guarantee = 1.0"), ("slip = 0.1", "slip = 0.0"))
-    assert prepared(write(*sure, text=RISKY)).requested == "best"
+    assert prepared(write(*sure, text=RISKY)).demands.requested == "best"
 
 
 @pytest.mark.parametrize("asked", ['"best"', '"none"', "0.6"])
@@ -377,9 +384,9 @@ def test_steps_after_the_formula_is_lost_are_not_used(write, tmp_path, asked):
     (tmp_path / "shown.json").write_text(json.dumps({"demonstrations": [shown]}))
     changes = ("guarantee = 0.85", f"guarantee = {asked}"), ("slip = 0.1", "slip = 0.0")
     setup = prepared(write(*changes, text=RISKY))
-    (used,) = setup.demonstrations
-    assert used.length.tolist() == [4] and setup.unused == 2
-    lost = {"guarantee": {"unused": {"steps": setup.unused, "of": 6}}}
+    (used,) = setup.demands.demonstrations
+    assert used.length.tolist() == [4] and setup.demands.unused == 2
+    lost = {"guarantee": {"unused": {"steps": setup.demands.unused, "of": 6}}}
     (remark,) = render_text("unused_remark.txt", result=lost)
     assert remark.startswith("note: 2 of 6 demonstrated steps come after the formula was lost")
 

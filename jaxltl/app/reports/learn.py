@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.guarantee import left_out
 from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, plain, short_name
 from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
@@ -28,6 +27,7 @@ from jaxltl.app.reports.page import (
 from jaxltl.app.wording import Record, Result, counted, position_text
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict
+from jaxltl.core.models.construct.lifting import memory_along
 from jaxltl.core.values.undiscounted.mixture import from_starts
 
 _OPTIMAL = 1e-6  # certified loss up to which a policy is reported as optimal
@@ -119,19 +119,19 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 def pictures(outcome: Any) -> list[Picture]:
     """Pictures of the policy on the map, of learning curves and of the automaton."""
-    cells, history = outcome.setup.world.cells, outcome.learned.history
+    cells, history = outcome.setup.world.cells, outcome.kept.learned.history
     return [
         *([] if cells is None else _maps(outcome, cells)),
         *steps.pictures(plain(outcome.expected_steps)),
-        learning_picture(history, _CURVES + over_seeds(len(outcome.learned.loss)), _FIGURES),
+        learning_picture(history, _CURVES + over_seeds(len(outcome.kept.learned.loss)), _FIGURES),
     ]
 
 
 def live(outcome: Any) -> list[Explorer | Curves]:
     """Interactive policy on the map, and learning curves."""
     setup, model = outcome.setup, outcome.setup.model
-    policy = np.asarray(outcome.learned.policy[outcome.chosen])
-    caption = _CURVES + over_seeds(len(outcome.learned.loss))
+    policy = np.asarray(outcome.kept.policy)
+    caption = _CURVES + over_seeds(len(outcome.kept.learned.loss))
     logged = setup.world.logged
     return [
         Explorer(
@@ -150,10 +150,10 @@ def live(outcome: Any) -> list[Explorer | Curves]:
             places={} if logged is None else dict(enumerate(logged.states)),
             label=_LABEL,
             wall=setup.task.world.wall or "#",
-            marked=left_out(model, setup.guarantee, setup.demonstrations),
+            marked=_left_out(setup),
             marks="Demonstrated steps that lower the maximal satisfaction probability",
         ),
-        curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
+        curves("learning", "Learning", caption, outcome.kept.learned.history, _FIGURES),
     ]
 
 
@@ -171,8 +171,8 @@ _TABLE = (
 def _layers(outcome: Any) -> dict[str, MapLayer]:
     """A layer for each memory state that is undecided and reachable, and one of initial states."""
     model = outcome.setup.model
-    policy = np.asarray(outcome.learned.policy[outcome.chosen])
-    value = np.array(outcome.solution.value)
+    policy = np.asarray(outcome.kept.policy)
+    value = np.array(outcome.kept.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
     undecided = verdicts(model.automaton) == Verdict.UNDECIDED
     met = _reached(model)
@@ -229,3 +229,14 @@ def _reached(model: Product) -> np.ndarray:
     met = np.zeros(model.state_shape, bool)
     met[np.asarray(restricted.base_state), np.asarray(restricted.memory)] = True
     return met
+
+
+def _left_out(setup: Any) -> list[tuple[int, int, int]]:
+    """World state, memory state and action of the steps that are left out, each once."""
+    model, guarantee, demonstrations = setup.model, setup.guarantee, setup.demonstrations
+    state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
+    marked = guarantee.forbidden | guarantee.unused(demonstrations)
+    if not marked.any():
+        return []
+    steps = np.stack([state, memory_along(model, state), action], -1)[marked]
+    return [(s, q, a) for s, q, a in np.unique(steps, axis=0).tolist()]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app.files.scenes import ObservedScene
 from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
@@ -29,7 +30,7 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.todirl_results import TodirlOutcome, TodirlSetup, counted_worlds, part_of, summary
+from jaxltl.app.todirl_results import TodirlOutcome, TodirlSetup, summary
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Trajectories, lift_memory_policy, make_trajectories
@@ -104,14 +105,14 @@ _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 def task_pictures(setup: TodirlSetup) -> list[Picture]:
     """Pictures of the automata of the formula and of the memory."""
-    same = setup.memory is setup.automaton
-    drawings = [automaton_picture(setup.automaton, "training-1" if same else "")]
+    same = setup.worlds.memory is setup.worlds.automaton
+    drawings = [automaton_picture(setup.worlds.automaton, "training-1" if same else "")]
     if not same:
         drawings.append(
             Picture(
                 "memory.svg",
                 "Memory of the learner",
-                drawing("automaton", setup.memory),
+                drawing("automaton", setup.worlds.memory),
                 "The automaton whose state is the learner's memory; the formula's automaton evaluates it.",
                 "training-1",
             )
@@ -121,7 +122,9 @@ def task_pictures(setup: TodirlSetup) -> list[Picture]:
 
 def pictures(outcome: TodirlOutcome) -> list[Picture]:
     """Pictures of learning curves and of policies in worlds."""
-    drawings = [learning_picture(outcome.learned.history, _caption_of_curves(outcome), _FIGURES)]
+    drawings = [
+        learning_picture(outcome.kept.learned.history, _caption_of_curves(outcome), _FIGURES)
+    ]
     if time := summary(outcome)["training"].get("expected_steps"):
         drawings += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
@@ -131,7 +134,7 @@ def pictures(outcome: TodirlOutcome) -> list[Picture]:
 
 def live(outcome: TodirlOutcome) -> list[Explorer | Curves]:
     """Interactive policies in worlds, and learning curves."""
-    caption, history = _caption_of_curves(outcome), outcome.learned.history
+    caption, history = _caption_of_curves(outcome), outcome.kept.learned.history
     return [
         *(_look_into(outcome, one) for one in _drawn_worlds(outcome)),
         curves("learning", "Learning", caption, history, _FIGURES),
@@ -139,7 +142,7 @@ def live(outcome: TodirlOutcome) -> list[Explorer | Curves]:
 
 
 def _caption_of_curves(outcome: TodirlOutcome) -> str:
-    scores = outcome.learned.held_out
+    scores = outcome.kept.learned.held_out
     choice = ". The parameters with the least held-out figure are kept"
     return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
@@ -161,7 +164,7 @@ class _DrawnWorld:
 
     @property
     def scene(self) -> ObservedScene:
-        return self.outcome.setup.worlds.scenes[self.w]
+        return self.outcome.setup.scenes[self.w]
 
     @property
     def live(self) -> str:
@@ -183,17 +186,17 @@ class _DrawnWorld:
     @property
     def policy(self) -> np.ndarray:
         """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
-        return self.outcome.evaluation.policy[self.w][..., : self.scene.mdp.num_states, :, :]
+        return self.outcome.kept.policy[self.w][..., : self.scene.mdp.num_states, :, :]
 
     @property
     def value(self) -> np.ndarray:
         """``[S]``: the satisfaction probability from an initial state."""
-        value = self.outcome.evaluation.performance["learned"].value[self.w]
+        value = self.outcome.kept.performance["learned"].value[self.w]
         return np.asarray(value)[: self.scene.mdp.num_states]
 
 
 def _drawn_worlds(outcome: TodirlOutcome) -> Iterator[_DrawnWorld]:
-    setup, mean = outcome.setup, np.asarray(outcome.evaluation.performance["learned"].mean)
+    setup, mean = outcome.setup, np.asarray(outcome.kept.performance["learned"].mean)
 
     def drawn(
         w: int, kind: str, stem: str, arrows: bool, demonstrations: Trajectories | None
@@ -201,10 +204,10 @@ def _drawn_worlds(outcome: TodirlOutcome) -> Iterator[_DrawnWorld]:
         title = f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
         return _DrawnWorld(outcome, w, stem, title, arrows, demonstrations)
 
-    for w, demonstrations in enumerate(setup.demonstrations[:_PICTURES]):
+    for w, demonstrations in enumerate(setup.demands.demonstrations[:_PICTURES]):
         yield drawn(w, "Training world", f"training_{w + 1}", True, demonstrations)
     # The test worlds of least, median and greatest satisfaction probability, each once.
-    counted = counted_worlds(setup)
+    counted = setup.counted
     if order := counted[np.argsort(mean[counted], kind="stable")].tolist():
         ranks = {"best": order[-1], "median": order[len(order) // 2], "worst": order[0]}
         named = {w: rank for rank, w in ranks.items()}
@@ -228,14 +231,16 @@ def _look_into(outcome: TodirlOutcome, one: _DrawnWorld) -> Explorer:
         title=one.title,
         caption=one.caption,
         size=scene.mdp.num_states,
-        automaton=setup.memory,
+        automaton=setup.worlds.memory,
         layers=layers,
         runs=[*demonstrated, *_runs(outcome, one)],
         place=place,
         actions=ACTIONS,
         label="satisfaction probability",
         wall=setup.task.world.wall or "#",
-        goal="the formula" if setup.memory is setup.automaton else "the memory's formula",
+        goal="the formula"
+        if setup.worlds.memory is setup.worlds.automaton
+        else "the memory's formula",
     )
 
 
@@ -268,7 +273,7 @@ def _draw(outcome: TodirlOutcome, one: _DrawnWorld) -> list[Picture]:
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
     if one.policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
-        satisfied = setup.automaton.is_cosafe  # by a finite prefix
+        satisfied = setup.worlds.automaton.is_cosafe  # by a finite prefix
         end = "satisfied or violated" if satisfied else f"violated, or for {LONGEST_RUN} steps"
         drawings.append(
             Picture(
@@ -285,18 +290,19 @@ def _draw(outcome: TodirlOutcome, one: _DrawnWorld) -> list[Picture]:
 
 def _memory_names(setup: TodirlSetup) -> dict[int, str]:
     """The undecided memory states, with their names."""
-    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
-    undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED).tolist()
+    memory = setup.worlds.memory
+    names = memory.state_names or ("",) * len(memory.delta)
+    undecided = np.flatnonzero(verdicts(memory) == Verdict.UNDECIDED).tolist()
     return {q: f"memory state {q}: {names[q]}" for q in undecided or [0]}
 
 
 def _runs(outcome: TodirlOutcome, one: _DrawnWorld) -> list[ReportTrajectory]:
     """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
-    setup, policy, count = outcome.setup, one.policy, 1
-    if setup.memory is not setup.automaton:
-        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), setup.automaton))
-        count = len(setup.automaton.delta)  # the formula's automaton state varies fastest
-    rollouts = learned_runs(part_of(setup.worlds.task_model, one.w), policy, outcome.seed)
+    worlds, policy, count = outcome.setup.worlds, one.policy, 1
+    if worlds.memory is not worlds.automaton:
+        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), worlds.automaton))
+        count = len(worlds.automaton.delta)  # the formula's automaton state varies fastest
+    rollouts = learned_runs(part_of(worlds.task_model, one.w), policy, outcome.seed)
     return [
         ReportTrajectory(run.name, [(s, q // count, a) for s, q, a in run.steps])
         for run in rollouts

@@ -4,13 +4,67 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from jaxltl.algos.common.guarantees import StepBound, neg_log_likelihood
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.page import number, probability
-from jaxltl.app.wording import Result
+from jaxltl.app.wording import Record, Result, enclosure
+from jaxltl.core.models import Product
+from jaxltl.core.values.undiscounted.mixture import Mixture
+from jaxltl.core.values.undiscounted.satisfaction_steps import Quickest, StepAnalysis, steps_front
 
+_SHARES = np.linspace(0, 0.9, 7)  # of the quickest policy, in the trade-off with the likelihood
 _PRINTED = 5  # vertices of the front in the terminal
 _DRAWN = 20  # largest multiple of the quickest policy's steps in the picture
 _NARROW = 1e-4  # relative width of bounds that are printed as an error
+
+
+def entry(
+    model: Product, bound: StepBound, before: np.ndarray, mixture: Mixture, counts: np.ndarray
+) -> Record:
+    """The steps of a policy, its trade-off with the likelihood, and the front of the task.
+
+    Args:
+      before: ``float[S, Q, A]``, the policy before mixing.
+      counts: ``float[S, Q, A]``, of demonstrated pairs.
+    """
+    clock = StepAnalysis(model)
+    learned = mixture.steps or clock.steps(mixture.policy)
+    record: Record = {
+        "until": "the formula is decided" if model.automaton.is_cosafe else "acceptance",
+        "learned": learned.value,
+        "learned_bounds": [learned.lower, learned.upper],
+        "quickest": bound.quickest.steps.value,
+        "quickest_bounds": [bound.quickest.steps.lower, bound.quickest.steps.upper],
+        "least": bound.quickest.least,
+        "quickest_status": bound.quickest.status.name,
+        "limit": bound.limit,
+        "factor": bound.factor if np.isfinite(bound.limit) else None,
+        "share": mixture.share,
+        "status": learned.status.name,
+    }
+    shares = [0.0] if np.isinf(bound.limit) else sorted({*_SHARES.tolist(), mixture.share})
+    mixed = [(x, (1 - x) * before + x * bound.anchor) for x in shares]
+    record["likelihood"] = [
+        {
+            "share": share,
+            "steps": enclosure(*clock.steps(policy)[:3]),
+            "neg_log_likelihood": neg_log_likelihood(policy, counts),
+        }
+        for share, policy in mixed
+    ]
+    if model.automaton.is_cosafe:
+        record["front"] = front_entry(model, bound.quickest)
+    return record
+
+
+def front_entry(model: Product, quickest: Quickest | None = None) -> list[Record]:
+    """The front of probability and steps of a co-safe task."""
+    return [
+        {"probability": enclosure(*one.probability), "steps": enclosure(*one.steps)}
+        for one in steps_front(model, quickest)
+    ]
 
 
 def heading(steps: Result) -> str:
