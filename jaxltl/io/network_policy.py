@@ -146,7 +146,10 @@ def _program(agent: Agent, environment: Environment, automaton: Automaton | None
     if isinstance(observation, TaskObservation):
         tables = task_tables(environment)
         if automaton is None or len(automaton.delta) != len(tables.delta):
-            raise ValueError("the environment has a task; give its automaton.")
+            raise ValueError(
+                f"the environment has a task with {len(tables.delta)} memory states; give its "
+                "automaton, automaton=jl.to_automaton(formula)."
+            )
         rows = np.eye(len(tables.delta)) if tables.embedding is None else tables.embedding
         rows, observation = rows.astype(observation.memory.dtype), observation.world
     leaves, structure = jax.tree.flatten(observation)

@@ -114,6 +114,10 @@ def test_a_policy_with_such_a_network_is_saved_and_deployed(tmp_path):
     robot.start(seen)
     output = many_tasks.trained(nnx_network, state.parameters)(seen)
     assert robot.act() == int(jnp.argmax(output[0]))
+    labels = jax.tree_util.Partial(lambda world: jnp.zeros(1, bool))
+    task = jl.task_environment(WALK, "F goal", labels=labels, propositions=["goal"])
+    with pytest.raises(ValueError, match=r"automaton=jl.to_automaton\(formula\)"):
+        jl.io.save_network(tmp_path / "policy.npz", agent, task)
 
 
 def scores(parameters, *read):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -135,8 +136,23 @@ def tabulate_policy(
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
         some = jax.tree.map(lambda x, i=place: jnp.asarray(x)[i], table.world)
-        parts.append(np.asarray(_acts(policy, (inner, tables), memory, some))[: count - begin])
+        with _observed_as_trained(policy, tables):
+            parts.append(np.asarray(_acts(policy, (inner, tables), memory, some))[: count - begin])
     return np.concatenate(parts)
+
+
+@contextlib.contextmanager
+def _observed_as_trained(policy: PyTree, tables: PyTree) -> Iterator[None]:
+    """Names the remedy if an agent of a task is given the observations without the task."""
+    try:
+        yield
+    except (ValueError, TypeError, AttributeError) as error:
+        if tables is not None or not isinstance(policy, Agent):
+            raise
+        raise ValueError(
+            "the agent does not take the observations of environment, which has no task; if the agent "
+            f"was trained in task_environment(...), give that environment. ({error})"
+        ) from error
 
 
 @jit()

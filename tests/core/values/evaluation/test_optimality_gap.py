@@ -277,6 +277,8 @@ def test_a_learned_agent_is_tabulated_as_it_acts(sampled):
         row = found[np.asarray(table.world).tolist().index(place), int(world.memory)]
         np.testing.assert_allclose(float(acts.mean()), row[1], atol=0.04)
     assert optimality_gap(table, "F (a & F b)", found).mean[1] >= 0
+    with pytest.raises(ValueError, match="no task; if the agent was trained in task_environment"):
+        tabulate_policy(agent, corridor, table, count)
 
 
 def test_an_agent_with_memory_is_refused():
