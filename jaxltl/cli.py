@@ -179,9 +179,9 @@ def synthesize(
     """
     begin = time.perf_counter()
     _begin(f"solving {game_file}")
-    from jaxltl.app import synthesize as synthesis
-    from jaxltl.app.files.game import GameFile
+    from jaxltl.app.files.game import GameFile, solve_game
     from jaxltl.app.reports import synthesize as report
+    from jaxltl.core.games.synthesis import STAGES
 
     file = GameFile.read(game_file)
     out = run_job.directory(out, file.name)
@@ -190,8 +190,8 @@ def synthesize(
         # Before the work, since the directory may not be writable.
         run_job.claim_directory(out, "game.toml", game_file.read_bytes(), again)
         held.enter_context(float64())
-        progress = held.enter_context(_stages(synthesis.STAGES))
-        solved = synthesis.synthesize(file, progress)
+        progress = held.enter_context(_stages(STAGES))
+        solved = solve_game(file, progress)
         place = report.place_of(solved, environment)
         progress("writing")
         written = report.write(solved, out, place, time.perf_counter() - begin)
@@ -204,7 +204,7 @@ def synthesize(
             "the independent check refutes the result, which is a bug of jaxltl; "
             "please report it with the game file."
         )
-    synthesis.demand(solved)
+    solved.demand()
 
 
 @contextlib.contextmanager

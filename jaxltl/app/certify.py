@@ -13,7 +13,7 @@ from typing import Any, Literal
 import click
 import numpy as np
 
-from jaxltl.app.files.models import padded
+from jaxltl.io.padded_models import padded
 from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.app.wording import Record
 from jaxltl.core import validation

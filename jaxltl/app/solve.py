@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +24,17 @@ from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, program_definitions
 from jaxltl.core.logic.properties import parse_each
-from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
-from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values import (
     Achievable,
     ConstrainedOptimum,
     Pareto,
     Answer,
-    PropertyStrategy,
     solve_property,
 )
 from jaxltl.core.values.properties.aims import SourceModel, graph_of_model
+from jaxltl.io.strategies import strategy_entry
 from jaxltl.io.templates import render
 
 AnyAnswer = Answer | Achievable | ConstrainedOptimum | Pareto
@@ -393,7 +391,7 @@ def strategies(
             "--strategy is for models whose states are seen; save the policy of solve_property's answer."
         )
     entries = [
-        {"property": r.query.text, **_strategy(model, r.answer.strategy)}
+        {"property": r.query.text, **strategy_entry(model, r.answer.strategy)}
         for r in results
         if isinstance(r.answer, Answer)
         and r.answer.strategy is not None
@@ -401,64 +399,3 @@ def strategies(
     ]
     table = {"model": source.name, "states": model.num_states, "strategies": entries}
     return (json.dumps(table, allow_nan=False) + "\n").encode()
-
-
-def _strategy(solved: SourceModel, strategy: PropertyStrategy) -> Record:
-    model = graph_of_model(solved)
-    host = model.host
-    row = np.asarray(strategy.row)
-    choice = (row - host.row_start[host.state[row]]).tolist()
-    names = _names(model)
-    entry: Record = {"kind": "memoryless", "choice": choice}
-    if strategy.by:
-        entry["kind"] = f"first choice, then by the {strategy.by} left"
-    if names is not None:
-        entry["action"] = names(row)
-    memory = strategy.memory
-    if memory is None:
-        if strategy.nature is not None:
-            entry["nature"] = _nature(host, host.successor, strategy.nature)
-        return entry
-    product, start = memory.product, memory.product.start
-    if strategy.nature is not None:
-        entry["letter_of"] = "the state that is left"
-        entry["nature"] = _nature(
-            product.host, product.base_state[product.host.successor], strategy.nature, product.still
-        )
-    return {
-        "kind": "memory",
-        "initial": np.stack([product.base_state[start], product.memory[start]], 1).tolist(),
-        "letters": [
-            sorted(
-                p for p, holds in zip(memory.automaton.propositions, letter, strict=True) if holds
-            )
-            for letter in memory.automaton.letters
-        ],
-        "letter": memory.letter.tolist(),
-        "update": memory.automaton.delta.tolist(),
-        "state": product.base_state.tolist(),
-        "memory": product.memory.tolist(),
-        **{k: v for k, v in entry.items() if k != "kind"},
-    }
-
-
-def _nature(
-    host: HostMDP, successor: np.ndarray, probability: np.ndarray, still: np.ndarray | None = None
-) -> list[list[dict[str, float]]]:
-    """Nature's distribution of each choice by numbers of successors; empty in states of `still`."""
-    names, mass = list(map(str, successor.tolist())), probability.tolist()
-    starts = host.entry_start.tolist()
-    rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]} for a, b in pairwise(starts)]
-    choices = [rows[a:b] for a, b in pairwise(host.row_start.tolist())]
-    return (
-        choices
-        if still is None
-        else [[] if stands else x for x, stands in zip(choices, still.tolist(), strict=True)]
-    )
-
-
-def _names(model: SparseMDP) -> Callable[[np.ndarray], list[str]] | None:
-    if model.action is None or not model.action_names:
-        return None
-    action, names = np.asarray(model.action), np.array(model.action_names, dtype=object)
-    return lambda row: names[action[row]].tolist()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxltl.app.files.game import GameFile, load_game
-from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.game import make_game
@@ -15,6 +14,7 @@ from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.io.model_files import write_model
+from jaxltl.io.padded_models import read_padded
 from tests.test_cli import failure, run
 
 # Wait at 0, or go to 1, which is red, or by chance to 2, the goal; from 1 a way on to 2.

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxltl import plot
-from jaxltl.app import synthesize as synthesis
-from jaxltl.app.files.game import GameFile, load_game
+from jaxltl.app.files.game import GameFile, load_game, solve_game
 from jaxltl.app.reports import synthesize as report
 from jaxltl.app.reports.synthesize import play_explorer
+from jaxltl.core.games import synthesis
 from jaxltl.io.policies import load_policy
 from tests.support import replaced
 from tests.test_cli import failure, run
@@ -290,12 +290,12 @@ def test_chance_may_be_an_adversary(arrays, tmp_path):
         probability=[[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]],
         actions=["try"],
     )
-    found = synthesis.synthesize(GameFile.read(path))
+    found = solve_game(GameFile.read(path))
     result = report.summary(found, 0.0)
     assert result["outcome"] == "realizable" and result["strategy"]["confirmed"]
     assert "wins almost surely from 1 of 1" in report.report_of(found).table(result)
     path.write_text(path.read_text() + 'chance = "adversarial"\n')
-    found = synthesis.synthesize(GameFile.read(path))
+    found = solve_game(GameFile.read(path))
     result = report.summary(found, 0.0)
     assert result["outcome"] == "unrealizable" and report.is_confirmed(result)
     printed = report.report_of(found).table(result)
@@ -331,7 +331,7 @@ def test_the_page_says_and_plays_what_was_found(won, lost):
 
 def test_a_play_of_the_strategy_is_one(tmp_path):
     (tmp_path / "game.toml").write_text(SQUARE)
-    found = synthesis.synthesize(GameFile.read(tmp_path / "game.toml"))
+    found = solve_game(GameFile.read(tmp_path / "game.toml"))
     part = play_explorer(found)
     (run,), game = part.runs, found.world.game
     successor = np.asarray(game.mdp.successor)
@@ -349,7 +349,7 @@ def test_a_play_of_the_strategy_is_one(tmp_path):
 
 
 def test_the_examples_are_sound():
-    robots = synthesis.synthesize(GameFile.read("examples/robots.toml"))
+    robots = solve_game(GameFile.read("examples/robots.toml"))
     result = report.summary(robots, 0.0)
     # The dissertation's table 5 for N = 4.
     strategy = result["strategy"]
@@ -367,7 +367,7 @@ def test_a_picture_for_each_memory_of_a_strategy(tmp_path):
         'assumptions = ["environment_a & !system_b", "environment_b"]',
     )
     (tmp_path / "game.toml").write_text(text)
-    found = synthesis.synthesize(GameFile.read(tmp_path / "game.toml"))
+    found = solve_game(GameFile.read(tmp_path / "game.toml"))
     assert found.strategy is not None and not found.strategy.maximal
     titles = [axes.get_title(loc="left") for axes in report._moves_picture(found, None).axes]
     assert titles == ["towards system_a", "towards system_b"]
@@ -383,7 +383,7 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
     monkeypatch.setattr(
         plot, "game_region", lambda *a, **k: shown.append(k["environment"]) or real(*a, **k)
     )
-    report.pictures(synthesis.synthesize(GameFile.read(tmp_path / "game.toml")))
+    report.pictures(solve_game(GameFile.read(tmp_path / "game.toml")))
     assert shown == [[0, 1, 2]]
 
 
@@ -526,7 +526,7 @@ def test_methods_that_do_not_fit(arrays, tmp_path):
 
 def test_the_expected_moves_until_acceptance_are_certified(arrays):
     """One move to the label, and one that reads it."""
-    found = synthesis.synthesize(GameFile.read(arrays("F bad")))
+    found = solve_game(GameFile.read(arrays("F bad")))
     result = report.summary(found, 1.0)
     for upper in result["expected_moves"].values():
         assert 2 <= upper <= 2 + 1e-5
@@ -538,12 +538,10 @@ def test_expected_moves_are_those_of_the_worst_choice(arrays):
     """Both moves lead to the label, one of them only with probability 1/4."""
     probability = [[[0.25, 0.75], [1.0, 0]], [[1.0, 0], [0, 0]], [[1.0, 0], [0, 0]]]
     successor = [[[2, 0], [2, 0]], [[0, 0], [0, 0]], [[2, 0], [0, 0]]]
-    found = synthesis.synthesize(
-        GameFile.read(arrays("F bad", probability=probability, successor=successor))
-    )
+    found = solve_game(GameFile.read(arrays("F bad", probability=probability, successor=successor)))
     assert found.moves == pytest.approx((1 / 0.625 + 1, 5), rel=1e-5)
 
 
 def test_safety_has_no_expected_moves(arrays):
-    found = synthesis.synthesize(GameFile.read(arrays("G !bad")))
+    found = solve_game(GameFile.read(arrays("G !bad")))
     assert report.summary(found, 1.0)["expected_moves"] is None

@@ -8,10 +8,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.app.files.models import read_padded
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.io.drn.drn import read_drn
 from jaxltl.io.model_files import read_model, write_model
+from jaxltl.io.padded_models import read_padded
 from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.storm import from_stormpy, to_stormpy
 from jaxltl.io.umb.umb import read_umb

@@ -6,6 +6,7 @@ A game file is TOML with the tables ``[game]``, ``[task]`` and optionally ``[str
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -14,7 +15,7 @@ from typing import Annotated as TomlKey
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.app.files.models import read_padded
+from jaxltl.io.padded_models import read_padded
 from jaxltl.app.files.schema import (
     Count,
     File,
@@ -29,10 +30,10 @@ from jaxltl.app.files.schema import (
     table,
 )
 from jaxltl.app.files.worlds import initial_where
-from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
+from jaxltl.core.games.synthesis import Synthesis, synthesize
 from jaxltl.core.games.winning import task_game
-from jaxltl.core.models import Game, Product, make_game
+from jaxltl.core.models import Game, make_game
 from jaxltl.envs.robots import ACTIONS, grid_game, places
 from jaxltl.envs.text_map import parse_map
 from jaxltl.app.wording import Record
@@ -248,6 +249,38 @@ def task_text(task: TaskTable) -> str:
     return " & ".join(parts)
 
 
-def automaton_of(game: Game) -> Automaton | None:
-    """The formula's automaton, if the game is a product with one."""
-    return game.mdp.automaton if isinstance(game.mdp, Product) else None
+@dataclass(frozen=True)
+class SolvedGame(Synthesis):
+    """A solved game, with its file."""
+
+    file: GameFile
+    world: MappedGame
+
+    def demand(self) -> None:
+        """Raises ValueError if the file demands a strategy and the task is unrealizable."""
+        if self.file.strategy and self.strategy is None:
+            where = self.world.describe(int(self.starts[0]))
+            raise ValueError(
+                f"{self.file.path}: [strategy] demands a strategy, but the task is unrealizable: the "
+                f"environment wins from every initial state, for example: {where}. Weaken the task, "
+                "assume something of the environment, or leave [strategy] out."
+            )
+
+
+def solve_game(file: GameFile, progress: Callable[[str], None] = lambda stage: None) -> SolvedGame:
+    """Solves the game of a file."""
+    progress("reading")
+    world = load_game(file)
+    game, objective = load_objective(file, world)
+    table = file.strategy or StrategyTable()
+    with errors_in(f"{file.path}: [strategy] "):
+        solved = synthesize(
+            game,
+            objective,
+            chance=file.task.chance,
+            method=table.method,
+            bound=table.bound,
+            actions=world.actions,
+            progress=progress,
+        )
+    return SolvedGame(**vars(solved), file=file, world=world)

@@ -62,7 +62,7 @@ def load_world(path: Path, table: WorldTable) -> MappedModel:
             mdp, actions, logged = load_logged(path.parent, table)
             return MappedModel(mdp, None, actions, logged)
         if table.model is not None:
-            from jaxltl.app.files.models import read_padded
+            from jaxltl.io.padded_models import read_padded
 
             file = path.parent / table.model
             loaded = read_padded(file, constants=table.constants)

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.game import task_text
+from jaxltl.app.files.game import SolvedGame, task_text
 from jaxltl.app.job import plain, took
 from jaxltl.app.run_job import write_results
 from jaxltl.app.reports.certificate import Certifiable, formula_question, write_certificates
 from jaxltl.app.reports.drawing import Picture, draw
 from jaxltl.app.reports.explorer import Explorer, ReportTrajectory
 from jaxltl.app.reports.page import Report, aligned, number
-from jaxltl.app.synthesize import EnvironmentPlay, Synthesis
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.games import GR1, Permissive, Winning
+from jaxltl.core.games.synthesis import EnvironmentPlay
 from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
 from jaxltl.core.models.game import Game, is_deterministic
 from jaxltl.core.models.product import product
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # --- results --------------------------------------------------------------------------------
 
 
-def summary(synthesis: Synthesis, seconds: float) -> Record:
+def summary(synthesis: SolvedGame, seconds: float) -> Record:
     """The results for ``result.json``."""
     file, world = synthesis.file, synthesis.world
     wins, starts = synthesis.wins, synthesis.starts
@@ -75,7 +75,7 @@ def summary(synthesis: Synthesis, seconds: float) -> Record:
     return dict(plain(result))
 
 
-def _about_strategy(synthesis: Synthesis) -> Record | None:
+def _about_strategy(synthesis: SolvedGame) -> Record | None:
     if (
         synthesis.strategy is None
         or synthesis.restricted is None
@@ -105,7 +105,7 @@ def is_confirmed(result: Result) -> bool:
     return bool(claims["system"] and claims["environment"] and sound)
 
 
-def report_of(synthesis: Synthesis) -> Report:
+def report_of(synthesis: SolvedGame) -> Report:
     """The report of a synthesis, of its :func:`summary`."""
 
     def values(result: Result) -> Record:
@@ -139,7 +139,7 @@ def verdict(result: Result) -> str:
 # --- plays -----------------------------------------------------------------------------------
 
 
-def describe_play(synthesis: Synthesis) -> list[str]:
+def describe_play(synthesis: SolvedGame) -> list[str]:
     """A play that the environment wins, as lines of a table."""
     play, world = synthesis.play, synthesis.world
     if play is None:
@@ -152,7 +152,7 @@ def describe_play(synthesis: Synthesis) -> list[str]:
     return [f"  {line}" for line in (*aligned(rows), _ending(play, synthesis))]
 
 
-def _ending(play: EnvironmentPlay, synthesis: Synthesis) -> str:
+def _ending(play: EnvironmentPlay, synthesis: SolvedGame) -> str:
     last = len(play.steps) - 1
     if play.failed:
         chance = ", after random moves against the system" if play.by_chance else ""
@@ -163,7 +163,7 @@ def _ending(play: EnvironmentPlay, synthesis: Synthesis) -> str:
     return f"{round_} for ever, and {_missed(play, synthesis) or 'violate the objective'}"
 
 
-def _missed(play: EnvironmentPlay, synthesis: Synthesis) -> str:
+def _missed(play: EnvironmentPlay, synthesis: SolvedGame) -> str:
     """The guarantees that a repeated part of a play never satisfies."""
     objective = synthesis.winning.objective
     guarantees = synthesis.file.task.guarantees or ()
@@ -178,7 +178,7 @@ def _missed(play: EnvironmentPlay, synthesis: Synthesis) -> str:
 # --- files ----------------------------------------------------------------------------------
 
 
-def save(out: Path, synthesis: Synthesis) -> None:
+def save(out: Path, synthesis: SolvedGame) -> None:
     """Writes the strategies into a directory, atomically, as policies that `load_policy` reads.
 
     Besides the arrays of a policy of the world they have those of the solved game:
@@ -210,7 +210,7 @@ def save(out: Path, synthesis: Synthesis) -> None:
 
 
 def _write(
-    path: Path, kind: str, synthesis: Synthesis, strategy: Permissive | Winning, arrays: Record
+    path: Path, kind: str, synthesis: SolvedGame, strategy: Permissive | Winning, arrays: Record
 ) -> None:
     """Writes a strategy as a finite-memory policy, or as its game alone where it is none."""
     nodes, world = synthesis.nodes, synthesis.world
@@ -232,7 +232,7 @@ def _write(
     save_policy(path, policy, {k: v for k, v in arrays.items() if k != "actions"})
 
 
-def _arrays(synthesis: Synthesis, game: Game, node: np.ndarray) -> Record:
+def _arrays(synthesis: SolvedGame, game: Game, node: np.ndarray) -> Record:
     return {
         "successor": game.mdp.successor,
         "probability": game.mdp.probability,
@@ -260,7 +260,7 @@ MAX_MAPS = 36  # of the environment's places
 MAX_PANELS = 6  # of a strategy's memory
 
 
-def pictures(synthesis: Synthesis, environment: int | None = None) -> list[tuple[Picture, bytes]]:
+def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[tuple[Picture, bytes]]:
     """Pictures: the automaton, and maps if the game has one."""
     # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
@@ -290,7 +290,7 @@ def pictures(synthesis: Synthesis, environment: int | None = None) -> list[tuple
     return [(picture, plot.to_bytes(figure)) for picture, figure in figures]
 
 
-def place_of(synthesis: Synthesis, cell: tuple[int, int] | None) -> int | None:
+def place_of(synthesis: SolvedGame, cell: tuple[int, int] | None) -> int | None:
     """The index of the place in a cell, which has row and column from 1."""
     if cell is None:
         return None
@@ -307,7 +307,7 @@ def place_of(synthesis: Synthesis, cell: tuple[int, int] | None) -> int | None:
     return int(here[0])
 
 
-def _moves_picture(synthesis: Synthesis, environment: int | None) -> Figure:
+def _moves_picture(synthesis: SolvedGame, environment: int | None) -> Figure:
     from jaxltl import plot
 
     world, nodes = synthesis.world, synthesis.nodes
@@ -349,7 +349,7 @@ def _moves_picture(synthesis: Synthesis, environment: int | None) -> Figure:
     )
 
 
-def _title(synthesis: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
+def _title(synthesis: SolvedGame, q: int, m: int, pairs: np.ndarray) -> str:
     """Title of a panel: its automaton state and memory state."""
     parts = []
     if len(set(pairs[:, 0])) > 1:
@@ -367,7 +367,7 @@ _PLAY_STEPS = 40  # of a play of the strategy
 _PLAYERS = ("system", "environment")
 
 
-def write(synthesis: Synthesis, out: Path, place: int | None, seconds: float) -> Result:
+def write(synthesis: SolvedGame, out: Path, place: int | None, seconds: float) -> Result:
     """Writes the strategies, pictures, report and result of a synthesis to a directory."""
     for stale in ("result.json", *FILES):
         (out / stale).unlink(missing_ok=True)
@@ -383,7 +383,7 @@ def write(synthesis: Synthesis, out: Path, place: int | None, seconds: float) ->
     return result
 
 
-def _certifiable(synthesis: Synthesis) -> list[Certifiable] | str:
+def _certifiable(synthesis: SolvedGame) -> list[Certifiable] | str:
     """The greatest probability of the objective, which 1 and 0 bound where one player wins surely."""
     game, automaton = synthesis.world.game, synthesis.nodes.automaton
     if synthesis.file.task.chance == "adversarial" and not is_deterministic(game):
@@ -393,7 +393,7 @@ def _certifiable(synthesis: Synthesis) -> list[Certifiable] | str:
     return [Certifiable(game, None, question, num_nodes=count)]
 
 
-def play_explorer(synthesis: Synthesis) -> Explorer:
+def play_explorer(synthesis: SolvedGame) -> Explorer:
     """Plays on the map: one of the strategy, and one that the environment wins."""
     world, nodes = synthesis.world, synthesis.nodes
     runs = []
@@ -429,7 +429,9 @@ def play_explorer(synthesis: Synthesis) -> Explorer:
     )
 
 
-def _counter_play(synthesis: Synthesis, play: EnvironmentPlay) -> list[tuple[int, int, int | None]]:
+def _counter_play(
+    synthesis: SolvedGame, play: EnvironmentPlay
+) -> list[tuple[int, int, int | None]]:
     """The play that the environment wins; chance has no action."""
     nodes, actions = synthesis.nodes, synthesis.world.actions
     moves: list[int | None] = [
@@ -444,7 +446,7 @@ def _counter_play(synthesis: Synthesis, play: EnvironmentPlay) -> list[tuple[int
     ]
 
 
-def _strategy_play(synthesis: Synthesis) -> list[tuple[int, int, int | None]]:
+def _strategy_play(synthesis: SolvedGame) -> list[tuple[int, int, int | None]]:
     """A play with random moves among those that the strategy allows."""
     assert synthesis.restricted is not None
     game, nodes, rng = synthesis.restricted.model, synthesis.nodes, np.random.default_rng(0)

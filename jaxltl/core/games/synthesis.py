@@ -1,42 +1,41 @@
-"""Synthesis from a game file: winning region, permissive strategy, checks, counter-play."""
+"""Synthesis for a game: winning region, permissive strategy, independent checks, and a counter-play.
+
+Example: a robot that must stay on the left, where it can.
+  >>> import jaxltl as jl
+  >>> from jaxltl.core.games.synthesis import synthesize
+  >>> from jaxltl.core.games.winning import task_game
+  >>> world = jl.make_mdp([[[0], [1]], [[1], [0]]], [[[1.0], [1.0]]] * 2, label=[[1], [0]],
+  ...                     propositions=["left"], initial=[0.5, 0.5])
+  >>> game, objective = task_game(jl.make_game(world, [True, True]), "G left")
+  >>> solved = synthesize(game, objective)
+  >>> solved.wins.tolist(), solved.verdict.system, solved.play.failed
+  ([True, False], True, True)
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.game import (
-    GameFile,
-    StrategyTable,
-    MappedGame,
-    automaton_of,
-    load_game,
-    load_objective,
-)
-from jaxltl.core.automata import Automaton
-from jaxltl.core.environments import Verdict, make_monitor
-from jaxltl.core.games import (
-    GR1,
-    Parity,
-    Permissive,
-    apply_strategy,
-    permissive_strategy,
-    Verification,
-    verify,
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.environments.monitor import Verdict, make_monitor
+from jaxltl.core.games.objective import GR1, Parity
+from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy
+from jaxltl.core.games.verify import Verification, verify
+from jaxltl.core.games.winning import (
     Winning,
+    adversarial_chance,
+    objective_at,
     winning_region,
 )
-from jaxltl.core.games.winning import adversarial_chance, objective_at
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models import Game, Restriction, restrict
-from jaxltl.core.validation import errors_in
+from jaxltl.core.models import Game, Product, Restriction, restrict
 from jaxltl.core.values.undiscounted.total_reward import worst_case_steps
 
-
-Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")
 
 
@@ -44,8 +43,8 @@ STAGES = ("reading", "solving", "checking", "strategy", "writing")
 class GameNodes:
     """The product game that is solved, with its reachable states numbered."""
 
-    # N nodes, reachable from any state of the world; the initial distribution is that of the game
-    # file
+    # N nodes, reachable from any state of the world; the initial distribution is that of the
+    # game
     game: Game
     objective: Parity | GR1  # of the system
     world_state: np.ndarray  # world_state, automaton_state: int[N]
@@ -56,7 +55,7 @@ class GameNodes:
 
 
 @dataclass(frozen=True)
-class Step:
+class PlayStep:
     """A position of a play, and the move that leads there."""
 
     node: int  # the position
@@ -69,7 +68,7 @@ class Step:
 class EnvironmentPlay:
     """A play that the environment wins."""
 
-    steps: list[Step]  # its positions in order
+    steps: list[PlayStep]  # its positions in order
     repeats_from: int | None  # the step from which it repeats for ever, or None
     failed: bool  # whether it ends in a violation that no continuation can undo
     by_chance: bool  # whether a random move was resolved against the system
@@ -79,9 +78,8 @@ class EnvironmentPlay:
 class Synthesis:
     """A solved game with its strategies and their independent checks."""
 
-    file: GameFile  # file, world, nodes: the game
-    world: MappedGame
-    nodes: GameNodes
+    game: Game  # the states of the world, without an automaton
+    nodes: GameNodes  # the product game that is solved
     winning: Winning  # the region and both players' strategies, on the nodes
     verdict: Verification  # of the independent check of both strategies
     # a permissive strategy, or None if the system wins from no initial state
@@ -106,19 +104,40 @@ class Synthesis:
 
     @property
     def starts(self) -> np.ndarray:
-        return np.flatnonzero(np.asarray(self.world.game.initial) > 0)
+        """The initial states of the world."""
+        return np.flatnonzero(np.asarray(self.game.initial) > 0)
 
     @property
     def lost_starts(self) -> np.ndarray:
+        """Those from which the environment wins."""
         return self.starts[~self.wins[self.starts]]
 
 
-def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synthesis:
-    """Solves the game of a file, checks the solution, and extracts a permissive strategy."""
-    progress("reading")
-    world = load_game(file)
-    nodes = make_nodes(file, world)
+def synthesize(
+    game: Game,
+    objective: Parity | GR1,
+    *,
+    chance: str = "random",
+    method: str = "auto",
+    bound: int | None = None,
+    actions: Sequence[str] | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> Synthesis:
+    """Solves a game, checks the solution, and extracts a permissive strategy.
+
+    Args:
+      game: a game, or the product of one with a formula's automaton, of :func:`~jaxltl.core.games.winning.task_game`.
+      objective: of the system.
+      chance: random moves are by probability, ``"random"``, or the environment's, ``"adversarial"``.
+      method, bound: of :func:`~jaxltl.core.games.permissive_strategy`.
+      actions: names of the actions in plays; default their numbers.
+      progress: called with the name of each stage.
+
+    Raises:
+      ValueError: a method that does not fit the objective.
+    """
     progress("solving")
+    nodes = make_nodes(game, objective, chance)
     winning = winning_region(nodes.game, nodes.objective)
     progress("checking")
     verdict = verify(winning)
@@ -127,30 +146,30 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
     progress("strategy")
     strategy = restricted = strategy_verdict = moves = None
     if wins[initial].any():
-        table = file.strategy or StrategyTable()
-        with errors_in(f"{file.path}: [strategy] "):
-            strategy = permissive_strategy(
-                nodes.game, nodes.objective, method=table.method, bound=table.bound
-            )
+        strategy = permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
         restricted = apply_strategy(strategy)
         strategy_verdict = check_strategy(nodes, strategy, restricted)
         moves = expected_moves(nodes, strategy, restricted)
     lost = np.flatnonzero(initial & ~wins)
-    play = lost_play(nodes, winning, int(lost[0]), world.actions) if lost.size else None
+    names = tuple(map(str, range(game.num_actions))) if actions is None else tuple(actions)
+    play = lost_play(nodes, winning, int(lost[0]), names) if lost.size else None
+    world = game
+    if isinstance(game.mdp, Product):
+        world = Game(game.mdp.mdp, jnp.asarray(game.system).reshape(game.state_shape)[:, 0])
     return Synthesis(
-        file, world, nodes, winning, verdict, strategy, restricted, strategy_verdict, play, moves
+        world, nodes, winning, verdict, strategy, restricted, strategy_verdict, play, moves
     )
 
 
-def make_nodes(file: GameFile, world: MappedGame) -> GameNodes:
-    """The product game of a file's world and objective."""
-    game, objective = load_objective(file, world)
-    automaton = automaton_of(game)
+def make_nodes(game: Game, objective: Parity | GR1, chance: str = "random") -> GameNodes:
+    """The product game that is solved, with its reachable states numbered."""
+    automaton = game.mdp.automaton if isinstance(game.mdp, Product) else None
     width = 1 if automaton is None else game.state_shape[1]
     first = 0 if automaton is None else int(automaton.initial)
-    start = np.arange(world.game.num_states) * width + first
+    num_states = game.state_shape[0]
+    start = np.arange(num_states) * width + first
     origin, num_own = np.arange(game.num_states), game.num_states
-    if file.task.chance == "adversarial":
+    if chance == "adversarial":
         game, base_state = adversarial_chance(game)
         objective, origin = objective_at(objective, base_state), np.asarray(base_state)
     memories = 1 if len(game.state_shape) == 1 else width
@@ -237,7 +256,7 @@ def lost_play(
         nexts = nexts[outside[nexts]]
         return int(nexts[np.argmin(time[nexts])])
 
-    steps, met, memory, by_chance = [Step(node, "start", "")], {(node, 0): 0}, 0, False
+    steps, met, memory, by_chance = [PlayStep(node, "start", "")], {(node, 0): 0}, 0, False
     while not failed[node]:
         if system[node]:
             # A losing node has a losing successor by every move.
@@ -249,7 +268,7 @@ def lost_play(
         by_chance |= used[node, action].sum() > 1
         memory = (memory + int(advances[memory, node])) % len(advances)
         node = target
-        steps.append(Step(node, mover, "" if mover == "chance" else actions[action]))
+        steps.append(PlayStep(node, mover, "" if mover == "chance" else actions[action]))
         if (node, memory) in met:
             return EnvironmentPlay(steps, met[node, memory], False, bool(by_chance))
         met[node, memory] = len(steps) - 1
@@ -257,14 +276,3 @@ def lost_play(
     return EnvironmentPlay(
         steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
     )
-
-
-def demand(synthesis: Synthesis) -> None:
-    """Raises ValueError if the file demands a strategy and the task is unrealizable."""
-    if synthesis.file.strategy and synthesis.strategy is None:
-        where = synthesis.world.describe(int(synthesis.starts[0]))
-        raise ValueError(
-            f"{synthesis.file.path}: [strategy] demands a strategy, but the task is unrealizable: the "
-            f"environment wins from every initial state, for example: {where}. Weaken the task, "
-            "assume something of the environment, or leave [strategy] out."
-        )

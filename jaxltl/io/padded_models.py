@@ -1,4 +1,4 @@
-"""Models that task and game files name, of any format, with padded successor lists."""
+"""Models of files of any format with padded successor lists, as learners and games take them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.app.files.schema import read_bytes
 from jaxltl.core.models.action_numbers import row_actions
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models import POMDP, MDP, Game, IntervalMDP, MultiplayerGame, SparseMDP
@@ -37,7 +36,10 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
     the rank of a choice in its state.
     """
     name = str(path)
-    raw = read_bytes(path, "the model")
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"the model cannot be read: {name!r}: {error.strerror}.") from None
     if path.suffix.lower() == ".npz" or raw.startswith(b"PK"):
         arrays = parse_arrays(raw, name, more)
         if "entry_start" not in arrays:
