@@ -354,8 +354,8 @@ def test_what_has_no_intervals_takes_one_direction():
         ('Pmin>0.5 [ F "goal1" ]', r"ask for Pminmin=\? or Pminmax=\?"),
         ('R{"time"}min=? [ F "goal1" ]', r'ask for R\{"time"\}minmin=\? or R\{"time"\}minmax=\?'),
         (
-            "Rminmax=? [ C ]",
-            r"rewards for ever \(C, F0, Fc\) are not solved for where probabilities are int",
+            'Rminmax=? [ F0 "goal1" ]',
+            r"rewards that count if a state is reached \(F0\) are not solved for where probabilities are int",
         ),
         ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
         ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from typing import cast
 
 import numpy as np
 
@@ -12,12 +13,12 @@ from jaxltl.core.logic.good_prefixes import prefix_automaton, state_formulas
 from jaxltl.core.logic.labels import distinct_rows
 from jaxltl.core.logic.ltl import Formula, negation_normal_form
 from jaxltl.core.models.construct.state_formulas import states_satisfying
-from jaxltl.core.models.exact_numbers import exact_numbers
+from jaxltl.core.models.exact_numbers import exact_numbers, exact_reward
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.number_source import NumberSource, Part, RationalNumbers
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
@@ -52,6 +53,38 @@ def prefix_product(
         return larger, product.start
     system = np.asarray(model.system)[product.base_state]
     return Game(larger, to_jax(system)), product.start
+
+
+def step_product(
+    model: SparseMDP, num_steps: int, rewards: dict[str, tuple[str, int]]
+) -> SparseMDP:
+    """Product with a counter of steps up to a number, from the initial states.
+
+    `rewards` has new structures by name: the name of one of the model, and the number of steps in which it is earned.
+    """
+    first = np.flatnonzero(np.asarray(model.initial) > 0)
+    delta = np.minimum(np.arange(1, num_steps + 2), num_steps)[:, None]
+    letter, start = np.zeros(model.num_states, np.int64), (first, np.zeros_like(first))
+    product = sparse_product(model.host, delta, letter, start)
+    larger = _unrolled(model, product)
+    initial = np.zeros(larger.num_states)
+    initial[product.start] = np.asarray(model.initial)[first]
+    passed, source = product.memory[product.host.state], larger.numbers.read
+    structures = dict(larger.rewards)
+    for name, (old, count) in rewards.items():
+        earned = np.where(passed < count, choice_reward(model, old)[product.base_row], 0)
+        structures[name] = Rewards(choice=earned)
+
+    def read(whole: SparseMDP) -> RationalNumbers:
+        assert source is not None
+        numbers, own = cast(RationalNumbers, source(whole)), exact_numbers(model)
+        for name, (old, count) in rewards.items():
+            each = exact_reward(model, own, model.rewards[old], old)
+            rows = zip(product.base_row.tolist(), (passed < count).tolist(), strict=True)
+            numbers.rewards[name] = None, [each[r] if x else ZERO for r, x in rows], None
+        return numbers
+
+    return replace(larger, initial=initial, rewards=structures, numbers=NumberSource(read))
 
 
 def transition_graph(model: SparseMDP) -> SparseMDP:

@@ -104,7 +104,7 @@ def require_infinite(path: TotalReward) -> None:
     """Raises ValueError unless runs that avoid the target of a total reward are worth infinity."""
     if path.target is None:
         raise ValueError(
-            "total rewards of interval models need a target, as those inside jit and over a mesh do; "
+            "total rewards of games with intervals need a target, as those inside jit and over a mesh do; "
             "give one."
         )
     if path.unreached != "infinite":

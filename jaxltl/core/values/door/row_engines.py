@@ -12,7 +12,8 @@ from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward
 from jaxltl.core.sparse.bounded.reward_bounded import in_units
 from jaxltl.core.sparse.interval import discounted as interval_discounted
-from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.reachability import reachability, without_absorbing
+from jaxltl.core.sparse.interval.reward_forever import reward_forever
 from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
@@ -143,6 +144,9 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
     assert isinstance(path, TotalReward)
     if form.interval is None and (path.target is None or path.unreached != "infinite"):
         return _earn_in_game(form, question, accuracy.width(TOLERANCE))
+    forever = path.target is None or path.unreached == "sum"
+    if forever and form.system is None:
+        return _earn_forever(form, question, accuracy.width(TOLERANCE))
     require_infinite(path)
     requested, target = accuracy.width(TOLERANCE), form.states("target", path.target)
     reward = certain_reward(form, path.reward)
@@ -150,6 +154,26 @@ def earn_with_nature(model: Model, question: Question, accuracy: Accuracy) -> So
     def earn(sides: Sides) -> RobustValues:
         earned = np.where(sides.choosing, 0, reward[sides.encoded.row])
         return total_reward(sides.host, earned, sides.states(target), sides.query(requested))
+
+    return robust_solution(form, question, earn, requested, relative=True)
+
+
+def _earn_forever(form: RowForm, question: Question, requested: float) -> Solution:
+    """Total rewards under intervals for ever, or until a set of states that runs may avoid."""
+    path = question.path
+    assert isinstance(path, TotalReward)
+    reward = certain_reward(form, path.reward)
+    target = None if path.target is None else form.states("target", path.target)
+
+    def earn(sides: Sides) -> RobustValues:
+        earned, query = reward[sides.encoded.row], sides.query(requested)
+        if target is None:
+            return reward_forever(sides.host, earned, query)
+        ends = sides.states(target)
+        ended, row = sides.host.with_absorbing(ends)
+        earned = np.where(ends[ended.mdp.state], 0, earned[row])
+        values = reward_forever(ended, earned, query)
+        return without_absorbing(sides.host, ended, row, ends, values)
 
     return robust_solution(form, question, earn, requested, relative=True)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaxltl.core.logic.bounded import Bounded, Conditional, Earned, Recognized, unfolded
@@ -9,9 +11,11 @@ from jaxltl.core.logic.good_prefixes import is_plain_reachability
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.property import MAX_UNFOLDED_STEPS, Property
+from jaxltl.core.models.construct.property_models import step_product
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.models.sparse import SparseMDP, choice_reward
+from jaxltl.core.models.rewards import default_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward, reward_structure
 from jaxltl.core.values.properties.exact_thresholds import acceptor
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
@@ -24,10 +28,14 @@ from jaxltl.core.values.multi_objective.multi_objective import (
 )
 
 
+MAX_COUNTED = 10**7  # transitions of a product with a counter of steps
+
+
 def solve_multi_objective(
     model: SparseMDP, prop: Property, tolerance: float
 ) -> Achievable | ConstrainedOptimum | Pareto:
     """Solution of ``multi(...)``: the objectives without a threshold say which of three questions it is."""
+    model, prop = _without_steps(model, prop)
     parts = [_objective(model, x) for x in prop.parts]
     free = sum(part.threshold is None for part in parts)
     if not free:
@@ -40,6 +48,29 @@ def solve_multi_objective(
             "them (the best value), to all (achievability) or to none (the curve)."
         )
     return pareto(model, parts, tolerance=max(tolerance, 1e-6))
+
+
+def _without_steps(model: SparseMDP, prop: Property) -> tuple[SparseMDP, Property]:
+    """The rewards of some steps, ``C<=k``, as total rewards of a product with a counter of steps."""
+    parts, rewards = list(prop.parts), {}
+    for i, part in enumerate(parts):
+        steps = part.path.steps if isinstance(part.path, Earned) else None
+        if steps is None or str(part.path)[0] != "C" or part.discount is not None:
+            continue
+        name = default_reward(model.rewards) if part.reward is None else part.reward
+        reward_structure(model, name)  # which names the rewards
+        counted = f"[{name} in {steps} steps]"
+        rewards[counted] = name, steps
+        parts[i] = replace(part, reward=counted, path=Earned("total"))
+    if not rewards:
+        return model, prop
+    largest = max(steps for _, steps in rewards.values())
+    if model.num_transitions * (largest + 1) > MAX_COUNTED:
+        raise ValueError(
+            f"{prop.text}: the model with a counter of {largest} steps has more than {MAX_COUNTED:.0e} "
+            "transitions; ask for fewer steps."
+        )
+    return step_product(model, largest, rewards), replace(prop, parts=tuple(parts))
 
 
 def _objective(model: SparseMDP, prop: Property) -> Objective:
@@ -98,8 +129,8 @@ def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
     is_total = isinstance(path, Formula) or (isinstance(path, Earned) and path.kind == "total")
     if prop.operator == "LRA" or not is_total or prop.unreached != "infinite":
         raise ValueError(
-            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
-            "and T are supported."
+            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ], "
+            "R [ C<=k ] and T are supported."
         )
     # By name, so that its exact numbers are those of the model's source.
     name = next(iter(model.rewards)) if len(model.rewards) == 1 else None

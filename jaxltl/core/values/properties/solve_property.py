@@ -513,10 +513,10 @@ def _solved(query: ModelQuery, prop: Property, aim: PropertyAim, tolerance: floa
         solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
         return query.result(solve(model, reward, path.steps, **aim.directions), by="steps")
     inner = model.mdp if isinstance(model, Game) else model
-    if isinstance(inner, IntervalMDP) and (target is None or prop.unreached != "infinite"):
+    if isinstance(inner, IntervalMDP) and prop.unreached == "zero":
         raise ValueError(
-            f"{prop.text}: rewards for ever (C, F0, Fc) are not solved for where probabilities are "
-            "intervals; ask for those until a state is reached (F), of so many steps (C<=k) or "
+            f"{prop.text}: rewards that count if a state is reached (F0) are not solved for where probabilities are "
+            "intervals; ask for those until a state is reached (F, Fc), for ever (C), of so many steps (C<=k) or "
             "after them (I=k), or for the average (S)."
         )
     directed = aim.directions

@@ -56,9 +56,10 @@ def total_reward(
         also as of :func:`~jaxltl.core.models.sparse.choice_reward`, of a ShardedMDP the name of one.
         Rewards of transitions must not differ within a row of intervals.
       target: ``bool[S]``, a label's name, or a Boolean formula of labels; required inside ``jit``, over
-        a mesh, and of interval models.
+        a mesh; without one an interval model needs positive lower ends.
       unreached: the reward of a run that never reaches the target, ``"infinite"``, ``"sum"`` or ``"zero"``;
-        the last two without intervals, on the host, and ``"zero"``, as both in games, without a policy.
+        the last two on the host, ``"sum"`` under intervals with positive lower ends, and ``"zero"`` without
+        intervals and, as both in games, without a policy.
       policy, objective, nature, environment, throw: as of :func:`reachability_probability`.
       tolerance: relative width of the enclosure; default 1e-6 in double precision, 1e-3 in single.
 

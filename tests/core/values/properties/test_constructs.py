@@ -26,6 +26,8 @@ SOURCES = {
     "rough": """mdp module m s : [0..2]; [a] s=0 -> (s'=1); [b] s=0 -> [0.3,0.7]:(s'=1) + [0.3,0.7]:(s'=2);
     [] s=1 -> true; [] s=2 -> true; endmodule label "goal" = s=1;
     rewards "r" [a] true : 10; [b] true : 1; s=2 : 5; endrewards""",
+    "drift": """dtmc module m s : [0..3]; [] s=0 -> [0.3,0.7]:(s'=1) + [0.3,0.7]:(s'=2); [] s=1|s=2 -> (s'=3);
+    [] s=3 -> true; endmodule rewards "r" s=1 : 2; s=2 : 10; endrewards""",
     "walk": """dtmc module m s : [0..3]; [] s<2 -> 0.5:(s'=s+1) + 0.5:(s'=3); [] s>1 -> true; endmodule
     rewards "r" s<2 : 3; s=2 : 1; endrewards rewards "act" [] s<2 : 4; endrewards label "two" = s=2;""",
     "duel": """smg player p1 [a], [b] endplayer player p2 [c], [d] endplayer
@@ -69,6 +71,25 @@ TABLES = {
             "[[p2]] P>0.5 [ F s=2 ]": False,
             "[[p1,p2]] P>=0.1 [ F s=3 ]": False,
             "[[]] P>=1 [ F s=3 ]": True,
+        },
+    },
+    "forever": {
+        "rough": {
+            'R{"r"}minmin=? [ C ]': 10,
+            'R{"r"}minmax=? [ C ]': 10,
+            'R{"r"}maxmin=? [ C ]': inf,
+            'R{"r"}minmin=? [ Fc s=2 ]': 1,
+            'R{"r"}maxmax=? [ Fc s=2 ]': 10,
+            'R{"r"}maxmin=? [ Fc "goal" ]': inf,
+            'filter(state, R{"r"}minmin=? [ C ], s=2)': inf,
+            'filter(state, R{"r"}maxmax=? [ C ], s=1)': 0,
+        },
+        "drift": {
+            'R{"r"}min=? [ C ]': 0.7 * 2 + 0.3 * 10,
+            'R{"r"}max=? [ C ]': 0.3 * 2 + 0.7 * 10,
+            'R{"r"}max=? [ Fc s=2 ]': 1.4,
+            'R{"r"}min=? [ Fc s=1 ]': 3,
+            'R{"r"}max=? [ C<=1 ]': 0,
         },
     },
     "discount": {
@@ -217,6 +238,49 @@ def test_discounted_rewards_agree_with_the_solvers_of_discounted_rewards():
         assert solve_property(rough, text, states=range(5)).value == pytest.approx(
             np.asarray(expected), rel=1e-6
         )
+
+
+MULTI = {  # action a earns 3 of x, then 1 of y; b earns 2 of y, then 0.2 of x and 1 of y with probability 0.5
+    'multi(R{"x"}max=? [ C<=2 ], R{"y"}>=1 [ C<=1 ])': 1.55,
+    'multi(R{"x"}max=? [ C<=1 ], R{"y"}>=1 [ C<=1 ])': 1.5,
+    'multi(R{"x"}max=? [ C<3 ], P>=1 [ F s=2 ])': 3,
+    'multi(R{"x"}max=? [ C<=3 ], P>=1 [ F s=2 ])': 6,
+    'multi(R{"x"}max=? [ C<=3 ], R{"y"}>=2.5 [ C<=3 ])': 3.75,
+    'multi(R{"x"}max=? [ C<=0 ], P>=1 [ F s=2 ])': 0,
+    'multi(R{"x"}min=? [ C<=3 ], P>=1 [ F s=2 ])': 0.1,
+    'multi(Pmax=? [ F s=3 ], R{"x"}>=3 [ C<=1 ])': 0.5,
+    'multi(R{"y"}min=? [ C ], R{"x"}>=3 [ C<=1 ], P>=1 [ F s=2 ])': 1 + 2.5,
+    'multi(Pmax=? [ F<=2 s=2 ], R{"x"}>=1 [ C<=1 ])': 2 / 3,
+    'multi(R{"x"}>=1.5 [ C<=1 ], R{"y"}>=1 [ C<=1 ])': True,
+    'multi(R{"x"}>=1.501 [ C<=1 ], R{"y"}>=1 [ C<=1 ])': False,
+    'multi(R{"x"}>=3.3 [ C<=3 ], R{"y"}>=2 [ C<=3 ])': True,
+    'multi(R{"x"}<=0 [ C<=1 ], R{"y"}>=2 [ C<=1 ])': True,
+    'multi(R{"x"}>=1.55 [ C<=2 ], R{"y"}>=1 [ C<=1 ])': True,
+}
+
+
+def test_rewards_of_some_steps_among_several_objectives():
+    """Thresholds on the boundary are met, since the numbers of the program are exact."""
+    program = read_program(
+        """mdp module m s : [0..3]; [a] s=0 -> (s'=1); [b] s=0 -> 0.5:(s'=2) + 0.5:(s'=3); [] s=1 -> (s'=0);
+        [] s=2 -> true; [] s=3 -> (s'=2); endmodule
+        rewards "x" [a] true : 3; s=3 : 0.2; endrewards rewards "y" [b] true : 2; s=1 : 1; s=3 : 1; endrewards"""
+    )
+    model, known = build_model(program), program_definitions(program)
+    for text, expected in MULTI.items():
+        (prop,) = parse_properties(text, known)
+        answer = solve_property(model, prop)
+        assert answer.status == jl.Status.CONVERGED, text
+        if isinstance(expected, bool):
+            assert answer.holds == expected, text
+        else:
+            assert answer.value == pytest.approx(expected, rel=1e-6), text
+    (prop,) = parse_properties('multi(R{"x"}max=? [ C<=3 ], R{"y"}max=? [ C<=3 ])', known)
+    front = solve_property(model, prop)
+    assert np.sort(front.points, 0) == pytest.approx(np.array([[3, 1], [6, 3]]))
+    (prop,) = parse_properties('multi(R{"x"}max=? [ C<=9999999 ], P>=1 [ F s=2 ])', known)
+    with pytest.raises(ValueError, match="ask for fewer steps"):
+        solve_property(model, prop)
 
 
 HOA = {
