@@ -1,9 +1,12 @@
 """``python -m benchmarks.multiplayer [--large] [--json]``: games of several players from the literature.
 
-Two games of the PRISM benchmark suite, written anew from their descriptions: a dice game, and a grid in
-which an intruder looks for an item and for the exit while an observer searches for it (Chatterjee, Katoen,
-Weininger and Winkler 2020, "Stochastic games with lexicographic reachability-safety objectives"). The
-numbers of states and of choices are those that the suite reports. Times are seconds of the first call.
+Games of the PRISM benchmark suite, written anew from their descriptions: a dice game; a grid in which an
+intruder looks for an item and for the exit while an observer searches for it, and a hall in which a robot
+with faulty moves looks for a person in panic (Chatterjee, Katoen, Weininger and Winkler 2020, "Stochastic
+games with lexicographic reachability-safety objectives"); two investors in a futures market that may bar
+them (McIver and Morgan 2007); and the schedule of a task graph on two processors with faults (Bouyer,
+Fahrenberg, Larsen and Markey 2011), with clocks in whole time units. The numbers of states and of choices
+are those that the suite reports. Times are seconds of the first call.
 """
 
 from __future__ import annotations
@@ -89,6 +92,93 @@ label "item" = item;
 label "free" = exit & item;
 """
 
+# The robot moves ahead with probability 4/5, or slips; each turn on the spot damages it with 1/100.
+HALL = """smg
+const int N;
+player robot [check], [go], [spin], [settle] endplayer
+player person [drift], [flee] endplayer
+global phase : [0..4];  // the robot checks itself, acts, has turned; the person drifts, flees
+module robot
+  x : [0..N-1]; y : [0..N-1]; look : [0..3]; damaged : bool;
+  [check] phase=0 & damaged -> 1/2 : (phase'=1) + 1/2 : (phase'=3);
+  [check] phase=0 & !damaged -> (phase'=1);
+  GO
+  SPIN
+  [settle] phase=2 -> 1/100 : (damaged'=true) & (phase'=3) + 99/100 : (phase'=3);
+endmodule
+module person
+  a : [0..N-1] init N-1; b : [0..N-1] init N-1;
+  [drift] phase=3 -> DRIFT + 1/2 : (phase'=4);
+  FLEE
+  [flee] phase=4 -> (phase'=0);
+endmodule
+label "saved" = x=a & y=b;
+label "damaged" = damaged;
+"""
+
+# An investor reserves a share for the next month and sells unless the market bars it, not twice in a row.
+MARKET = """smg
+const int V;
+player one [reserve_one], [wait_one], [sell_one] endplayer
+player two [reserve_two], [wait_two], [sell_two] endplayer
+player market calendar, [open], [bar_one], [bar_two], [month], [closed] endplayer
+module calendar
+  next : [0..3];  // nobody yet, an investor, the market
+  over : bool;
+  done_one : [0..2]; done_two : [0..2];  // undecided, decided, waits for the month
+  [] next=0 & done_one=0 & has_one!=2 & !over -> 99/100 : (next'=1) + 1/100 : (over'=true);
+  [] next=0 & done_two=0 & has_two!=2 & !over -> 99/100 : (next'=2) + 1/100 : (over'=true);
+  [] next=0 & (done_one>0 | has_one=2) & (done_two>0 | has_two=2) & !over -> (next'=3);
+  [wait_one] next=1 & done_one=0 -> (done_one'=1) & (next'=0);
+  [reserve_one] next=1 & done_one=0 -> (done_one'=1) & (next'=0);
+  [sell_one] next=1 & done_one=0 -> (next'=0);
+  [wait_two] next=2 & done_two=0 -> (done_two'=1) & (next'=0);
+  [reserve_two] next=2 & done_two=0 -> (done_two'=1) & (next'=0);
+  [sell_two] next=2 & done_two=0 -> (next'=0);
+  [open] next=3 & (done_one=1 | has_one=2) & (done_two=1 | has_two=2) & has_one+has_two<4
+    -> (done_one'=2) & (done_two'=2);
+  [bar_one] next=3 & done_one=1 -> (done_one'=2) & (done_two'=2);
+  [bar_two] next=3 & done_two=1 -> (done_one'=2) & (done_two'=2);
+  [month] done_one=2 & done_two=2 -> (done_one'=0) & (done_two'=0) & (next'=0);
+  [closed] next=3 & done_one=0 & done_two=0 | over -> true;
+endmodule
+module first
+  has_one : [0..2];  // nothing, a reservation, sold
+  [wait_one] has_one=0 | has_one=1 & barred_one -> (has_one'=0);
+  [reserve_one] has_one=0 | has_one=1 & barred_one -> (has_one'=1);
+  [sell_one] has_one=1 & !barred_one -> (has_one'=2);
+  [closed] has_one=2 | over -> true;
+endmodule
+module second = first [has_one=has_two, barred_one=barred_two, wait_one=wait_two, reserve_one=reserve_two,
+  sell_one=sell_two]
+endmodule
+module prices
+  barred_one : bool init true; barred_two : bool init true;
+  v : [0..V] init 5;
+  [open] true -> (barred_one'=false) & (barred_two'=false);
+  [bar_one] !barred_one -> (barred_one'=true) & (barred_two'=false);
+  [bar_two] !barred_two -> (barred_two'=true) & (barred_one'=false);
+  [month] true -> up/10 : (v'=min(v+1,cap,V)) + 1-up/10 : (v'=min(max(v-1,0),cap));
+endmodule
+module trend
+  up : [0..10] init 5;
+  [month] v<5 -> 2/3 : (up'=min(up+1,10)) + 1/3 : (up'=max(up-1,0));
+  [month] v=5 -> 1/2 : (up'=min(up+1,10)) + 1/2 : (up'=max(up-1,0));
+  [month] v>5 -> 1/3 : (up'=min(up+1,10)) + 2/3 : (up'=max(up-1,0));
+endmodule
+module ceiling
+  cap : [0..V] init V;
+  [month] true -> 1/2 : (cap'=max(cap-1,0)) + 1/2 : true;
+endmodule
+label "rich" = has_one=2 & v>5;
+rewards "profit" [sell_one] true : v; endrewards
+"""
+
+# Each processor needs at most so long for a sum and for a product; a fault stops a task with 1/10.
+TASKS = {1: ("sum", ()), 2: ("product", ()), 3: ("product", (1,)), 4: ("sum", (1, 2)), 5: ("product", (3,)),
+         6: ("sum", (4, 5))}  # fmt: skip
+LONGEST = {1: (2, 3), 2: (5, 7)}
+
 
 def dice(throws: int) -> MultiplayerGame:
     """The dice game with at most some throws of each player."""
@@ -104,6 +194,84 @@ def avoid(size: int) -> MultiplayerGame:
     return _built(AVOID, X=size, Y=size)
 
 
+def hall(size: int) -> MultiplayerGame:
+    """The robot and the person on a square grid."""
+    steps, moves = _moves("x", "y", size), _moves("a", "b", size)
+    go = []
+    for look in range(4):
+        right, back, left = ((look + i) % 4 for i in (1, 2, 3))
+        slips = [("4/5", f"{steps[look]} & "), ("1/20", "")]
+        slips += [("1/20", f"{steps[side]} & (look'={side}) & ") for side in (left, right)]
+        slips += [("1/40", f"{steps[back]} & "), ("1/40", f"{steps[back]} & (look'={back}) & ")]
+        outcomes = " + ".join(f"{p} : {move}(phase'=3)" for p, move in slips)
+        go.append(f"[go] phase=1 & look={look} -> {outcomes};")
+    spin = [f"[spin] phase=1 -> (look'={look}) & (phase'=2);" for look in range(4)]
+    text = HALL.replace("GO", "\n  ".join(go)).replace("SPIN", "\n  ".join(spin))
+    text = text.replace("DRIFT", " + ".join(f"1/8 : {move} & (phase'=0)" for move in moves))
+    text = text.replace("FLEE", "\n  ".join(f"[flee] phase=4 -> {m} & (phase'=0);" for m in moves))
+    return _built(text, N=size)
+
+
+def _moves(x: str, y: str, size: int) -> list[str]:
+    """Assignments of a step to the north, east, south and west."""
+    last = size - 1
+    return [
+        f"({y}'=min({y}+1,{last}))",
+        f"({x}'=min({x}+1,{last}))",
+        f"({y}'=max({y}-1,0))",
+        f"({x}'=max({x}-1,0))",
+    ]
+
+
+def market(highest: int) -> MultiplayerGame:
+    """Two investors and a market with shares of at most some value."""
+    return _built(MARKET, V=highest)
+
+
+def task_graph(faults: int) -> MultiplayerGame:
+    """The scheduler of six tasks against two processors with at most some faults each."""
+    commands, processors = [], []
+    for number, (kind, after) in TASKS.items():
+        ready = "".join(f" & task{i}=3" for i in after)
+        for q in LONGEST:
+            commands += [
+                f"[{kind}{q}] turn=0 & task{number}=0{ready} -> (task{number}'={q});",
+                f"[done{q}] task{number}={q} -> (task{number}'=3) & (y'=0) & (turn'=0);",
+                f"[stop{q}] task{number}={q} -> (task{number}'=0) & (turn'=0);",
+            ]
+    for q, longest in LONGEST.items():
+        lines = [f"p{q} : [0..3]; faults{q} : [0..{faults}]; x{q} : [0..{max(longest) + 1}];"]
+        for job, (kind, limit) in enumerate(zip(("sum", "product"), longest, strict=True), 1):
+            lines += [
+                f"[{kind}{q}] p{q}=0 -> (p{q}'={job}) & (x{q}'=0);",
+                f"[done{q}] turn=1 & p{q}={job} & x{q}<={limit} -> (p{q}'=0) & (x{q}'=0);",
+                f"[] turn=1 & p{q}={job} & x{q}<={limit} & faults{q}<{faults} -> 1/10 : (p{q}'=3) & (x{q}'=0) "
+                f"& (faults{q}'=faults{q}+1) + 9/10 : (faults{q}'=faults{q}+1);",
+            ]
+        lines += [
+            f"[stop{q}] turn=1 & p{q}=3 -> (p{q}'=0);",
+            f"[time] (p{q}=1 => x{q}<{longest[0]}) & (p{q}=2 => x{q}<{longest[1]}) & p{q}<3 -> "
+            f"(x{q}'=min(x{q}+1,{max(longest) + 1}));",
+        ]
+        processors.append(f"module processor{q} " + "\n  ".join(lines) + " endmodule\n")
+    started = ", ".join(f"[{kind}{q}]" for kind in ("sum", "product") for q in LONGEST)
+    ended = ", ".join(f"[{name}{q}]" for name in ("done", "stop") for q in LONGEST)
+    text = f"""smg
+player scheduler scheduler, {started} endplayer
+player environment processor1, processor2, {ended} endplayer
+module scheduler
+  turn : [0..1]; y : [0..1]; {" ".join(f"task{i} : [0..3];" for i in TASKS)}
+  [] turn=0 -> (turn'=1);
+  {" ".join(commands)}
+  [time] turn=1 | task6=3 & p1<2 & p2<2 -> (y'=1);
+endmodule
+{"".join(processors)}
+label "complete" = task6=3;
+rewards "time" [time] true : 1; endrewards
+"""
+    return _built(text)
+
+
 def _built(text: str, **constants: int) -> MultiplayerGame:
     model = build_model(read_program(text, constants))
     assert isinstance(model, MultiplayerGame)
@@ -116,8 +284,20 @@ CASES = (
     (dice, 25, 34_645, ('<<one>> Pmax=? [ F "one" ]',)),
     (dice, 50, 136_795, ('<<one>> Pmax=? [ F "one" ]',)),
     (avoid, 10, 106_524, ('<<p1>> Pmax=? [ F "exit" ]', '<<p1>> Pmax=? [ F "item" ]')),
+    (
+        hall,
+        5,
+        25_000,
+        ('<<robot>> Pmax=? [ F "saved" ]', '<<robot>> Pmax=? [ !"damaged" U "saved" ]'),
+    ),
+    (market, 10, 172_240, ('<<one>> Pmax=? [ F "rich" ]',)),
 )
-LARGE = ((avoid, 15, 480_464, ('<<p1>> Pmax=? [ F "exit" ]', '<<p1>> Pmax=? [ F "item" ]')),)
+LARGE = (
+    (hall, 10, 400_000, ('<<robot>> Pmax=? [ F "saved" ]',)),
+    (market, 20, 568_790, ('<<one>> Pmax=? [ F "rich" ]',)),
+    (task_graph, 10, 467_638, ('<<scheduler>> R{"time"}min=? [ F "complete" ]',)),
+    (avoid, 15, 480_464, ('<<p1>> Pmax=? [ F "exit" ]', '<<p1>> Pmax=? [ F "item" ]')),
+)
 
 
 def run(large: bool = False) -> Iterator[dict[str, Any]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from benchmarks.multiplayer import avoid, dice
+from benchmarks.multiplayer import avoid, dice, hall, market, task_graph
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.types import Status
@@ -346,6 +346,23 @@ def test_games_of_the_literature():
     kept = jl.solve_property(world, '<<p2>> Pmax=? [ G !"exit" ]')
     assert leaves.value[0] + kept.value[0] == pytest.approx(1, abs=1e-6)
     assert 0.85 < leaves.value[0] < 0.87
+    # Without faults the six tasks take 12 time units; the person in the hall is saved almost surely.
+    check(task_graph(0), '<<scheduler>> R{"time"}min=? [ F "complete" ]', 12)
+    check(hall(2), '<<robot>> P>=1 [ F "saved" ]', True)
+
+
+@pytest.mark.slow
+def test_sizes_and_values_of_the_literature():
+    """Those that PRISM-games reports for its models."""
+    sizes = {
+        hall: (10, 400_000, 1_040_000, 1_820_800),
+        market: (10, 172_240, 230_767, 373_669),
+        task_graph: (10, 467_638, 1_043_539, 1_267_156),
+    }
+    for make, (parameter, *counts) in sizes.items():
+        mdp = make(parameter).mdp
+        assert [mdp.num_states, mdp.num_rows, mdp.num_transitions] == counts, make
+    check(market(10), '<<one>> Pmax=? [ F "rich" ]', "0.480298005")
 
 
 @pytest.mark.parametrize(
