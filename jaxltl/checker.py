@@ -36,7 +36,8 @@ CODES = {"uint32": "I", "uint64": "Q", "double64": "d"}  # of the module array
 # or a list of an operator and its operands.
 INDEX = "version:int producer:str numbers:str question:dict claims:list members:dict counts?:dict"
 RULE = " policy?:str memory?:int next?:str"
-QUESTION = "text:str path:dict objective:str nature?:str environment?:str observations?:str" + RULE
+QUESTION = "text:str path:dict objective:str nature?:str environment?:str observations?:str"
+QUESTION += " initial?:str" + RULE
 CLAIM = "side:str bound:str values:str" + RULE
 COUNTS = "member:str method:str confidence:str assumption:str"
 PATHS = {
@@ -172,8 +173,7 @@ class UmbModel:
         self.contents, index = contents, read_json(contents, "index.json")
         system, self.annotations = index["transition-system"], index.get("annotations", {})
         version = index["format-version"], system.get("time", "discrete")
-        is_known = version == (1, "discrete") and not system.get("#observations")
-        need(is_known, f"version and time {version!s:.40}, or observations, are not covered")
+        need(version == (1, "discrete"), f"version and time {version!s:.40} are not covered")
         counts = (system[f"#{x}"] for x in ("states", "choices", "branches", "players"))
         states, rows, branches, players = counts
         target = read_numbers(contents, "branch-to-target", "uint64", branches)
@@ -194,6 +194,12 @@ class UmbModel:
         need(players < 3, "a model of more than two players is not covered")
         self.opponents = {"nature": len(ends) > 1, "environment": players > 1}
         self.num_states = states
+        self.observation: Sequence = array("Q")
+        if system.get("#observations"):
+            place = system.get("observations-apply-to"), "observation-probability-type" in system
+            need(place == ("states", False), "observations that are no numbers of states")
+            name = "observations/states/values"
+            self.observation = read_numbers(contents, name, "uint64", states)
         self.initial = self._bits("state-is-initial", [2**64 - 1] * states)
         need(True in self.initial, "no state is initial")
 
@@ -507,6 +513,7 @@ def question_text(question: dict) -> str:
     notes = [f"discount {path['discount']}"] if "discount" in path else []
     notes += ["policies see observations"] if "observations" in question else []
     notes += ["of a given policy"] if "policy" in question else []
+    notes += ["from a distribution of initial states"] if "initial" in question else []
     return f"{head}=? [ {formula_text(inner)} ]" + (f" // {', '.join(notes)}" if notes else "")
 
 
@@ -532,6 +539,13 @@ class CertificateFile:
             self.direction[player] = OTHER[objective] if word == "adversarial" else objective
         text = question_text(self.question)
         hold(self.question["text"] == text, f"the text of the question is not {text!r}")
+        kinds, size = (("observations", "uint"), ("initial", "double")), [self.model.num_states]
+        self.observation, self.weights = (
+            self.array(self.question[key], **{kind: size}) if key in self.question else array("Q")
+            for key, kind in kinds
+        )
+        fits = self.model.observation in (array("Q"), self.observation)
+        need(fits, "the question has not the observations of the model")
         self.automaton, self.trusted, self.confidence, self.unproven = None, "", "", ""
         if "counts" in index:
             self.check_counts(record(index["counts"], COUNTS))
@@ -642,7 +656,7 @@ class ClaimChecker:
                 numbers = file.array(table["policy"], uint=nodes, double=rows, rational=rows)
                 self.policy[owner] = numbers, math.prod(more)
         if "observations" in file.question and (directions[0] == ours or 0 in self.policy):
-            seen = file.array(file.question["observations"], uint=[states])
+            seen: Any = file.observation
             choices: dict[tuple, tuple] = {}
             hold(0 in self.policy, "a policy that sees observations is missing")
             starts, zeros = self.model.row_start, [0] * num_rows
@@ -829,10 +843,19 @@ class ClaimChecker:
         bound = math.inf if text == "inf" else to_fraction(text)
         relation, worst = (ge, min) if is_lower else (le, max)
         v = worst(initial, key=self.values.__getitem__)
-        why = f"{self.place(v)}: {self.values[v]!s:.40} is beyond {text:.40}"
-        hold(relation(self.values[v], bound), why)
+        value, weights = self.values[v], self.file.weights
+        if weights:
+            used = [s for s, w in enumerate(weights) if w]
+            fits = used and all(weights[s] > 0 and self.model.initial[s] for s in used)
+            need(fits, "the weights of initial states are no distribution of them")
+            pairs = [(Fraction(weights[s]), self.values[s * width + start]) for s in used]
+            is_infinite = any(x == math.inf for _, x in pairs)
+            mean = 0 if is_infinite else sum(w * Fraction(x) for w, x in pairs)
+            value = math.inf if is_infinite else mean / sum(w for w, _ in pairs)
+        hold(relation(value, bound), f"{self.place(v)}: {value!s:.40} is beyond {text:.40}")
         claimed = f"{self.file.question['text']} is {'>=' if is_lower else '<='} {text}"
-        return len(graph), f"{claimed} in every initial state{self.file.confidence}"
+        place = "" if weights else " in every initial state"
+        return len(graph), f"{claimed}{place}{self.file.confidence}"
 
 
 def verdict(path: str, limit: int = 2**30) -> tuple[int, list[str]]:

@@ -20,7 +20,7 @@ LIMITS = {
     "names at the top level": 80,
 }
 MODULE_LINES, BODY_LINES = 600, 120
-ONE_FILE = {"checker.py": 874}  # runs alone, without the package
+ONE_FILE = {"checker.py": 900}  # runs alone, without the package
 MEASURED = size.measure(PACKAGE)
 TREES = {path: (text, ast.parse(text)) for path, text in size.sources(PACKAGE).items()}
 

@@ -25,6 +25,7 @@ from jaxltl.core.language.syntax import Program
 from jaxltl.core.logic import Definitions, Property, program_definitions
 from jaxltl.core.logic.properties import parse_each
 from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values import (
     Achievable,
@@ -358,8 +359,13 @@ def text(result: PropertyResult) -> str:
 def certifiable(model: SourceModel | POMDP, result: PropertyResult) -> Certifiable:
     """The arguments of the certificate of a property's answer."""
     text = result.query.text if result.query.parsed is None else result.query.parsed.text
-    reason = "" if isinstance(result.answer, Answer) else f"{text} has no answer of one number"
-    return Certifiable(model, None, text, reason=reason)
+    answer = result.answer
+    reason = "" if isinstance(answer, Answer) else f"{text} has no answer of one number"
+    controller = answer.strategy if isinstance(answer, Answer) else None
+    if not isinstance(model, POMDP) or not isinstance(controller, FiniteMemoryPolicy):
+        return Certifiable(model, None, text, reason=reason)
+    nodes = model.num_states * (controller.next_memory.shape[1] + 1)
+    return Certifiable(model, controller, text, num_nodes=nodes)
 
 
 def summary(results: Sequence[PropertyResult]) -> str:

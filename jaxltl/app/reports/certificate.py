@@ -12,6 +12,7 @@ from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import Solution
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee
 
@@ -23,7 +24,7 @@ class Certifiable:
     """A result that has a certificate: the arguments of `write_certificate`."""
 
     model: Model | MultiplayerGame | POMDP
-    solution: Solution | DataGuarantee | None
+    solution: Solution | DataGuarantee | FiniteMemoryPolicy | None
     question: str
     options: Record = field(default_factory=dict)
     num_nodes: int = 0  # an estimate, compared with `MAX_NODES`

@@ -98,6 +98,28 @@ class POMDP:
         mask[np.asarray(self.observation)[model.host.state], model.action_number] = True
         return mask
 
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Name of each action number; empty if the states of some observations name them otherwise."""
+        model, names = self.fully_observable, [""] * self.num_actions
+        if model.action is None or not model.action_names:
+            return ()
+        for number, name in zip(model.action_number, np.asarray(model.action), strict=True):
+            text = model.action_names[name]
+            if names[number] not in ("", text):
+                return ()
+            names[number] = text
+        return tuple(names)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """The values of the observables in each observation, ``"x=1, door=0"``; empty without them."""
+        columns = [
+            [f"{name}={x}" for x in np.asarray(values).tolist()]
+            for name, values in self.observables.items()
+        ]
+        return tuple(map(", ".join, zip(*columns, strict=True)))
+
     @cached_property
     def row_of_action(self) -> Integers:
         """``int[S, A]``, the row of each action in each state; -1 where it is unavailable."""
@@ -283,9 +305,11 @@ def belief_filter(pomdp: POMDP, observation: ArrayLike, action: ArrayLike) -> Fl
 
 def policy_of_states(pomdp: POMDP, policy: FiniteMemoryPolicy) -> FiniteMemoryPolicy:
     """The policy of a POMDP's observations as one of its states; it acts alike in look-alike states."""
-    if policy.num_states != pomdp.num_observations:
+    is_policy = isinstance(policy, FiniteMemoryPolicy)
+    if not is_policy or policy.num_states != pomdp.num_observations:
         raise ValueError(
-            f"the policy is of {policy.num_states} observations, and the POMDP has {pomdp.num_observations}."
+            f"policy is {f'of {policy.num_states} states' if is_policy else type(policy).__name__}; give a "
+            f"FiniteMemoryPolicy whose states are the {pomdp.num_observations} observations."
         )
     seen = np.asarray(pomdp.observation)
     table = policy.on_host()

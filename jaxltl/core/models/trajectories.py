@@ -206,12 +206,10 @@ def rollout(
       [[0, 1, 0], [0, 1, 0]]
     """
     if isinstance(model, POMDP):
-        if not isinstance(policy, FiniteMemoryPolicy):
-            raise ValueError(
-                f"rollout: the policy is {type(policy).__name__}; in a POMDP, give a FiniteMemoryPolicy "
-                "whose states are the observations."
-            )
-        policy, model = policy_of_states(model, policy), to_padded(model.fully_observable)
+        policy, model = (
+            policy_of_states(model, cast(FiniteMemoryPolicy, policy)),
+            to_padded(model.fully_observable),
+        )
     if not isinstance(policy, FiniteMemoryPolicy):
         distribution = policy_distribution(model, policy).reshape(-1, 1, model.num_actions)
         zeros = np.zeros((len(distribution), 1), np.int32)

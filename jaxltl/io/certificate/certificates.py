@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
+from typing import cast
 
 import chex
 import numpy as np
@@ -24,7 +25,7 @@ from jaxltl.core.models.construct.lifting import project_policy
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.multiplayer import MultiplayerGame
-from jaxltl.core.models.pomdp import POMDP
+from jaxltl.core.models.pomdp import POMDP, policy_of_states
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, reward_structure
@@ -56,7 +57,7 @@ from jaxltl.io.umb.members import tar_pieces, write_gzip
 def write_certificate(
     path: str | os.PathLike[str],
     model: Model | MultiplayerGame | POMDP,
-    solution: Solution | DataGuarantee | None,
+    solution: Solution | DataGuarantee | FiniteMemoryPolicy | None,
     question: str,
     *,
     reward: Rewards | chex.Array | None = None,
@@ -72,10 +73,12 @@ def write_certificate(
     Args:
       path: the file, a UMB archive.
       model: a SparseMDP, MDP or DenseMDP, an IntervalMDP without L1 balls, or a Game of one of them,
-        whose environment is adversarial; for a formula also a Product.
+        whose environment is adversarial; for a formula also a Product. Of a POMDP, from its initial
+        belief: the bound that a controller attains, and that of policies that see the states.
       solution: of the question, such as of :func:`~jaxltl.reachability_probability`, with bounds
-        and a deterministic policy; of a formula that of :func:`~jaxltl.optimal_satisfaction`, or the
-        guarantee of :func:`~jaxltl.learn_guarantee`, with the counts of its log. None: it is solved.
+        and a deterministic policy, of a POMDP a finite-memory policy over its observations; of a formula
+        that of :func:`~jaxltl.optimal_satisfaction`, or the guarantee of :func:`~jaxltl.learn_guarantee`,
+        with the counts of its log; of a POMDP also the finite-memory policy alone. None: it is solved.
       question: in PRISM's syntax, over labels of the model: ``Pmax=? [ F "goal" ]``,
         ``Pmin=? [ "safe" U "goal" ]``, ``Pmax=? [ F<=9 "goal" ]``, ``R{"time"}min=? [ F "goal" ]``,
         ``R{"time"}max=? [ C ]``, ``R{"time"}max=? [ C<=9 ]``, ``Pmax=? [ G F "goal" ]``.
@@ -85,7 +88,8 @@ def write_certificate(
         names.
       discount: in [0, 1), of a question ``R{"name"}max=? [ C ]``: discounted instead of total reward.
       policy: the question is about this policy of the system: actions ``int[S]`` or weights
-        ``float[S, A]``, of a product ``[S, Q]`` and ``[S, Q, A]``, or with a finite memory.
+        ``float[S, A]``, of a product ``[S, Q]`` and ``[S, Q, A]``, or with a finite memory; of a POMDP
+        over its observations.
 
     Raises:
       ValueError: the model or the question is of another kind, the solution has no bounds, or they
@@ -111,43 +115,59 @@ def write_certificate(
         prop = parse_property(question)
         if isinstance(model, MultiplayerGame) and prop.coalition and not prop.universal:
             model, prop = model.game(prop.coalition), replace(prop, coalition=None)
-        if isinstance(model, MultiplayerGame | POMDP):
+        if isinstance(model, MultiplayerGame):
             raise ValueError(
-                f"{question}: certificates are written for a coalition, as in <<a>> Pmax=?, and for "
-                "models whose states are observed."
+                f"{question}: certificates are written for a coalition, as in <<a>> Pmax=?."
             )
+        pomdp = controller = None
+        if isinstance(model, POMDP):
+            pomdp, model = model, model.fully_observable
+            controller, policy = _policies(pomdp, solution, policy)
         lazy = model.mdp if isinstance(model, Game) else model
         world: Model = model
         if isinstance(lazy, Product):
             world = replace(model, mdp=lazy.mdp) if isinstance(model, Game) else lazy.mdp
         problem, formula = question_problem(world, prop, reward, discount)
         answer = solution.satisfaction if isinstance(solution, DataGuarantee) else solution
-        simple = None if policy is not None or isinstance(lazy, Product) else answer
+        answer = None if isinstance(answer, FiniteMemoryPolicy) else answer
+        is_other = policy is not None or isinstance(lazy, Product) or pomdp is not None
+        simple = None if is_other else answer
         if simple is not None and simple.product_policy is not None:
             simple = None  # its values are those of a product
         automaton = None if formula is None else to_automaton(formula)
         if isinstance(lazy, Product) and not isinstance(policy, FiniteMemoryPolicy | None):
             policy = project_policy(lazy, policy)
-        induced = None if policy is None else induced_problem(problem, policy)
+        induced = None
+        if policy is not None:
+            induced, arrays, rule = induced_problem(problem, policy)
+            problem.question.update(rule)
         problem.question["text"] = checker.question_text(problem.question)
         text = "" if automaton is None else write_hoa(automaton)
         guarantee = solution if isinstance(solution, DataGuarantee) else None
         if guarantee is not None:  # of what holds for all probabilities in the intervals
             side = "lower" if problem.directions[1] == "min" else "upper"
             problem = replace(problem, sides=(side,))
-        contents = contents_of(problem.model, problem.question, text, guarantee)
+        if pomdp is not None:
+            pomdp = replace(pomdp, fully_observable=problem.sparse)
+        written = problem.model if pomdp is None else pomdp
+        contents = contents_of(written, problem.question, text, guarantee)
         try:
             file = checker.CertificateFile(contents)
         except checker.Refusal as error:
             raise ValueError(f"the checker refuses the model or the question: {error}.") from None
+        problems = [problem]
         if induced is not None:
-            problem, arrays = induced
+            problems = [induced]
             for name, (values, shape) in arrays.items():
                 store(file, name, values, shape)
-        if automaton is not None:
-            claims = formula_claims(problem, file, automaton)
-        else:
-            claims = _claims(problem, file, solved(problem) if simple is None else simple)
+        elif controller is not None:
+            problems = _of_controller(problem, file, controller)
+        claims = []
+        for part in problems:
+            if automaton is not None:
+                claims += formula_claims(part, file, automaton)
+            else:
+                claims += _claims(part, file, solved(part) if simple is None else simple)
         if answer is not None:
             _check_initial(answer, model, claims)
     index = json.loads(contents["certificate/index.json"])
@@ -155,6 +175,38 @@ def write_certificate(
     contents["certificate/index.json"] = json.dumps(index, indent=1).encode()
     with write_bytes(path, None) as target:
         write_gzip(target, tar_pieces(list(contents.items())))
+
+
+def _policies(
+    pomdp: POMDP, solution: Solution | DataGuarantee | FiniteMemoryPolicy | None, policy: PyTree
+) -> tuple[FiniteMemoryPolicy | None, FiniteMemoryPolicy | None]:
+    """The policies of states of a solution's controller, and of a controller in the question."""
+    if policy is not None:
+        return None, policy_of_states(pomdp, policy)
+    attained = solution.policy if isinstance(solution, Solution) else solution
+    if not isinstance(attained, FiniteMemoryPolicy):
+        raise ValueError(
+            "certificates of a POMDP are written for a controller; give a solution that has one, or policy=, "
+            "a FiniteMemoryPolicy over observations."
+        )
+    return policy_of_states(pomdp, attained), None
+
+
+def _of_controller(
+    problem: Certified, file: checker.CertificateFile, controller: FiniteMemoryPolicy
+) -> list[Certified]:
+    """The chain of a controller, for the bound that it attains, and the problem for the other one."""
+    induced, arrays, rule = induced_problem(problem, controller)
+    attained, other = ("lower", "upper")[:: 1 if problem.objective == "max" else -1]
+    for name, (values, shape) in arrays.items():
+        if file.automaton is not None:  # the same in all states of the automaton
+            size = file.automaton.num_states
+            table = np.reshape(values, (shape[0], 1, *shape[1:]))
+            shape = shape[0], size, *shape[1:]
+            store(file, name, cast(Integers, np.broadcast_to(table, shape).ravel()), shape)
+        else:
+            store(file, name, values, shape)
+    return [replace(induced, sides=(attained,), rule=rule), replace(problem, sides=(other,))]
 
 
 @contextlib.contextmanager
@@ -279,7 +331,7 @@ def nested(formula: Formula) -> str | list[object]:
 
 def _claims(
     problem: Certified, file: checker.CertificateFile, solution: Solution
-) -> list[dict[str, str]]:
+) -> list[dict[str, object]]:
     """Claims of reachability and rewards, of both sides where they have bounds."""
     steps, claims, host = problem.path.get("steps"), [], problem.host
     policy, name = np.asarray(solution.policy), ""
@@ -309,7 +361,7 @@ def _claims(
 
 def _step_claim(
     problem: Certified, file: checker.CertificateFile, side: str, bound: Floats, steps: int
-) -> dict[str, str]:
+) -> dict[str, object]:
     """A claim of values of all numbers of steps, by backward induction with rounding outwards."""
     host, sign = problem.host, 1 if side == "upper" else -1
     first, inside = host.row_start[:-1], ~problem.target & problem.stay
@@ -340,15 +392,18 @@ def _step_claim(
     return proven(counted, file, side, bounds(), initial * (steps + 1) + steps)
 
 
-def _check_initial(solution: PyTree, model: Model, claims: list[dict[str, str]]) -> None:
+def _check_initial(solution: PyTree, model: Model, claims: list[dict[str, object]]) -> None:
     """Raises a ValueError if bounds of a solution contradict the claims in the initial states."""
     initial: Booleans | slice = slice(None)
-    if solution.product_policy is None:
+    if solution.product_policy is None and np.ndim(solution.lower):
         initial = np.asarray(model.initial) > 0
-    low, high = (np.asarray(x, np.float64)[initial] for x in (solution.lower, solution.upper))
+    low, high = (
+        np.array(x, np.float64, ndmin=1)[initial] for x in (solution.lower, solution.upper)
+    )
     slack = TIGHT * max([1.0, *(abs(x) for x in (low.min(), high.max()) if np.isfinite(x))])
     for claim in claims:
-        bound = float("inf") if claim["bound"] == "inf" else float(Fraction(claim["bound"]))
+        text = str(claim["bound"])
+        bound = float("inf") if text == "inf" else float(Fraction(text))
         fits = (
             bound <= high.max() + slack if claim["side"] == "lower" else bound >= low.min() - slack
         )

@@ -31,7 +31,7 @@ _OTHER = {"adversarial": "cooperative", "cooperative": "adversarial"}
 
 def formula_claims(
     problem: Certified, file: checker.CertificateFile, automaton: Automaton
-) -> list[dict[str, str]]:
+) -> list[dict[str, object]]:
     """A lower and an upper claim of the probability of a formula, with values ``[S, Q]``.
 
     Those players whose objective is that of the claim have a policy on the product, and the values

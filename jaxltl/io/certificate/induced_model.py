@@ -26,11 +26,11 @@ Arrays = dict[str, tuple[Floats | Integers, tuple[int, ...]]]
 
 def induced_problem(
     problem: Certified, policy: FiniteMemoryPolicy | Array
-) -> tuple[Certified, Arrays]:
+) -> tuple[Certified, Arrays, dict[str, object]]:
     """The question about the model that a policy of the system induces, on states with memory.
 
-    The policy is added to the question. Its memory reads a state when it is left, and its first
-    memory state is that before the initial state.
+    The arrays of the policy, and their names in a question or in a claim, follow. Its memory reads a state
+    when it is left, and its first memory state is that before the initial state.
     """
     form, host = row_form(problem.model), problem.host
     states = np.arange(host.num_states)
@@ -91,11 +91,10 @@ def induced_problem(
     if isinstance(problem.model, Game):
         model = Game(model, cast(Array, system))
     shape: tuple[int, ...] = (states.size, count) if count > 1 else (states.size,)
-    question = problem.question
-    question["policy"] = "policy"
+    rule: dict[str, object] = {"policy": "policy"}
     arrays: Arrays = {}
     if count > 1:
-        question |= {"memory": count, "next": "next"}
+        rule |= {"memory": count, "next": "next"}
         arrays["next"] = following, shape
     is_sure = bool(np.isin(weights, (0, 1)).all())
     if is_sure:
@@ -116,7 +115,7 @@ def induced_problem(
         node=np.arange(states.size * count),
         shape=shape,
     )
-    return induced, arrays
+    return induced, arrays, rule
 
 
 def solved(problem: Certified) -> Solution:

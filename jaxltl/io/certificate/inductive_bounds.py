@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import jaxltl
 from jaxltl import checker
+from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
@@ -54,6 +55,7 @@ class Certified:
     node: Integers  # int[S], of each state the node of the file's arrays
     shape: tuple[int, ...]  # of these arrays
     sides: tuple[str, ...] = ("lower", "upper")  # of the claims
+    rule: dict[str, object] = field(default_factory=dict)  # policy, memory and next of the claims
 
     @property
     def host(self) -> HostMDP:
@@ -100,18 +102,35 @@ class Certified:
 
 
 def contents_of(
-    model: Model, question: dict[str, object], automaton: str, guarantee: DataGuarantee | None
+    model: Model | POMDP,
+    question: dict[str, object],
+    automaton: str,
+    guarantee: DataGuarantee | None,
 ) -> dict[str, bytes]:
-    """Members of the archive, without claims; of a guarantee from data with its counts."""
+    """Members of the archive, without claims; of a guarantee from data with its counts.
+
+    Those of a POMDP have its observations and its initial belief.
+    """
+    known: dict[str, object] = {}
+    arrays: dict[str, tuple[str, NDArray[np.generic]]] = {}
+    if isinstance(model, POMDP):
+        arrays["observations"] = "uint32", np.asarray(model.observation, "<u4")
+        if (np.asarray(model.initial) > 0).sum() > 1:
+            arrays["initial"] = "double", np.asarray(model.initial, "<f8")
+        question |= {name: name for name in arrays}
+        question["text"] = checker.question_text(question)
+        known = {k: {"dtype": kind, "shape": [x.size]} for k, (kind, x) in arrays.items()}
     index: dict[str, object] = {
         "version": 1,
         "producer": f"jaxltl {jaxltl.__version__}",
         "numbers": checker.NUMBERS,
         "question": question,
         "claims": [{}],
-        "members": {},
+        "members": known,
     }
     members = {name: bytes(content) for name, content in umb_contents(model)}
+    for name, (_, values) in arrays.items():
+        members[f"certificate/{name}.bin"] = values.tobytes()
     if automaton:
         members["certificate/automaton.hoa"] = automaton.encode()
     if guarantee is not None:
@@ -161,9 +180,9 @@ def proven(
     bounds: Iterable[Values],
     initial: Integers | None = None,
     policy: str = "",
-) -> dict[str, str]:
+) -> dict[str, object]:
     """A claim of the first bounds that the checker accepts; its arrays are added to the file."""
-    claim, reason = {"side": side, "values": side, "bound": ""}, "no bound"
+    claim, reason = {"side": side, "values": side, "bound": "", **problem.rule}, "no bound"
     claim |= {"policy": policy} if policy else {}
     initial = problem.initial if initial is None else initial
     size = int(np.prod(problem.shape))
@@ -175,8 +194,13 @@ def proven(
             for v, x in zip(problem.node.tolist(), values, strict=True):
                 nodes[v] = x
         store(file, side, nodes, problem.shape)
-        worst = [values[s] for s in initial]
-        claim["bound"] = as_text((min if side == "lower" else max)(worst), side)
+        begins = [values[s] for s in initial]
+        bound = (min if side == "lower" else max)(begins)
+        if file.weights and all(map(np.isfinite, map(float, begins))):  # on average
+            weights = [Fraction(w) for w in file.weights if w]
+            pairs = zip(weights, map(Fraction, begins), strict=True)
+            bound = sum(w * x for w, x in pairs) / sum(weights)
+        claim["bound"] = as_text(bound, side)
         try:
             checker.ClaimChecker(file, claim).check()
         except checker.Refusal as error:

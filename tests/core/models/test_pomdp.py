@@ -6,6 +6,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.language.resolve import read_program
+from jaxltl.core.models.pomdp import policy_of_states
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.programs.partial import solve_program
 from jaxltl.core.programs.simulation import program_environment
@@ -171,3 +172,42 @@ def test_environment_shows_observations_alone(lamp):
         assert int(np.argmax(env.observe(state))) == lamp.observation[state]
     timestep = env.step(np.int32(0), np.int32(0), jax.random.key(0))
     assert int(timestep.world) in range(lamp.num_states)
+
+
+def test_controllers_are_named_saved_loaded_and_simulated(lamp, tmp_path):
+    answer = jl.values.belief_bounds(lamp, "on")
+    policy = answer.policy
+    assert set(policy.actions) == {"stay", "guess"}
+    assert policy.states[lamp.observation[0]] == "on=False, late=False"
+    jl.io.save_policy(tmp_path / "lamp.npz", policy)
+    loaded = jl.io.load_policy(tmp_path / "lamp.npz")
+    assert loaded.states == policy.states and loaded.actions == policy.actions
+    again = jl.reachability_probability(lamp, "on", policy=loaded)
+    assert float(again.lower) == pytest.approx(float(answer.value), abs=1e-6)
+    robot = loaded.controller()
+    robot.start(policy.states[lamp.observation[0]])
+    assert robot.act() in (0, 1)
+    # A rollout acts as the robot does, and reaches the label as often as is certified.
+    key = jax.random.key(0)
+    seen = jl.rollout(lamp, loaded, key, num_trajectories=2000, num_steps=6)
+    reached = np.asarray(lamp.label)[np.asarray(seen.state)].any((1, 2)).mean()
+    assert abs(reached - float(answer.value)) < 5 * 0.5 / np.sqrt(2000)
+    of_states = policy_of_states(lamp, loaded)
+    assert of_states.num_states == lamp.num_states
+    np.testing.assert_array_equal(of_states.action, loaded.action[np.asarray(lamp.observation)])
+    for wrong in (of_states, np.zeros(4, int)):
+        with pytest.raises(ValueError, match=r"whose states are the 3 observations"):
+            jl.rollout(lamp, wrong, key, num_trajectories=1, num_steps=1)
+
+
+def test_action_names_that_depend_on_the_observation_are_left_out():
+    world = jl.make_sparse(
+        [0, 2, 4],
+        [0, 1, 2, 3, 4],
+        [0, 1, 0, 1],
+        [1.0, 1, 1, 1],
+        action=[0, 1, 1, 2],
+        action_names=("a", "b", "c"),
+    )
+    pomdp = jl.models.make_pomdp(world, [0, 1])
+    assert pomdp.action_names == () and pomdp.observation_names == ()

@@ -343,6 +343,18 @@ def test_c_code_is_the_policy(tmp_path, model):
         memory = memory_by_hand(model, word)
         assert rows[:, 0].tolist() == memory
         assert rows[:, 1].tolist() == [table[s, q] for s, q in zip(word, memory, strict=True)]
+    # A controller over observations, whose memory starts and changes with what is seen.
+    rng = np.random.default_rng(1)
+    action, start, step = (rng.integers(0, n, x) for n, x in ((5, (3, 4)), (4, 3), (4, (3, 4))))
+    controller = FiniteMemoryPolicy(action, start, step)
+    found = run_c(tmp_path, controller, words, [0] * 6).reshape(20, 6, 2)
+    for word, rows in zip(words.tolist(), found, strict=True):
+        robot = controller.controller()
+        robot.start(word[0])
+        for i, row in enumerate(rows.tolist()):
+            if i:
+                robot.update(word[i])
+            assert row == [int(robot.at.memory), robot.act()]
     weight = np.array([0.0, 0.25, 0.0, 0.75, 0.0])
     policy = FiniteMemoryPolicy(weight[None, None], np.zeros(1, int), np.zeros((1, 1), int))
     numbers = [0, 2**30 - 1, 2**30, 2**32 - 2, 2**32 - 1, *range(0, 2**32, 2**20)]

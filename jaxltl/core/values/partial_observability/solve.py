@@ -165,9 +165,12 @@ def _solution(problem: BeliefProblem, bounds: BeliefBounds, tolerance: float) ->
         np.isfinite(lower) and upper - lower <= tolerance * (abs(upper) if problem.is_reward else 1)
     ) or lower == upper
     status = Status.CONVERGED if done else Status.MAX_STEPS
+    pomdp, policy = problem.pomdp, bounds.policy
+    if policy is not None:
+        policy = policy.replace(actions=pomdp.action_names, states=pomdp.observation_names)
     parts: dict[str, Array] = {
         "value": np.float64(value),
-        "policy": bounds.policy,
+        "policy": policy,
         "lower": np.float64(lower),
         "upper": np.float64(upper),
         "residual": np.float64(upper - lower),
