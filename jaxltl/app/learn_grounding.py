@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.algos import grounding
 from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.grounding.problem import require_task
-from jaxltl.app.files.demonstrations import read_demonstrations
+from jaxltl.io.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file

@@ -15,6 +15,7 @@ from .adapters.jumanji import from_jumanji as from_jumanji
 from .adapters.minigrid import from_navix as from_navix
 from .adapters.pgx import from_pgx as from_pgx
 from .adapters.minigrid import from_xminigrid as from_xminigrid
+from .by_name import make as make
 from .flat_world import flat_world as flat_world
 from .gridworld import gridworld as gridworld, partial_gridworld as partial_gridworld
 from .gymnasium_runner import run_policy as run_policy

@@ -6,6 +6,11 @@ from .cassandra import (
 from .certificate.certificates import write_certificate as write_certificate
 from .certificate.storm_text import write_storm_certificate as write_storm_certificate
 from .colored_world import read_world as read_world, write_world as write_world
+from .demonstrations import (
+    NamedWorld as NamedWorld,
+    named_map as named_map,
+    read_demonstrations as read_demonstrations,
+)
 from .drn.drn import read_drn as read_drn, write_drn as write_drn
 from .hoa.hoa import (
     read_hoa as read_hoa,

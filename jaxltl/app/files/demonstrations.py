@@ -1,155 +1,28 @@
-"""Demonstrations of task files: read from JSON, or simulated."""
+"""Demonstrations of task files: of a file, or simulated."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeGuard
 
 import jax
 import numpy as np
 
-from jaxltl.core.validation import errors_in
-from jaxltl.app.files.schema import off_map, read_bytes
 from jaxltl.app.files.task import SyntheticTable
 from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import MappedModel
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models.construct.counts import listed
 from jaxltl.core.models import Product, Trajectories, make_trajectories, project_trajectories
 from jaxltl.core.types import Solution
+from jaxltl.io.demonstrations import read_demonstrations
 
 _STEP_BYTES = 128  # of a simulated step, measured while demonstrations are made and checked
 _LARGEST_BYTES = 4e9
 
 
 def load_demonstrations(task: MlirlFile, world: MappedModel) -> Trajectories:
-    """The demonstrations of a task's file; see :func:`read_demonstrations`."""
+    """The demonstrations of a task's file; see :func:`~jaxltl.io.read_demonstrations`."""
     assert task.demonstrations.file is not None
     return read_demonstrations(task.path.parent / task.demonstrations.file, world)
-
-
-def read_demonstrations(path: Path, world: MappedModel) -> Trajectories:
-    """Demonstrations of a JSON file, ``{"demonstrations": [...]}``.
-
-    Each is an object with ``"cells"``, ``[row, column]`` counted from 1 at the top left (or
-    ``"states"``, numbers from 0), and ``"actions"``, names or numbers from 0, one per cell; a final
-    cell may have no action. In the world of a log, states and actions have the names of the log.
-    """
-    try:
-        data = json.loads(read_bytes(path, "the demonstrations"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: this is not JSON: {error}") from None
-    demonstrations = data.get("demonstrations") if isinstance(data, dict) else None
-    if not isinstance(demonstrations, list) or not demonstrations:
-        raise ValueError(
-            f'{path}: expected {{"demonstrations": [...]}} with at least one demonstration.'
-        )
-    sequences = []
-    for number, one in enumerate(demonstrations, start=1):
-        with errors_in(f"{path}: demonstration {number}"):
-            sequences.append(_read_demonstration(one, world))
-    return make_trajectories(world.mdp, sequences)
-
-
-def _read_demonstration(one: Any, world: MappedModel) -> list[tuple[int, int]]:
-    keys = set(one) if isinstance(one, dict) else set()
-    if keys not in ({"cells", "actions"}, {"states", "actions"}):
-        content = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
-        raise ValueError(
-            f': expected {{"cells": [[row, column], ...], "actions": [...]}}, or "states" in place '
-            f'of "cells"; {content}.'
-        )
-    kind = "cells" if "cells" in keys else "states"
-    places, names = one[kind], one["actions"]
-    if not isinstance(places, list) or not isinstance(names, list) or not names:
-        raise ValueError(f": {kind} and actions must be lists, with at least one action.")
-    if len(places) - len(names) not in (0, 1):
-        raise ValueError(
-            f": {len(places)} {kind} and {len(names)} actions; give one action for each of the "
-            f"{kind}, except perhaps the last."
-        )
-    read = _read_cell if kind == "cells" else _read_state
-    states, actions = _each_step(read, places, world), _each_step(_read_action, names, world)
-    _check_steps(states, actions, world)
-    return list(zip(states, actions, strict=False))
-
-
-def _check_steps(states: list[int], actions: list[int], world: MappedModel) -> None:
-    """Raises ValueError for an unavailable action, or a successor of probability 0."""
-    available = np.asarray(world.mdp.available)
-    successor, probability = np.asarray(world.mdp.successor), np.asarray(world.mdp.probability)
-    for t, (s, a) in enumerate(zip(states, actions, strict=False)):
-        step = f", step {t + 1}: {world.actions[a]!r} in {world.position_text(s)}"
-        if not available[s, a]:
-            options = ", ".join(np.array(world.actions)[available[s]])
-            raise ValueError(f"{step} is not available there; available are {options}.")
-        reached = np.unique(successor[s, a][probability[s, a] > 0])
-        if t + 1 < len(states) and states[t + 1] not in reached:
-            options = " or ".join(world.position_text(r) for r in reached)
-            raise ValueError(
-                f"{step} cannot lead to {world.position_text(states[t + 1])}, which comes next; it "
-                f"leads to {options}."
-            )
-
-
-def _each_step(
-    read: Callable[[object, MappedModel], int], values: list[object], world: MappedModel
-) -> list[int]:
-    numbers = []
-    for step, value in enumerate(values, start=1):
-        with errors_in(f", step {step}: "):
-            numbers.append(read(value, world))
-    return numbers
-
-
-def _is_int(value: object) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _read_cell(value: object, world: MappedModel) -> int:
-    if world.shape is None:
-        raise ValueError('the model has no map, so give "states" instead of "cells".')
-    if not (isinstance(value, list) and len(value) == 2 and all(map(_is_int, value))):
-        raise ValueError(f"the cell is {value!r}; it must be [row, column].")
-    row, column = value
-    rows, columns = world.shape
-    if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(f"the cell [{row}, {column}] is {off_map(world.shape)}")
-    return (row - 1) * columns + column - 1
-
-
-def _read_state(value: object, world: MappedModel) -> int:
-    if world.logged is not None:
-        return _read_name("state", value, world.logged.states)
-    last = world.mdp.num_states - 1
-    if not _is_int(value) or not 0 <= value <= last:
-        raise ValueError(f"the state is {value!r}; states are 0 to {last}.")
-    return int(value)
-
-
-def _read_name(kind: str, value: object, names: tuple[str, ...]) -> int:
-    """The index of a name of a log; a name that is a number may be given as one."""
-    name = str(value) if _is_int(value) else value
-    if name in names:
-        return names.index(name)
-    raise ValueError(f"the {kind} {value!r} is not in the log, which has {listed(names)}.")
-
-
-def _read_action(value: object, world: MappedModel) -> int:
-    if world.logged is not None:
-        return _read_name("action", value, world.actions)
-    if value in world.actions:
-        return world.actions.index(value)
-    if _is_int(value) and 0 <= value < len(world.actions):
-        return int(value)
-    raise ValueError(
-        f"the action {value!r} is unknown; the actions are {', '.join(world.actions)}."
-    )
-
-
-# --- simulated ------------------------------------------------------------------------------
 
 
 def synthetic_demonstrations(

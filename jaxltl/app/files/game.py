@@ -15,6 +15,7 @@ from typing import Annotated as TomlKey
 import numpy as np
 
 from jaxltl.core.validation import errors_in
+from jaxltl.io.demonstrations import off_map
 from jaxltl.io.padded_models import read_padded
 from jaxltl.app.files.schema import (
     Count,
@@ -24,7 +25,6 @@ from jaxltl.app.files.schema import (
     TomlTable,
     Text,
     Unit,
-    off_map,
     read_map,
     Meta,
     table,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.app.files.demonstrations import read_demonstrations
+from jaxltl.io.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_todirl import TodirlFile, WorldTable, map_file
 from jaxltl.app.files.worlds import MappedModel, grid_options

@@ -199,11 +199,6 @@ def read_map(path: Path, entry: str | Mapping[str, str]) -> str:
     )
 
 
-def off_map(shape: Sequence[int]) -> str:
-    """End of an error about a cell that is not on a map."""
-    return f"off the map, which has rows 1 to {shape[0]} and columns 1 to {shape[1]}."
-
-
 # --- conversion -----------------------------------------------------------------------------
 
 

@@ -17,33 +17,18 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
-from jaxltl.app.wording import Record, position_text, state_position
+from jaxltl.app.wording import Record
+from jaxltl.io.demonstrations import NamedWorld
 
 if TYPE_CHECKING:
     from jaxltl.app.certify import Logged
 
 
 @dataclass(frozen=True)
-class MappedModel:
-    """A model, with its map if it has one."""
+class MappedModel(NamedWorld):
+    """A world of a task file."""
 
-    mdp: MDP  # the model
-    cells: np.ndarray | None  # str[rows, columns], or None for a model without a map
-    actions: tuple[str, ...]  # A names
     logged: Logged | None = None  # the log that the model was estimated from, or None
-
-    @property
-    def shape(self) -> tuple[int, ...] | None:
-        """Rows and columns of the map, if there is one."""
-        return None if self.cells is None else self.cells.shape
-
-    def position(self, state: int) -> Record:
-        """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
-        position = state_position(state, self.shape)
-        return position if self.logged is None else {**position, "name": self.logged.states[state]}
-
-    def position_text(self, state: int) -> str:
-        return position_text(self.position(state))
 
 
 def grid_options(table: GridTable) -> Record:
@@ -60,7 +45,7 @@ def load_world(path: Path, table: WorldTable) -> MappedModel:
             from jaxltl.app.certify import load_logged
 
             mdp, actions, logged = load_logged(path.parent, table)
-            return MappedModel(mdp, None, actions, logged)
+            return MappedModel(mdp, None, actions, logged.states, logged)
         if table.model is not None:
             from jaxltl.io.padded_models import read_padded
 

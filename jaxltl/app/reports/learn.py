@@ -24,7 +24,8 @@ from jaxltl.app.reports.page import (
     number,
     probability,
 )
-from jaxltl.app.wording import Record, Result, counted, position_text
+from jaxltl.app.wording import Record, Result, counted
+from jaxltl.io.demonstrations import position_text
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, restrict
 from jaxltl.core.models.construct.lifting import memory_along

@@ -20,7 +20,8 @@ from markupsafe import Markup
 from jaxltl.app.reports.certificate import certificate_lines
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.explorer import START, Curves, Explorer, ReportTrajectory
-from jaxltl.app.wording import Record, Result, counted, position_text, state_position
+from jaxltl.app.wording import Record, Result, counted
+from jaxltl.io.demonstrations import position_text, state_position
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
