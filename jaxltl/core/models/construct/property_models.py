@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.array_types import Integers
 from jaxltl.core.logic.good_prefixes import prefix_automaton, state_formulas
 from jaxltl.core.logic.labels import distinct_rows
 from jaxltl.core.logic.ltl import Formula, negation_normal_form
@@ -20,7 +20,6 @@ from jaxltl.core.models.number_source import NumberSource, Part, RationalNumbers
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.exact.model import ONE, ZERO, ExactMDP
-from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.sparse.rows import row_entries
 
@@ -162,15 +161,3 @@ def _pairs(starts: Integers) -> list[tuple[int, int]]:
 
 def _taken(part: Part, index: Integers) -> Part:
     return None if part is None else [part[i] for i in index.tolist()]
-
-
-def fair_reachability(model: SparseMDP, target: Booleans) -> SparseMDP:
-    """The model with the label :data:`LOST` in the states that cannot reach a target.
-
-    Under strong fairness, where each choice of a state that is visited for ever is taken for ever, almost
-    all runs reach the target or such a state (Baier and Kwiatkowska 1998).
-    """
-    host = model.host
-    able = backward_reachable(host, target, np.ones(host.num_rows, bool))
-    label = np.column_stack([np.asarray(model.label), ~able])
-    return replace(model, label=label, propositions=(*model.propositions, LOST))

@@ -15,15 +15,13 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.array_types import Integers
-from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.bounded import Earned
 from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.good_prefixes import is_plain_reachability
-from jaxltl.core.logic.ltl import Formula, is_syntactically_cosafe
+from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property, parse_property
 from jaxltl.core.models.construct.property_models import (
     END,
-    LOST,
-    fair_reachability,
     prefix_product,
     transition_graph,
 )
@@ -64,6 +62,7 @@ from jaxltl.core.values.properties.answers import (
 )
 from jaxltl.core.values.properties.discounting import rounding_of_discount, without_discount
 from jaxltl.core.values.properties.expressions import expression_bounds
+from jaxltl.core.values.properties.fairness import over_fair_strategies
 from jaxltl.core.values.properties.model_query import ModelQuery, QueryResult
 from jaxltl.core.values.properties.partially_observable import solve_partially_observable
 from jaxltl.core.values.properties.several_objectives import solve_multi_objective
@@ -118,8 +117,8 @@ def solve_property(
       exact: True for values in rational arithmetic, by policy iteration in fractions, of chains and MDPs of
         moderate size; probabilities and rewards of a program are those of its text, so that 0.1 is a tenth.
       fair: True for probabilities of MDPs over fair strategies alone, which take each choice of a state
-        infinitely often if they visit it infinitely often, in the product with the formula's automaton. Of
-        co-safe and safe formulas; rewards have no such option.
+        infinitely often if they visit it infinitely often, in the product with the formula's automaton;
+        rewards and quantifiers have no such option.
 
     Returns:
       :class:`Answer`. If narrower bounds do not decide a threshold either, `holds` is None and the
@@ -183,6 +182,8 @@ def solve_property(
         with contextlib.suppress(ValueError):  # a model that is too large
             return _value(source, prop, states, tolerance, partial(again, exact=True))
         return answer
+    if fair and prop.operator in ("E", "A", "multi") and not graph.is_chain:
+        raise ValueError(f"{prop.text}: fair=True is for P; leave it out.")
     if prop.operator in ("E", "A"):
         objective: Literal["max", "min"] = "max" if prop.operator == "E" else "min"
         simple = replace(prop, operator="P", objective=objective, definitions=())
@@ -198,7 +199,7 @@ def solve_property(
     if prop.operator == "multi":
         return _several(chosen, prop, places is None, tolerance)
     if fair and not graph.is_chain:
-        product, start, prop = _fair(chosen, prop, states)
+        product, start, prop = over_fair_strategies(chosen, prop, states)
         answer = _of_model(product, prop, start, width(requested_width(tolerance)), exact)
         return answer._replace(states=states, strategy=None)
     path = prop.path if prop.operator in ("R", "T") else None
@@ -207,32 +208,6 @@ def solve_property(
         simple = replace(prop, path=_AT_END, definitions=())
         return again(larger, simple, states=start)._replace(states=states, strategy=None)
     return _of_model(chosen, prop, states, width(requested_width(tolerance)), exact)
-
-
-def _fair(
-    model: CheckableModel, prop: Property, states: np.ndarray
-) -> tuple[SparseMDP, np.ndarray, Property]:
-    """The property over all strategies of a product that has the value of one over fair strategies."""
-    path = unfolded(prop.path) if isinstance(prop.path, Bounded) else prop.path
-    if prop.operator != "P" or not isinstance(path, Formula) or not isinstance(model, SparseMDP):
-        raise ValueError(
-            f"{prop.text}: fair=True is for probabilities of formulas in MDPs without intervals and players."
-        )
-    direction: Literal["max", "min"] = "max" if aim_of(model, prop).policy == "max" else "min"
-    proven = path if is_syntactically_cosafe(path) else ~path
-    if not is_syntactically_cosafe(proven):
-        raise ValueError(
-            f"{prop.text}: fair=True is for formulas that a prefix proves or refutes, such as F and G."
-        )
-    larger, start = prefix_product(model, proven, states, prop.text)
-    assert isinstance(larger, SparseMDP)
-    end, lost = (Formula("ap", proposition=name) for name in (END, LOST))
-    larger = fair_reachability(larger, states_satisfying(larger, end))
-    # The limits of fair strategies decide: all runs end in END or LOST.
-    reached = end if proven is path else lost
-    missed = lost if proven is path else end
-    simple = Formula("F", (reached,)) if direction == "max" else Formula("G", (~missed,))
-    return larger, start, replace(prop, path=simple, objective=direction, definitions=())
 
 
 def _of_model(

@@ -496,6 +496,15 @@ FAIR = {
     "P<=0 [ G x<2 ]": (False, True),
     "filter(count, P>=1 [ F x=2 ])": (1, 3),
     "1 - Pmin=? [ F x=1 ]": (1, 0.5),
+    "Pmin=? [ G F x=2 ]": (0, 1),
+    "Pmax=? [ G F x=0 ]": (1, 0),
+    "Pmax=? [ F G x=0 ]": (1, 0),
+    "Pmin=? [ F G x=2 ]": (0, 1),
+    "Pmin=? [ (F x=1) & (F G x=2) ]": (0, 0.5),
+    "Pmax=? [ (G F x=0) | (G F x=1) ]": (1, 0),
+    "P<=0 [ G F x=1 ]": (False, True),
+    "Pmin=? [ F[1,2] x=2 ]": (0, 0),
+    "Pmin=? [ F>=2 x=2 ]": (0, 1),
 }
 
 
@@ -509,9 +518,14 @@ def test_fair_strategies_take_all_choices_for_ever(fair):
         expected = values[fair]
         got = actual.value if actual.holds is None else actual.holds
         assert got == (pytest.approx([expected]) if actual.holds is None else [expected]), text
-    for text in ("Pmin=? [ G F x=0 ]", "Rmin=? [ F x=2 ]"):
+    for text in (
+        "E [ G x=0 ]",
+        "Rmin=? [ F x=2 ]",
+        "multi(Pmax=? [ F x=2 ])",
+        "Pmin=? [ F{1}<=2 x=2 ]",
+    ):
         if fair:
-            with pytest.raises(ValueError, match="fair=True is for"):
+            with pytest.raises(ValueError, match="fair=True"):
                 solve_property(model, parse_properties(text, known)[0], fair=True)
 
 
