@@ -502,6 +502,7 @@ def test_check(write):  # noqa: F811
                 "one_demonstration",
                 "patrol_two",
                 "patrol_anywhere",
+                "two_rooms",
                 "unlabelled_delivery",
             )
         ),

@@ -6,8 +6,16 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import attrs
 
-from jaxltl.algos import cce, mlirl, ppo, todirl, trust_region
-from jaxltl.app.files import game, schema, task_environment, task_grounding, task_mlirl, task_todirl
+from jaxltl.algos import cce, finite_state_controllers, mlirl, ppo, todirl, trust_region
+from jaxltl.app.files import (
+    game,
+    schema,
+    task_controller,
+    task_environment,
+    task_grounding,
+    task_mlirl,
+    task_todirl,
+)
 from jaxltl.app.files.schema import File, TomlTable
 
 
@@ -44,6 +52,13 @@ PAGES = {
         "a policy in each map.",
         "unlabelled_delivery.toml",
     ),
+    "task-file-controller": FilePage(
+        "Task files: partial observability",
+        task_controller.ControllerFile,
+        "``jaxltl learn`` reads a map, what a robot sees of it, and a formula, learns a finite-state "
+        "controller, and bounds :doc:`what any controller attains </docs/partial-observability>`.",
+        "two_rooms.toml",
+    ),
     "task-file-environment": FilePage(
         "Task files: environments",
         task_environment.EnvironmentFile,
@@ -64,6 +79,7 @@ PAGES = {
 HPARAMS: dict[type[TomlTable], Any] = {
     task_mlirl.LearnerTable: mlirl.Hparams,
     task_todirl.LearnerTable: todirl.Hparams,
+    task_controller.ControllerTable: finite_state_controllers.Hparams,
     task_environment.PpoTable: ppo.Hparams,
     task_environment.CceTable: cce.Hparams,
     task_environment.CpoTable: trust_region.Hparams,

@@ -6,8 +6,10 @@ chain of states and memory states,
 
     v(m, s) = sum_a pi(a | m, o(s)) (g(s, a) + discount sum_t P(t | s, a) sum_n eta(n | m, o(t)) v(n, t)),
 
-which is solved, and differentiated implicitly. Many starts are a ``vmap`` over keys. The learned value
-certifies nothing; ``reachability_probability(pomdp, target, policy=...)`` or ``total_reward`` of the policy do.
+which is solved, and differentiated implicitly; before the first observation the memory state is 0. Many
+starts are a ``vmap`` over keys. The learned value certifies nothing;
+``reachability_probability(pomdp, target, policy=...)`` or ``total_reward`` of the policy do, and
+:func:`learn_formula` learns and certifies a controller for a formula.
 
 Example: a hidden coin; one guess, right in state 2. A look, which costs nothing, shows the coin.
   >>> import jax, numpy as np, jaxltl as jl
@@ -31,7 +33,7 @@ Example: a hidden coin; one guess, right in state 2. A look, which costs nothing
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -41,22 +43,36 @@ import optax
 from jax import lax
 
 from jaxltl.algos.common import learner, optimizers
+from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
 from jaxltl.algos.common.settings import Number, RunState, static, traced
 from jaxltl.core import struct
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Array, Key
 from jaxltl.core.models.sparse import Reward, choice_reward
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
+from jaxltl.core.types import AtInitial, Solution
 from jaxltl.core.validation import Range, choice, require_in_range
+from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.linear import solve_linear
+from jaxltl.core.values.partial_observability.chains import controlled_chain
 from jaxltl.core.values.partial_observability.problem import (
     BeliefProblem,
     discounted_problem,
     reach_problem,
     reward_problem,
 )
-from jaxltl.core.values.partial_observability.solve import target_states
+from jaxltl.core.values.partial_observability.reduction import reduced_controller
+from jaxltl.core.values.partial_observability.solve import (
+    belief_bounds,
+    controller_value as value_of_policy,
+    target_states,
+    task_pomdp,
+)
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+
+_CERTIFIED = 5  # starts whose controllers are certified
 
 
 @struct.dataclass
@@ -257,7 +273,7 @@ def controller_value(problem: Problem, parameters: ControllerLogits) -> jax.Arra
 
     solved = lax.stop_gradient(solve_linear(residual, earned))
     value = implicit(operator, solved)
-    return problem.initial_gain + jnp.sum(problem.initial * value[0])
+    return problem.initial_gain + jnp.sum(problem.initial * jnp.sum(keep[0].T * value, 0))
 
 
 def _init(key: Key, problem: Problem, hparams: Hparams) -> State:
@@ -348,11 +364,180 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 def policy(state: State, problem: Problem, hparams: Hparams) -> FiniteMemoryPolicy:
     """The finite-memory policy over observations: random actions, and the likeliest memory updates.
 
-    ``int[O, M]`` updates on entry, from memory state 0; on the host.
+    ``int[O, M]`` updates on entry, from memory state 0 before the first observation; on the host.
     """
     del hparams
     logits = jnp.where(problem.available, state.parameters.action, -jnp.inf)
     action = np.asarray(jax.nn.softmax(logits), np.float64).swapaxes(0, 1)
     action = action / action.sum(-1, keepdims=True)
     update = np.asarray(state.parameters.update).argmax(-1).T.astype(np.int32)
-    return FiniteMemoryPolicy(action, np.zeros(len(action), np.int32), update)
+    return FiniteMemoryPolicy(action, update[:, 0].copy(), update)
+
+
+@dataclass(frozen=True)
+class CertifiedController:
+    """A controller for a formula, with bounds.
+
+    Attributes:
+      policy: the best controller of at most M memory states, over observations.
+      satisfaction: its satisfaction probability at the initial belief, certified.
+      explored: bounds of all controllers by explored beliefs, with the controller of the lower bound.
+      reduced: that controller with merged memory states, perhaps of more than M.
+      fully_observable: the optimum of policies that see the states, ``Solution`` of the model.
+      start: of the policy: ``"random"`` logits, ``"beliefs"``, a start at the explored controller, or
+        ``"explored"``, that controller itself.
+      history: metrics ``[T, N]`` of all starts by name, and ``step`` ``[T]``.
+
+    >>> CertifiedController.__dataclass_fields__["start"].name
+    'start'
+    """
+
+    policy: FiniteMemoryPolicy
+    satisfaction: AtInitial
+    explored: Solution
+    reduced: FiniteMemoryPolicy
+    fully_observable: AtInitial
+    start: str
+    history: dict[str, np.ndarray]
+
+
+def learn_formula(
+    key: Key,
+    pomdp: POMDP,
+    formula: FormulaLike,
+    hparams: Hparams,
+    *,
+    num_starts: int = 16,
+    num_steps: int = 200,
+    discount: float = 1.0,
+    tolerance: float = 1e-3,
+    max_beliefs: int = 2000,
+    max_seconds: float | None = None,
+    options: ChunkOptions | None = None,
+) -> CertifiedController:
+    """A finite-state controller for a co-safe or safe formula, learned from several starts and certified.
+
+    Beliefs are explored for both bounds. Their controller, if it can be reduced to the memory of
+    `hparams`, is one start of the policy gradient; the other starts are random. The five best of them
+    are certified with random and with likeliest actions. Of all controllers within the tolerance of
+    the best value, the one of fewest expected steps to a decision is kept.
+
+    Args:
+      key: random key.
+      pomdp: a concrete POMDP.
+      formula: co-safe or safe; its automaton is hidden, and the memory has to keep what matters of it.
+      hparams: of the learner; ``num_memory`` bounds the memory of the policy.
+      num_starts, num_steps: number of starts, and gradient steps of each.
+      discount: of steps, for the learner of a co-safe formula alone: below 1 it favours quick controllers.
+      tolerance, max_beliefs, max_seconds: of :func:`~jaxltl.core.values.partial_observability.solve.belief_bounds`.
+      options: reports, and a checkpoint from which a run resumes.
+
+    Returns:
+      :class:`CertifiedController`.
+
+    Raises:
+      ValueError: another formula, or one with unknown propositions.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> rooms = jl.envs.partial_gridworld("a . . g . . x", 1, hidden=["g", "x"], initial="a")
+      >>> learned = learn_formula(jax.random.key(0), rooms, "!x U g", Hparams(), num_starts=2, num_steps=3)
+      >>> round(float(learned.satisfaction.lower), 6)
+      1.0
+    """
+    joint, final, automaton = task_pomdp(pomdp, formula)
+    if final is None:
+        raise ValueError(
+            f"learn_formula: {formula} is neither co-safe nor safe; give such a formula, or learn with "
+            "make_problem and evaluate by solve_property(controlled_chain(pomdp, policy), ...)."
+        )
+    objective, target = ("min", ~final) if automaton.is_safety else ("max", final)
+    explored = belief_bounds(
+        joint,
+        target,
+        objective=objective,
+        tolerance=tolerance,
+        max_beliefs=max_beliefs,
+        max_seconds=max_seconds,
+    )
+    decided = np.ones(joint.num_states, bool)
+    decided[reach_problem(joint, target, None, maximize=objective == "max").state] = False
+    reduced = reduced_controller(joint, _controller_of(explored), decided=decided)
+    require_in_range("discount", discount, Range(0, 1, open_below=True))
+    problem = make_problem(joint, target, objective=objective)
+    if not automaton.is_safety:
+        problem = replace(problem, discount=jnp.asarray(discount, problem.gain.dtype))
+    keys = jax.random.split(key, num_starts)
+    states = jax.vmap(lambda one: init(one, problem, hparams))(keys)
+    fits = reduced.next_memory.shape[1] <= hparams.num_memory
+    if fits:
+        logits = _padded_logits(logits_of(reduced, problem), hparams.num_memory)
+        first = start_at(keys[0], logits, problem, hparams)
+        states = jax.tree.map(lambda x, y: x.at[0].set(y), states, first)
+    chunks = run_in_chunks(
+        step,
+        states,
+        problem,
+        hparams,
+        num_steps=num_steps,
+        options=replace(options or ChunkOptions(), lanes=True),
+    )
+    history = {"step": chunks.step, **vars(chunks.metrics)}
+    last = problem.sign * np.where(
+        np.isfinite(history["value"][-1]), history["value"][-1], -problem.sign
+    )
+    candidates = [(reduced, "explored")] if fits else []
+    for lane in np.argsort(-last, kind="stable")[:_CERTIFIED].tolist():
+        one = policy(jax.tree.map(lambda x, i=lane: x[i], chunks.state), problem, hparams)
+        likeliest = one.replace(action=np.eye(one.num_actions)[one.action.argmax(-1)])
+        name = "beliefs" if fits and lane == 0 else "random"
+        candidates += [(one, name), (likeliest, name)]
+    small = [reduced_controller(joint, one, decided=decided) for one, _ in candidates]
+    values = [_satisfaction(pomdp, one, formula) for one in small]
+    lower = np.array([float(x.lower) for x in values])
+    slow = [
+        _expected_steps(joint, one, decided) if value >= lower.max() - tolerance else np.inf
+        for one, value in zip(small, lower, strict=True)
+    ]
+    best = (
+        int(np.lexsort((-lower, np.array(slow)))[0])
+        if np.isfinite(slow).any()
+        else int(lower.argmax())
+    )
+    return CertifiedController(
+        policy=small[best],
+        satisfaction=values[best],
+        explored=complement_event(explored) if automaton.is_safety else explored,
+        reduced=reduced,
+        fully_observable=optimal_satisfaction(pomdp.fully_observable, formula).at_initial,
+        start=candidates[best][1],
+        history=history,
+    )
+
+
+def _padded_logits(parameters: ControllerLogits, num_memory: int) -> ControllerLogits:
+    """Logits with more memory states, which no update likes to enter."""
+    more = num_memory - parameters.action.shape[0]
+    action = jnp.pad(parameters.action, ((0, more), (0, 0), (0, 0)))
+    update = jnp.pad(parameters.update, ((0, more), (0, 0), (0, 0)))
+    least = parameters.update.min()
+    return ControllerLogits(
+        action, jnp.pad(update, ((0, 0), (0, 0), (0, more)), constant_values=least)
+    )
+
+
+def _controller_of(solution: Solution) -> FiniteMemoryPolicy:
+    """The controller of a solution of a POMDP."""
+    assert isinstance(solution.policy, FiniteMemoryPolicy)
+    return solution.policy
+
+
+def _expected_steps(joint: POMDP, one: FiniteMemoryPolicy, decided: Array) -> float:
+    """Expected steps of a controller until a decided state, an upper bound; perhaps infinite."""
+    steps = np.ones(joint.num_states)
+    return float(value_of_policy(joint, one, decided, reward=steps, tolerance=1e-3).upper)
+
+
+def _satisfaction(pomdp: POMDP, one: FiniteMemoryPolicy, formula: FormulaLike) -> AtInitial:
+    chain = controlled_chain(pomdp, one)
+    return optimal_satisfaction(chain, formula).at_initial

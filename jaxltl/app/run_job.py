@@ -35,6 +35,7 @@ _LINE_SECONDS = 10.0  # between lines of progress in a pipe
 _JOBS = {  # the module of each kind of job, and that of its task file
     "environment": ("learn_environment", "task_environment", "EnvironmentFile"),
     "grounding": ("learn_grounding", "task_grounding", "GroundingFile"),
+    "controller": ("learn_controller", "task_controller", "ControllerFile"),
     "todirl": ("learn_todirl", "task_todirl", "TodirlFile"),
     "mlirl": ("learn", "task_mlirl", "MlirlFile"),
 }

@@ -25,6 +25,11 @@ from .live import (
     live_map as live_map,
     playback as playback,
 )
+from .machines import (
+    controller as controller,
+    live_controller as live_controller,
+    windows as windows,
+)
 from .maps import (
     grid as grid,
     strategies as strategies,

@@ -50,6 +50,50 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     table = on_the_host(automaton)
     doomed = layout.rejecting(table)
     graph = layout.arrange(table.delta, int(table.initial), doomed, edge_texts(table, doomed))
+    final = table.final if table.has_final_states else doomed & False
+    names = table.state_names or ("",) * len(table.delta)
+    return live_graph(
+        graph,
+        name,
+        int(table.initial),
+        [
+            (
+                f"state{' final' * bool(final[q])}{' doomed' * bool(doomed[q])}",
+                f"memory {q}: {text}" if text else f"memory {q}",
+            )
+            for q, text in enumerate(names)
+        ],
+        # Accepting transitions are the first of two curves.
+        lambda key: (
+            f"edge{' doomed' * bool(doomed[key[1]])}"
+            f"{' accepting' * (table.marked_priority is not None and key[2] == 0)}"
+        ),
+        f"An automaton of {len(table.delta)} states; a table follows",
+    )
+
+
+def live_graph(
+    graph: layout.GraphLayout,
+    name: str,
+    initial: int,
+    states: Sequence[tuple[str, str]],
+    kind_of_edge: Callable[[layout.Key], str],
+    label: str,
+) -> str:
+    """A graph as SVG in which each state is a button.
+
+    Args:
+      graph, name, initial: the layout, the prefix of the ids, and the state with an arrow from outside.
+      states: the classes and the title of each state.
+      kind_of_edge: the classes of an edge.
+      label: the text alternative.
+
+    Example:
+      >>> texts = {(0, 0, 0): (("", "a"),)}
+      >>> graph = layout.arrange(np.array([[0]]), 0, np.array([False]), texts)
+      >>> live_graph(graph, "g", 0, [("state", "memory 0")], lambda key: "edge", "one").count("<text")
+      2
+    """
     height = graph.size[1]
 
     def at(points: ArrayLike) -> NDArray[np.float64]:
@@ -59,34 +103,22 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     labels = {label.key: label for label in graph.labels}
     edges = []
     for edge in graph.edges:
-        source, target, number = edge.key
-        accepting = table.marked_priority is not None and number == 0  # the first of two curves
+        source, target, _ = edge.key
         lines = _lines(labels[edge.key], at) if edge.key in labels else []
-        kind = f"edge{' doomed' * bool(doomed[target])}{' accepting' * accepting}"
-        edges.append((kind, source, target, _arrow(at(edge.curve)), lines))
-    final = table.final if table.has_final_states else doomed & False
-    names = table.state_names or ("",) * len(table.delta)
+        edges.append((kind_of_edge(edge.key), source, target, _arrow(at(edge.curve)), lines))
     radius = layout.RADIUS * _INCH
-    start = at(graph.position[int(table.initial)])
+    start = at(graph.position[initial])
     tail, rim = start - [radius + 40, 0], start - [radius + 2, 0]
-    states = [
-        (
-            f"state{' final' * bool(final[q])}{' doomed' * bool(doomed[q])}",
-            x,
-            y,
-            f"memory {q}: {names[q]}" if names[q] else f"memory {q}",
-        )
-        for q, (x, y) in enumerate(at(graph.position).tolist())
-    ]
+    places = at(graph.position).tolist()
     return _svg(
         "automaton",
         f"{name}-automaton",
         (0, 0, *np.array(graph.size) * _INCH),
-        f"An automaton of {len(table.delta)} states; a table follows",
+        label,
         prefix=name,
         edges=edges,
         start=_arrow(np.array([tail, (tail + rim) / 2, rim])),
-        states=states,
+        states=[(kind, x, y, text) for (kind, text), (x, y) in zip(states, places, strict=True)],
         radius=radius,
     )
 
@@ -153,6 +185,7 @@ def live_map(
     runs: Sequence[Sequence[int]] = (),
     marked: Iterable[tuple[int, int, int]] = (),
     num_pieces: int = 1,
+    window: int = 0,
     actions: Sequence[str] = tuple(STEPS),
     wall: str = "#",
 ) -> str:
@@ -167,6 +200,8 @@ def live_map(
       marked: (state, memory, action) to be highlighted: ``g.marked``.
       actions, wall: as for :func:`jaxltl.plot.grid`.
       num_pieces: number of moving pieces, ``circle.token``.
+      window: side of the frame of cells that a robot sees, ``rect.window``, with room for beliefs in
+        ``g.belief``; 0 for none.
 
     Example:
       >>> text = live_map(np.array([[".", "g"]]), "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
@@ -219,6 +254,7 @@ def live_map(
             for cells in runs
         ],
         pieces=num_pieces,
+        window=window,
         stride=-(-max(ground.shape) // 16),
         edge=-beyond - margin / 2,
     )

@@ -219,7 +219,7 @@ class TaskFile(FormulaFile):
             )
 
 
-def kind_of(path: Path) -> Literal["environment", "grounding", "todirl", "mlirl"]:
+def kind_of(path: Path) -> Literal["environment", "grounding", "controller", "todirl", "mlirl"]:
     """The kind of a task file, unchecked: by its world, its tables or its method."""
     data = read_toml(path, TaskFile.KIND)[0]
     world, learner = (x if isinstance(x := data.get(k), dict) else {} for k in ("world", "learner"))
@@ -228,4 +228,6 @@ def kind_of(path: Path) -> Literal["environment", "grounding", "todirl", "mlirl"
         return "environment"
     if "grounding" in data:
         return "grounding"
+    if "observations" in world or method == "controller":
+        return "controller"
     return "todirl" if method == "todirl" else "mlirl"

@@ -37,10 +37,15 @@ class MapLayer:
 
 @dataclass(frozen=True)
 class ReportTrajectory:
-    """A trajectory: world states, memory states and actions, None in a last step without one."""
+    """A trajectory: world states, memory states and actions, None in a last step without one.
+
+    Of a world that is seen in part also the number of each observation, and beliefs ``float[T, S]``.
+    """
 
     name: str
     steps: list[tuple[int, int, int | None]]
+    observations: Sequence[int] = ()
+    beliefs: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +56,7 @@ class Explorer:
     title: str  # title, caption: for people
     caption: str
     size: int  # S, the number of states or cells
-    automaton: Automaton | None  # the policy's memory, or None
+    automaton: Automaton | None  # the policy's memory, or None; see `machine`
     layers: Mapping[str, MapLayer]  # maps by memory state or :data:`START`
     runs: list[ReportTrajectory]  # trajectories
     place: Any = None  # cells of a text map, a coloured world, or None without a map
@@ -65,6 +70,9 @@ class Explorer:
     # cells of the pieces in some states; other states have one piece in their own cell
     cells: Mapping[int, Sequence[int]] = field(default_factory=dict)
     places: Mapping[int, str] = field(default_factory=dict)  # names of some states
+    # transitions of a finite-state controller, in place of an automaton, for plot.live_controller
+    machine: Sequence[tuple[int, int, int, Sequence[float]]] = ()
+    window: int = 0  # side of the window of cells that the robot sees; 0 for none
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -103,6 +111,8 @@ class Explorer:
             return drawn
         if self.automaton is not None:
             drawn["automaton"] = drawing("live_automaton", self.automaton, self.name)
+        if self.machine:
+            drawn["automaton"] = drawing("live_controller", self.machine, self.name, self.actions)
         if self.place is not None:
             drawn["map"] = drawing(
                 "live_map",
@@ -113,6 +123,7 @@ class Explorer:
                 marked=self.marked,
                 actions=self.actions,
                 wall=self.wall,
+                window=self.window,
                 num_pieces=max((len(each) for each in self.cells.values()), default=1),
             )
         return drawn

@@ -25,13 +25,13 @@ from jaxltl.io.demonstrations import position_text, state_position
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.core.policies.finite_memory import ARROWS, action_text
 from jaxltl.io import templates
 
 Part = tuple[Explorer | Curves, Mapping[str, str]]  # with its drawings as SVG
 Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
 
 _CURVE_ROWS = 12  # of a table of learning curves
-_ARROWS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _environment() -> jinja2.Environment:
     environment = templates.environment("jaxltl.app.reports")
     formats = (number, probability, certified, mean_deviation, rounded_down, position_text, counted)
     environment.filters |= {function.__name__: function for function in formats}
-    parts = (position, layer_table, run_rows, automaton_rows, curve_table)
+    parts = (position, layer_table, run_rows, machine_rows, automaton_rows, curve_table)
     environment.globals |= {function.__name__: function for function in parts}
     return environment
 
@@ -155,8 +155,29 @@ def explorer_data(part: Explorer) -> Record:
             key: {"value": listed(layer.value), "policy": listed(layer.policy)}
             for key, layer in part.layers.items()
         },
-        "runs": [{"name": run.name, "steps": run.steps} for run in part.runs],
+        "window": part.window,
+        "runs": [
+            {
+                "name": run.name,
+                "steps": run.steps,
+                "observations": run.observations,
+                "beliefs": None if run.beliefs is None else _sparse_rows(run.beliefs),
+            }
+            for run in part.runs
+        ],
     }
+
+
+def _sparse_rows(rows: np.ndarray) -> list[list[tuple[int, float]]]:
+    """Columns and entries of each row, largest first."""
+    return [
+        [
+            (int(s), round(float(row[s]), 4))
+            for s in np.argsort(-row, kind="stable")
+            if row[s] >= 5e-5
+        ]
+        for row in rows
+    ]
 
 
 def _finite(value: float) -> float | None:
@@ -171,6 +192,9 @@ def _verdict(verdict: int, goal: str) -> str:
 def _memory_texts(part: Explorer) -> dict[str, str]:
     """Meaning of each memory state, and of the layer of initial states."""
     meanings: dict[str, str] = {}
+    if part.machine:
+        count = 1 + max(target for _, target, _, _ in part.machine)
+        return {str(q): f"Memory state {q}" for q in range(count)}
     if part.automaton is None:
         return meanings
     names = part.automaton.state_names or ("",) * len(part.automaton.delta)
@@ -198,7 +222,7 @@ def layer_table(part: Explorer, key: str) -> tuple[tuple[object, ...], list[Any]
             text.append(probability(value))
         if chances is not None and np.isfinite(chances).all():
             best = part.actions[int(np.argmax(chances))]
-            text.append(_ARROWS.get(best, best))
+            text.append(ARROWS.get(best, best))
         texts.append(" ".join(text))
     caption = f"{layer.name}: {part.label if layer.policy is None else 'the likeliest action'}"
     if part.shape is None:
@@ -209,10 +233,26 @@ def layer_table(part: Explorer, key: str) -> tuple[tuple[object, ...], list[Any]
 
 
 def run_rows(part: Explorer, run: ReportTrajectory) -> list[tuple[object, ...]]:
-    """Step, position, memory state and action of a trajectory."""
-    return [
+    """Step, position, memory state and action of a trajectory; with beliefs, what it sees and believes."""
+    rows: list[tuple[object, ...]] = [
         (t, position(part, s), q, "" if a is None else part.actions[a])
         for t, (s, q, a) in enumerate(run.steps)
+    ]
+    if run.beliefs is None:
+        return rows
+    likely = [
+        "; ".join(f"{position(part, s)} {probability(p)}" for s, p in row[:3])
+        + ("; …" if len(row) > 3 else "")
+        for row in _sparse_rows(run.beliefs)
+    ]
+    return [(*row, o, text) for row, o, text in zip(rows, run.observations, likely, strict=True)]
+
+
+def machine_rows(part: Explorer) -> list[tuple[object, ...]]:
+    """Memory state, entered observation, next memory state and action of a controller."""
+    return [
+        ("start" if source < 0 else source, observation, target, action_text(action, part.actions))
+        for source, target, observation, action in part.machine
     ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable, cast
 
@@ -16,6 +16,8 @@ from jaxltl.core.pretty_print import brief
 
 Key = Array | np.random.Generator | None
 Label = Collection[str] | Array  # the propositions that hold, or the number of a letter
+ARROWS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}  # names of moves
+_CERTAIN = 0.995  # least probability that is written as one action
 
 
 @brief
@@ -182,6 +184,24 @@ class FiniteMemoryPolicy:
         if isinstance(label, Collection) and not isinstance(label, np.ndarray):
             label = np.asarray(letter_index(automaton, label))
         return _at(automaton.delta, memory, label)
+
+
+def action_text(action: Sequence[float] | Array, actions: Sequence[str]) -> str:
+    """An action, as an arrow if it is a direction; or several with their probabilities.
+
+    >>> action_text([0.0, 1.0], ["up", "right"]), action_text([0.25, 0.75], ["up", "wait"])
+    ('→', 'wait .75, ↑ .25')
+    """
+    weight = np.asarray(action, float)
+    names = [ARROWS.get(str(x), str(x)) for x in actions] or list(map(str, range(weight.size)))
+    best = int(weight.argmax())
+    if weight[best] >= _CERTAIN:
+        return names[best]
+    order = np.argsort(-weight, kind="stable").tolist()
+    parts = [
+        f"{names[a]} {weight[a]:.2f}".replace(" 0.", " .") for a in order if weight[a] >= 0.005
+    ]
+    return ", ".join(parts)
 
 
 def _at(table: Array, *index: Array | int) -> Array:

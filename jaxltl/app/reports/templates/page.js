@@ -94,6 +94,28 @@
       }
     }
 
+    // Shades cells by the belief of a step, and frames the window of cells that the robot sees.
+    function believe(belief, at) {
+      const shades = one(".belief"), frame = one(".window");
+      root.classList.toggle("believing", belief !== null);
+      if (!shades) return;
+      shades.replaceChildren();
+      frame.style.visibility = belief === null ? "hidden" : "visible";
+      if (belief === null) return;
+      const half = (data.window - 1) / 2;
+      frame.setAttribute("x", (at % data.columns - half) * CELL);
+      frame.setAttribute("y", (Math.floor(at / data.columns) - half) * CELL);
+      for (const [state, chance] of belief) {
+        const rect = document.createElementNS(shades.namespaceURI, "rect");
+        rect.setAttribute("x", state % data.columns * CELL);
+        rect.setAttribute("y", Math.floor(state / data.columns) * CELL);
+        rect.setAttribute("width", CELL);
+        rect.setAttribute("height", CELL);
+        rect.setAttribute("fill-opacity", 0.12 + 0.78 * chance);
+        shades.append(rect);
+      }
+    }
+
     // Shows step t of the selected trajectory on map and automaton, and as text.
     function step(t) {
       const run = data.runs[Number(select.value)], [state, memory, action] = run.steps[t];
@@ -101,11 +123,18 @@
       slider.max = run.steps.length - 1;
       slider.value = t;
       const did = action === null ? "end" : `action ${data.actions[action]}`;
+      const belief = run.beliefs ? run.beliefs[t] : null;
       const parts = [place(state), ...(data.memories[memory] ? [`memory state ${memory}`] : []), did];
+      if (belief !== null) {
+        const likely = belief.slice(0, 3).map(([s, p]) => `${place(s)} ${percent(p)}`);
+        parts.splice(1, 0, `sees observation ${run.observations[t]}`);
+        parts.push(`believes: ${likely.join("; ")}${belief.length > 3 ? "; …" : ""}`);
+      }
       const text = `step ${t} of ${run.steps.length - 1}: ${parts.join(" · ")}`;
       slider.setAttribute("aria-valuetext", text);
       cell = null;
       choose(memory);
+      if (map) believe(belief, state);
       if (cursor) cursor.style.visibility = "hidden";
       tokens.forEach((token, i) => {
         const at = data.cells[state] ? data.cells[state][i] : state;
@@ -134,7 +163,7 @@
     }
 
     for (const element of every("[aria-pressed][data-memory]")) {
-      const chosen = () => { stop(); choose(element.dataset.memory); };
+      const chosen = () => { stop(); believe(null, 0); choose(element.dataset.memory); };
       element.addEventListener("click", chosen);
       if (element.tagName !== "BUTTON") {
         element.addEventListener("keydown", (event) => {
@@ -151,7 +180,7 @@
       });
       map.addEventListener("click", (event) => {
         const state = under(event);
-        if (state !== null) { stop(); point(state); }
+        if (state !== null) { stop(); believe(null, 0); point(state); }
       });
       one(".board").addEventListener("keydown", (event) => {
         const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };

@@ -109,8 +109,9 @@ def reduced_controller(
       decided: ``bool[S]``, states from which actions no longer matter. Default: none.
 
     Returns:
-      :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy`; where the chain does not come, it
-      chooses uniformly.
+      :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy`; it begins in memory
+      state 0, which the first observation updates. Where the chain does not come, it chooses uniformly
+      and keeps its memory state.
 
     Raises:
       ValueError: a policy of other observations, or with updates on exit.
@@ -129,24 +130,18 @@ def reduced_controller(
     acts = {(t.target, t.observation): tuple(t.action.tolist()) for t in transitions}
     merged = _merged(states, after, acts)
     number: dict[int, int] = {}
-    for state in [START, *states]:  # the class of the start first
-        root = merged[state]
-        if root != START or any(merged[s] == START for s in states):
-            number.setdefault(root, len(number))
+    for state in [START, *states]:  # the class of the start is memory state 0
+        number.setdefault(merged[state], len(number))
     count, available = pomdp.num_observations, pomdp.available
     uniform = available / np.maximum(available.sum(1, keepdims=True), 1)
     uniform[~available.any(1)] = 1 / pomdp.num_actions  # observations that do not occur
     action = np.repeat(uniform[:, None], len(number), 1)
-    update = np.zeros((count, len(number)), np.int32)
-    initial = np.zeros(count, np.int32)
+    update = np.tile(np.arange(len(number), dtype=np.int32), (count, 1))
     for (state, o), row in acts.items():
         action[o, number[merged[state]]] = row
     for (state, o), target in after.items():
-        if merged[state] in number:
-            update[o, number[merged[state]]] = number[merged[target]]
-        if state == START:
-            initial[o] = number[merged[target]]
-    return FiniteMemoryPolicy(action, initial, update, actions=policy.actions)
+        update[o, number[merged[state]]] = number[merged[target]]
+    return FiniteMemoryPolicy(action, update[:, 0].copy(), update, actions=policy.actions)
 
 
 def _merged(
