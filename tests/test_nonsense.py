@@ -289,6 +289,11 @@ ADAPTERS = {
         {"in_turn": False},
     ),
     "brax": ("brax", lambda: {"env": imported("brax.envs", "get_environment", "fast")}, {}),
+    "playground": (
+        "mujoco_playground",
+        lambda: {"env": imported("mujoco_playground._src.registry", "load", "CartpoleBalance")},
+        {},
+    ),
     "pgx": (
         "pgx",
         lambda: {"env": imported("pgx", "make", "tic_tac_toe")},

@@ -9,6 +9,7 @@ from . import (
     temporal_gridworld as temporal_gridworld,
 )
 from .adapters.brax import from_brax as from_brax
+from .adapters.brax import from_playground as from_playground
 from .adapters.gymnax import from_craftax as from_craftax
 from .adapters.gymnax import from_gymnax as from_gymnax
 from .adapters.jumanji import from_jumanji as from_jumanji
@@ -16,6 +17,7 @@ from .adapters.minigrid import from_navix as from_navix
 from .adapters.pgx import from_pgx as from_pgx
 from .adapters.minigrid import from_xminigrid as from_xminigrid
 from .by_name import make as make
+from .conveyor_world import conveyor_world as conveyor_world
 from .flat_world import flat_world as flat_world
 from .gridworld import gridworld as gridworld, partial_gridworld as partial_gridworld
 from .gymnasium_runner import run_policy as run_policy

@@ -12,6 +12,7 @@ import contextlib
 import importlib
 import importlib.util
 import inspect
+import operator
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,7 @@ from jaxltl.core.environments.environment import Environment, make_environment
 from jaxltl.envs.continuous_worlds import BenchmarkWorld
 
 BUILT_IN = {
+    "conveyor_world": "jaxltl.envs.conveyor_world:conveyor_world",
     "flat_world": "jaxltl.envs.flat_world:flat_world",
     "letter_world": "jaxltl.envs.letter_world:letter_world",
     "zone_world": "jaxltl.envs.zone_world:zone_world",
@@ -35,6 +37,7 @@ PACKAGES = {
     "gymnax": ("gymnax", "make"),
     "jumanji": ("jumanji", "make"),
     "navix": ("navix", "make"),
+    "playground": ("mujoco_playground", "registry.load"),
     "xminigrid": ("xminigrid", "make"),
 }
 
@@ -125,7 +128,7 @@ def _of_package(
     """An environment of another package, by its adapter."""
     module, function = PACKAGES[root]
     try:
-        make = getattr(importlib.import_module(module), function)
+        make = operator.attrgetter(function)(importlib.import_module(module))
     except ImportError as problem:
         raise ValueError(
             f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".'

@@ -1,4 +1,4 @@
-"""Environments of the package brax."""
+"""Environments of the packages brax and MuJoCo Playground, which share the form of their states."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from jaxltl.envs.adapters.common import (
     Foreign,
     Held,
     copied,
+    layers,
     own_errors,
     package,
     refuse_wrappers,
@@ -61,9 +62,66 @@ def from_brax(
         (training.AutoResetWrapper, training.VmapWrapper, training.DomainRandomizationVmapWrapper),
         "give brax.envs.get_environment(name), and limit its episodes by with_time_limit",
     )
+    return _adapted("brax", env, labels, propositions)
+
+
+def from_playground(
+    env: Foreign,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A MuJoCo Playground environment without its auto-reset and batch wrappers.
+
+    Its ``done`` terminates. Playground limits episodes only in training: limit them by
+    ``with_time_limit(from_playground(env), config.episode_length)``, or by Brax's ``EpisodeWrapper``,
+    which truncates by ``info["truncation"]``.
+
+    Args:
+      env: as ``mujoco_playground.registry.load(name)`` returns it. Actions are in [-1, 1], as in
+        Playground's training. Its default implementation of the physics, Warp, is for GPUs; on a
+        processor give ``load(name, config_overrides={"impl": "jax"})``.
+      labels, propositions: ``state -> bool[P]``, of Playground's ``State`` (`obs`, `data`), and its
+        names.
+
+    Returns:
+      :class:`~jaxltl.core.environments.environment.Environment` with Playground's states.
+
+    Raises:
+      ValueError: not a Playground environment, or an auto-reset or batch wrapper.
+      ImportError: playground is not installed.
+    """
+    root = package("mujoco_playground", "playground")
+    training = package("brax.envs.wrappers.training")
+    inner = [*layers(env, "env")][-1]
+    make = "mujoco_playground.registry.load(name)"
+    require_environment("playground", inner, root.MjxEnv, make)
+    refuse_wrappers(
+        "playground",
+        env,
+        "env",
+        (
+            root.wrapper.BraxAutoResetWrapper,
+            root.wrapper.BraxDomainRandomizationVmapWrapper,
+            training.AutoResetWrapper,
+            training.VmapWrapper,
+            training.DomainRandomizationVmapWrapper,
+        ),
+        f"give {make}, and limit its episodes by with_time_limit",
+    )
+    return _adapted("playground", env, labels, propositions)
+
+
+def _adapted(
+    root: str,
+    env: Foreign,
+    labels: Callable[..., jax.Array] | None,
+    propositions: Sequence[str],
+) -> Environment:
+    """The environment of a checked argument."""
     held, size = Held(env), int(env.action_size)
     length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
-    with own_errors("brax", env):
+    with own_errors(root, env):
         return make_environment(
             Partial(reset_to_arrays, held),
             Partial(_step, held),

@@ -44,9 +44,12 @@ class Seen(NamedTuple):
     observation: PyTree
 
 
-def package(name: str) -> Foreign:
-    """Imports a module of another package; ImportError with the command that installs it."""
-    root = name.partition(".")[0]
+def package(name: str, root: str | None = None) -> Foreign:
+    """Imports a module of another package; ImportError with the command that installs it.
+
+    `root` is the name of the package and of its extra, by default the top-level module.
+    """
+    root = name.partition(".")[0] if root is None else root
     try:
         with warnings.catch_warnings():  # in its own imports
             warnings.simplefilter("ignore", DeprecationWarning)

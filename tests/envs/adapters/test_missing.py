@@ -8,11 +8,12 @@ import jaxltl
 
 
 @pytest.mark.parametrize(
-    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid"]
+    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "playground", "xminigrid"]
 )
 def test_a_missing_package_is_named(name, monkeypatch):
-    for module in [name, *sys.modules]:
-        if module == name or module.startswith(f"{name}."):
+    root = "mujoco_playground" if name == "playground" else name
+    for module in [root, *sys.modules]:
+        if module == root or module.startswith(f"{root}."):
             monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=rf'from_{name} needs .*pip install "jaxltl\[{name}\]"'):
         getattr(jaxltl.envs, f"from_{name}")(object())
