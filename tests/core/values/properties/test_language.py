@@ -457,6 +457,17 @@ SPELLINGS = {
     },
 }
 
+MORE_TEXTS = (
+    'R{"flips"}=? [ C{discount=0.9} ]',
+    'R{"time"}max=? [ F{discount=1/2} s=3 ]',
+    'R{"toll"}min=? [ C{discount=0.5}<=3 ]',
+    "<<*>> P>=0.5 [ F x=3 ]",
+    '[[]] P>0 [ G F "goal" ]',
+    'Pmax=? [ HOA: {"a.hoa", "a" <- x=1} ]',
+    'multi(R{"time"}max=? [ C<=2 ], P>=0.5 [ F "goal" ])',
+    "P=? [ F d=6 || F s=7 ]",
+    "const bool c = true; c & s=0",
+)
 GROUPS = {
     "spellings": SPELLINGS,
     "rational": RATIONAL,
@@ -643,12 +654,17 @@ def test_a_malformed_property_does_not_stop_the_others(models):
 PIECES = "P=? [ ] ( ) { } F G X U W R & | ! => <=> = < <= s d 1 1/3 filter(max, E A ? : ; const ceil( + - * / ^ << #"
 
 
-def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models):
-    rng = random.Random(0)
-    model, known = models["die"]
-    texts = [text for group in GROUPS.values() for text in group.get("die", {})]
-    for i in range(1000):
-        text = rng.choice(texts)
+@pytest.mark.parametrize("count", [1000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models, count):
+    rng = random.Random(count)
+    texts = {
+        name: [text for group in GROUPS.values() for text in [*group.get(name, {}), *MORE_TEXTS]]
+        for name in models
+    }
+    for i in range(count):
+        name = rng.choice(("die", "die", "lanes"))
+        model, known = models[name]
+        text = rng.choice(texts[name])
         for _ in range(rng.randint(1, 3)):
             first = rng.randrange(len(text) + 1)
             piece = rng.choice((*PIECES.split(), '"end"', ""))
@@ -658,7 +674,7 @@ def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models):
                 assert "column" in item.error, text
             elif i % 20 == 0:
                 with contextlib.suppress(ValueError):
-                    solve_property(model, item)
+                    solve_property(model, item, fair=i % 60 == 0, exact=i % 100 == 0)
 
 
 def test_quotients_by_zero_are_infinite_or_refused():
