@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
-from typing import NoReturn, TypeVar, cast
+from typing import cast
 
+from jaxltl.core.language.composition import read_composition
 from jaxltl.core.language.expressions import (
     FUNCTIONS,
     RELATIONS,
@@ -18,6 +16,7 @@ from jaxltl.core.language.expressions import (
     Type,
     literal,
 )
+from jaxltl.core.language.tokens import TokenReader
 from jaxltl.core.language.syntax import (
     Assignment,
     Command,
@@ -47,7 +46,6 @@ _REFUSED = {
     "popta": "partially observable timed automata",
     "csg": "concurrent games",
     **dict.fromkeys(("tptg", "tsg"), "timed games"),
-    "system": "system ... endsystem blocks (modules are composed in parallel over all actions)",
     "invariant": "invariants of timed automata",
 }
 _RESERVED = frozenset(_KINDS) | {
@@ -68,86 +66,6 @@ _NOT = 5
 SIMPLE = 6  # the level of comparisons, in which no Boolean operator stands outside of parentheses
 ADDITIVE = 8  # the level of + and -
 _FLAT = ("&", "|", "+", "*")
-
-
-Item = TypeVar("Item")
-MAX_TOKENS = 2_000_000  # of a text, about 200 MB of memory
-_TOKEN = re.compile(
-    r"""
-    (?P<space>(?:\s+|//[^\n]*)+)
-  | (?P<quoted>"[^"\n]*")
-  | (?P<real>[0-9]+\.[0-9]+(?:[eE][+-]?[0-9]+)?|[0-9]+[eE][+-]?[0-9]+|\.[0-9]+(?:[eE][+-]?[0-9]+)?)
-  | (?P<integer>[0-9]+)
-  | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
-  | (?P<sign><=>|=>|<=|>=|!=|->|\.\.|[-<>=&|!()\[\]{},;:?/+*^%'])
-  | (?P<unknown>.)
-""",
-    re.VERBOSE,
-)
-
-
-class TokenReader:
-    """The tokens of a text from an offset on, and a place in them; the last one has the kind "end"."""
-
-    pattern = _TOKEN
-
-    def __init__(self, text: str, start: int = 0) -> None:
-        tokens = (
-            match for match in self.pattern.finditer(text, start) if match.lastgroup != "space"
-        )
-        matches = list(islice(tokens, MAX_TOKENS + 1))
-        if len(matches) > MAX_TOKENS:
-            raise LanguageError(
-                matches[-1].start(), f"the text has more than {MAX_TOKENS} words and signs."
-            )
-        self.kinds = [*(str(token.lastgroup) for token in matches), "end"]
-        self.texts = [*(token[0] for token in matches), ""]
-        self.starts = [*(token.start() for token in matches), len(text)]
-        self.at = 0
-
-    @property
-    def place(self) -> int:
-        """Offset of the next token."""
-        return self.starts[self.at]
-
-    @property
-    def end(self) -> int:
-        """Offset of the end of the last token that was taken."""
-        return self.starts[self.at - 1] + len(self.texts[self.at - 1])
-
-    def fail(self, expected: str) -> NoReturn:
-        """Raises LanguageError: another token is expected."""
-        actual = "the end" if self.kinds[self.at] == "end" else repr(self.texts[self.at])
-        raise LanguageError(self.place, f"found {actual}, expected {expected}.")
-
-    def accept(self, text: str) -> bool:
-        """Takes the next token if it is this sign or word."""
-        accepted = self.texts[self.at] == text
-        self.at += accepted
-        return accepted
-
-    def expect(self, text: str, after: str = "") -> None:
-        """Takes the next token, which must be this sign or word."""
-        if not self.accept(text):
-            self.fail(f"{text!r}{after}")
-
-    def separated(self, item: Callable[[], Item], sign: str = ",") -> list[Item]:
-        """Takes items with a sign between each two."""
-        items = [item()]
-        while self.accept(sign):
-            items.append(item())
-        return items
-
-    def word(self, expected: str, kind: str = "word") -> str:
-        """Takes a name."""
-        if self.kinds[self.at] != kind:
-            self.fail(expected)
-        self.at += 1
-        return self.texts[self.at - 1]
-
-    def quoted(self, expected: str) -> str:
-        """Takes a name in double quotes."""
-        return self.word(expected, "quoted")[1:-1]
 
 
 class ExpressionParser(TokenReader):
@@ -281,8 +199,7 @@ def parse_program(text: str, name: str = "model") -> Syntax:
     """The syntax tree of a program in the PRISM language.
 
     Raises ValueError with file, line and column: a syntax error, or a feature that is not supported
-    (continuous time, clocks, concurrent games, ``system`` blocks, unbounded
-    integers).
+    (continuous time, clocks, concurrent games, unbounded integers).
 
     >>> parse_program("mdp module m x : [0..1]; [a] x=0 -> (x'=1); endmodule").kind
     'mdp'
@@ -312,6 +229,7 @@ class _ProgramParser(ExpressionParser):
             "module": self.module,
             "rewards": self.reward_structure,
             "init": self.initial_block,
+            "system": self.system_block,
             "player": self.player,
             "observables": self.observable_variables,
             "observable": self.observable,
@@ -457,7 +375,8 @@ class _ProgramParser(ExpressionParser):
             self.expect("=")
             if old in renaming:
                 raise LanguageError(place, f"{old} is renamed twice.")
-            renaming[old], _ = self.name("a new name")
+            is_function = old in FUNCTIONS and self.texts[self.at] in FUNCTIONS
+            renaming[old] = self.word("") if is_function else self.name("a new name")[0]
 
         self.expect("[")
         self.separated(pair)
@@ -528,6 +447,12 @@ class _ProgramParser(ExpressionParser):
             raise LanguageError(self.starts[self.at - 1], "there are two init blocks.")
         self.syntax.initial = self.expression()
         self.expect("endinit")
+
+    def system_block(self) -> None:
+        if self.syntax.system is not None:
+            raise LanguageError(self.starts[self.at - 1], "there are two system blocks.")
+        self.syntax.system = read_composition(self)
+        self.expect("endsystem", " or an operator")
 
     def player(self) -> None:
         place = self.place

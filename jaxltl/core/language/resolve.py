@@ -17,6 +17,7 @@ from jaxltl.core.language.exact import (
     shared_exact_tree,
 )
 from jaxltl.core.language.expressions import (
+    FUNCTIONS,
     Expression,
     LanguageError,
     MAX_INTEGER,
@@ -28,6 +29,7 @@ from jaxltl.core.language.expressions import (
     type_of,
     value_type,
 )
+from jaxltl.core.language.composition import composed
 from jaxltl.core.language.parser import ExpressionParser, parse_program
 from jaxltl.core.language.syntax import (
     Assignment,
@@ -206,6 +208,9 @@ class _Resolver:
             [changed(m, expand) if isinstance(m, Module) else m for m in syntax.modules], formulas
         )
         self.check_names(modules)
+        structures, players = tuple(syntax.rewards), tuple(syntax.players)
+        if syntax.system is not None:
+            modules, structures, players = composed(syntax.system, modules, structures, players)
         constants, known = self.constant_values(expand)
         quoted = [(f'"{name}"', expand(e)) for name, e in syntax.labels]
         labels = _expanded(quoted, "label", known)
@@ -214,7 +219,7 @@ class _Resolver:
         modules = [changed(m, fold) for m in modules]
         variables = [self.variable(changed(d, both), None) for d in syntax.variables]
         variables += [self.variable(d, i) for i, m in enumerate(modules) for d in m.declarations]
-        rewards = changed(_numbered(syntax.rewards), both)
+        rewards = changed(_numbered(structures), both)
         _check_distinct(
             [(name, e.place) for name, e in syntax.observables], "{} is observable twice."
         )
@@ -236,7 +241,7 @@ class _Resolver:
             {name.strip('"'): e for name, e in labels.items()},
             rewards,
             None if syntax.initial is None else both(syntax.initial),
-            tuple(syntax.players),
+            players,
             {name: both(e) for name, e in syntax.observables},
         )
         _Checker(program, undefined).check()
@@ -376,6 +381,17 @@ def _is_whole(value: Value) -> bool:
     return isinstance(value, float | Fraction) and value == math.floor(value)
 
 
+def _with_functions(change: Change, names: Mapping[str, str]) -> Change:
+    """A change of expressions after which functions have other names."""
+    functions = {old: new for old, new in names.items() if old in FUNCTIONS and new in FUNCTIONS}
+
+    def renamed(e: Expression) -> Expression:
+        operands = tuple([renamed(x) for x in e.operands])
+        return replace(e, operator=functions.get(e.operator, e.operator), operands=operands)
+
+    return (lambda e: renamed(change(e))) if functions else change
+
+
 def _substitution(names: Mapping[str, Expression]) -> Change:
     """Substitution that shares results between expressions."""
     memory: dict[int, Expression] = {}
@@ -406,6 +422,7 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
     rename = _substitution(
         {old: Expression("name", value=new, place=renaming.place) for old, new in names.items()}
     )
+    rename = _with_functions(rename, names)
     for old, new in renaming.renaming:
         # PRISM renames within the formula, Storm takes the other formula.
         if old in formulas and new in formulas and rename(formulas[old]) != formulas[new]:

@@ -125,6 +125,16 @@ class Player:
     place: int
 
 
+@dataclass(frozen=True)
+class Composition:
+    """A composition of modules in a ``system`` block: a module, or an operator on parts."""
+
+    operator: str  # the name of a module, or "||", "|||", "|[]|", "/", "<-"
+    place: int
+    actions: tuple[tuple[str, str], ...] = ()  # and what they become, "" where they are hidden
+    parts: tuple[Composition, ...] = ()
+
+
 @dataclass
 class Syntax:
     """A program as it is written; :func:`~jaxltl.core.language.parser.parse_program`."""
@@ -138,6 +148,7 @@ class Syntax:
     labels: list[tuple[str, Expression]] = field(default_factory=list)
     rewards: list[RewardStructure] = field(default_factory=list)
     initial: Expression | None = None
+    system: Composition | None = None  # None: all modules, synchronised over common actions
     players: list[Player] = field(default_factory=list)
     observables: list[tuple[str, Expression]] = field(default_factory=list)
 

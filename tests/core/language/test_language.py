@@ -153,7 +153,7 @@ M = "module m x : [0..1]; [] true -> true; endmodule"
         ("pta\n" + M, (1, 1), "timed automata"),
         ("popta " + M, (1, 1), "partially observable timed"),
         ("csg " + M, (1, 1), "concurrent games"),
-        (M + "\n system m endsystem", (2, 2), "system"),
+        (M + "\n system k endsystem", (2, 9), "exactly once"),
         ("mdp module m x : int; endmodule", (1, 18), "unbounded"),
         ("mdp module m x : clock; endmodule", (1, 18), "clock"),
         ("mdp module m invariant true endinvariant endmodule", (1, 14), "invariant"),
