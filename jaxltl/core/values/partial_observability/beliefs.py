@@ -192,6 +192,14 @@ class BeliefGraph:
         node, share, lost = self._insert(whole, none, -1)
         return node, mass * share, float(mass @ lost)
 
+    def corners(self, states: Integers) -> Integers:
+        """The nodes of the beliefs that know the state, of some states; new ones where they are missing."""
+        whole = Measures(np.arange(states.size + 1), states, np.ones(states.size))
+        node, share, _ = self._insert(whole, np.full(states.size, -1), -1)
+        if not (share == 1).all():
+            raise ArithmeticError("two beliefs have one hash; explore the model in another order.")
+        return node
+
     def expand(self, nodes: Integers) -> None:
         """Adds the rows of nodes that have none."""
         problem = self.problem
@@ -295,7 +303,10 @@ class ExactBeliefs:
             first, last = measures.start[at : at + 2]
             states = measures.state[first:last].tolist()
             if parent[at] < 0:
-                self._belief[at] = {s: Fraction(float(problem.initial[s])) for s in states}
+                known = len(states) == 1
+                self._belief[at] = {
+                    s: Fraction(1 if known else float(problem.initial[s])) for s in states
+                }
             else:
                 after = self.after(int(parent[at]), int(via[at]))
                 total = sum(after[s] for s in states)

@@ -13,14 +13,16 @@ that they lead to stored beliefs alone. As the values of an end component are eq
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers, SparseMatrix
+from jaxltl.core.sparse.graph.components import forward_reachable
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, mask_of, offsets_from_counts
+from jaxltl.core.sparse.rows import mask_of, offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.values.partial_observability.beliefs import BeliefGraph
 from jaxltl.core.values.partial_observability.problem import EPS, BeliefProblem
@@ -46,6 +48,15 @@ class BeliefRows:
     @property
     def problem(self) -> BeliefProblem:
         return self.graph.problem
+
+    @cached_property
+    def matrix(self) -> SparseMatrix:
+        """``float64[rows, nodes]``, the weights of successors."""
+        from scipy.sparse import csr_array
+
+        table = self.table
+        shape = table["node"].size, self.graph.size
+        return csr_array((table["by"], table["to"], table["start"]), shape=shape)
 
     @property
     def slack(self) -> float:
@@ -132,6 +143,13 @@ class BeliefRows:
         value = bounds.value if not safe else bounds.upper if problem.maximize else bounds.lower
         return NodeValues(value[:size] / factor, self._row[bounds.row[:size]])
 
+    def reaches_leaves(self) -> bool:
+        """True if unexpanded nodes are reachable from the initial measure."""
+        table, graph = self.table, self.graph
+        source = table["node"].repeat(np.diff(table["start"]))
+        reached = forward_reachable(source, table["to"], mask_of(graph.root[0], graph.size))
+        return bool((reached & ~graph.expanded).any())
+
     def at_root(self, value: Floats) -> float:
         """The bound of the initial measure."""
         node, weight, rest = self.graph.root
@@ -177,26 +195,3 @@ class BeliefRows:
             if not wrong:
                 return mask_of(rows, num)
             candidate[wrong] = False
-
-
-def visits(rows: BeliefRows, policy: Integers, *, sweeps: int = 300) -> Floats:
-    """Expected visits of each node under rows ``int[nodes]`` from the initial measure, from below."""
-    from scipy.sparse import csr_array
-
-    graph, table = rows.graph, rows.table
-    size = graph.size
-    inner = np.flatnonzero(policy >= 0)
-    count = np.diff(table["start"])[policy[inner]]
-    entry = concatenated_ranges(table["start"][policy[inner]], count)
-    matrix = csr_array(
-        (table["by"][entry], (inner.repeat(count), table["to"][entry])), shape=(size, size)
-    ).T.tocsr()
-    node, weight, _ = graph.root
-    mass: Floats = np.bincount(node, weight, minlength=size).astype(np.float64)
-    total = mass.copy()
-    for _ in range(sweeps):
-        mass = matrix @ mass
-        total += mass
-        if mass.sum() < 1e-6:
-            break
-    return total

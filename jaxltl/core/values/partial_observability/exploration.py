@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.values.partial_observability.beliefs import BeliefGraph
-from jaxltl.core.values.partial_observability.bounds import BeliefRows, NodeValues, visits
+from jaxltl.core.values.partial_observability.bounds import BeliefRows, NodeValues
 from jaxltl.core.values.partial_observability.certified_controllers import (
     Evaluated,
     Library,
@@ -19,16 +19,30 @@ from jaxltl.core.values.partial_observability.certified_controllers import (
     row_edges,
     steps_of_rows,
 )
+from jaxltl.core.values.partial_observability.interpolation import (
+    Interpolation,
+    improve_bounds,
+    visits,
+)
 from jaxltl.core.values.partial_observability.problem import BeliefProblem
 
 Report = Callable[[int, float, float], None]  # of the number of beliefs and the bounds so far
 _ROUND = 300  # beliefs that a round expands at least
 _SHARE = 0.3  # of the expanded beliefs that a round expands at most
+_IMPROVED = 0.5  # share of the time so far, beyond which the improvement of controllers waits
+_SHARE_INTERPOLATED = 0.1  # the same where decompositions of leaves are useful
 _REPEATS = 30  # evaluations of a controller that continues in its own steps
 _IMPROVING = 4  # pairs of these for each transition between beliefs, on average at most
 # Depth of the beliefs that a round expands below its first ones; the great one, in rounds 1, 2, 4, 8 ...,
 # finds controllers, the small one narrows the bound of all controllers.
 _DEPTH, _DEEP = 12, 300
+_MOVING = 1e-3  # share of mass that is left in cycles, at which the certified engine solves them
+_NARROW = 1e-3  # width of a leaf, relative to that of the initial belief, that needs no expansion
+_LONGEST = 8  # rounds
+_COVERED = 1e-3  # weight of a leaf that one expanded belief covers
+_USEFUL = (
+    1e-3  # share of the gap that new decompositions of leaves save, else they wait for some rounds
+)
 
 
 @dataclass(frozen=True)
@@ -61,13 +75,19 @@ class Exploration:
     problem: BeliefProblem
     library: Library
     graph: BeliefGraph
-    outer: Floats  # float64[nodes], bounds of all controllers at leaves
+    outer: Floats  # float64[nodes], bounds of all controllers
     inner: Floats  # float64[nodes], bounds of the library
     memory: Integers  # int[nodes], the memory state of the library that attains it
     best_outer: float
     best_inner: float
     best: tuple[Integers, Integers]  # the best controller: start memory and reached memory states
     end: float  # the time after which controllers are improved no more
+    interpolation: Interpolation
+    seconds: float = 0.0  # spent on the improvement of controllers
+    wait: tuple[int, int] = (
+        0,
+        1,
+    )  # rounds until leaves are decomposed again, and after the next failure
 
     def extend(self) -> None:
         """Bounds of the nodes that are new."""
@@ -103,6 +123,41 @@ class Exploration:
         some = self.graph.measures().take(leaves)
         self.inner[leaves], self.memory[leaves] = self.library.best_at(some)
 
+    def tighten(self, rows: BeliefRows, tolerance: float, room: int) -> tuple[BeliefRows, Floats]:
+        """Improves the bounds of all controllers; the rows, and the visits of a policy that attains them."""
+        rows, mass = self._sweep(rows, tolerance)
+        pause, longest = self.wait
+        leaves = np.flatnonzero((mass > 1e-9 * mass.sum()) & ~self.graph.expanded)
+        if pause or not leaves.size or not np.isfinite(self.gap):
+            self.wait = max(pause - 1, 0), longest
+            return rows, mass
+        if not self.interpolation.expand_states(leaves, room):
+            self.wait = longest, min(2 * longest, _LONGEST)
+            return rows, mass
+        self.extend()
+        rows = BeliefRows(self.graph, self.graph.rows())
+        mass = np.append(mass, np.zeros(self.graph.size - mass.size))
+        before = self.outer[leaves]
+        self.interpolation.refine(leaves[np.argsort(-mass[leaves], kind="stable")], self.outer)
+        rows, after = self._sweep(rows, tolerance)
+        saved = float(mass[leaves] @ np.abs(before - self.outer[leaves]))
+        useful = self.interpolation.is_useful = saved > _USEFUL * self.gap
+        self.wait = (0, 1) if useful else (longest, min(2 * longest, _LONGEST))
+        return rows, after
+
+    def _sweep(self, rows: BeliefRows, tolerance: float) -> tuple[BeliefRows, Floats]:
+        """Value iteration, then the certified engine if its policy stays in cycles."""
+        decomposed, problem = self.interpolation.leaves(), self.problem
+        bound = improve_bounds(rows, decomposed, self.outer, tolerance)
+        mass, moving = visits(rows, decomposed, bound.row)
+        # A maximal reward is finite only where all policies leave: there value iteration is enough.
+        if moving > _MOVING and not (problem.is_reward and problem.maximize):
+            solved = rows.solve(self.outer, safe=True, tolerance=min(1e-4, tolerance / 8))
+            better = np.minimum if problem.maximize else np.maximum
+            self.outer = better(self.outer, solved.value)
+            mass, _ = visits(rows, decomposed, solved.row)
+        return rows, mass
+
     def keep(self, evaluated: Evaluated, start: Integers) -> bool:
         """Keeps a controller if it is the best one."""
         sign = 1 if self.problem.maximize else -1
@@ -113,6 +168,13 @@ class Exploration:
         return True
 
     def improve(self, rows: BeliefRows) -> bool:
+        """Evaluates controllers of the explored beliefs, and counts the time; True if one is better."""
+        begin = time.monotonic()
+        better = self._improve(rows)
+        self.seconds += time.monotonic() - begin
+        return better
+
+    def _improve(self, rows: BeliefRows) -> bool:
         """Evaluates controllers of the explored beliefs; True if one is better.
 
         At its leaves a controller continues in the library; then, while that improves it, in its own steps.
@@ -205,6 +267,7 @@ def explore(
         inner,
         (none, none),
         begin + max_seconds,
+        Interpolation(graph),
     )
     initial = np.flatnonzero(problem.initial > 0)
     for start in library.start:
@@ -214,13 +277,15 @@ def explore(
     try:
         while True:
             rows = BeliefRows(graph, graph.rows())
-            bound = rows.solve(state.outer, safe=True, tolerance=min(1e-4, tolerance / 8))
-            at_root = rows.at_root(bound.value)
+            room = max_beliefs - int(graph.expanded.sum())
+            rows, mass = state.tighten(rows, tolerance, room)
+            at_root = rows.at_root(state.outer)
             narrower = min if problem.maximize else max
             state.best_outer = narrower(state.best_outer, at_root)
             expanded = int(graph.expanded.sum())
-            leaves = not graph.expanded.all()
-            if expanded >= 1.25 * checked + 20 or not leaves:
+            leaves = rows.reaches_leaves()
+            early = state.seconds <= _IMPROVED * (time.monotonic() - begin)
+            if (early and expanded >= 1.25 * checked + 20) or not leaves:
                 checked = expanded
                 state.improve(rows)
             rounds += 1
@@ -233,7 +298,7 @@ def explore(
             room = max_beliefs - expanded
             late = room <= 0 or time.monotonic() - begin > max_seconds
             depth = _DEEP if rounds & (rounds - 1) == 0 else _DEPTH
-            if late or not _grow(state, rows, bound, room, depth):
+            if late or not _grow(state, mass, room, depth):
                 state.improve(rows)
                 complete = state.gap <= tolerance
                 break
@@ -250,17 +315,23 @@ def explore(
 
 
 def _scores(state: Exploration, mass: Floats) -> Floats:
-    """Gaps of leaves, weighted by visits; the visits alone where a gap is infinite or undefined."""
+    """Visits of leaves that are not narrow, weighted by the share that no belief of a decomposition covers."""
+    share = 1 - state.interpolation.covered() + _COVERED
     with np.errstate(invalid="ignore"):
-        score = np.where(state.graph.expanded, 0, mass * np.abs(state.outer - state.inner))
-    return np.where(np.isfinite(score), score, mass)
+        width = abs(state.best_outer - state.best_inner)
+        narrow = np.abs(state.outer - state.inner) <= _NARROW * width
+        wide = ~(narrow & np.isfinite(width))
+    return np.where(state.graph.expanded | ~wide, 0, share * mass)
 
 
-def _grow(state: Exploration, rows: BeliefRows, bound: NodeValues, room: int, deepest: int) -> bool:
+def _grow(state: Exploration, mass: Floats, room: int, deepest: int) -> bool:
     """Expands leaves of the greatest gaps, weighted by visits, and some beliefs below them."""
     graph = state.graph
-    amount = min(room, max(_ROUND, int(_SHARE * graph.expanded.sum())))
-    mass = visits(rows, bound.row)
+    share = _SHARE
+    if state.interpolation.is_useful:
+        # Children have no decompositions yet: their bounds are too loose to choose the best action below.
+        share, deepest = _SHARE_INTERPOLATED, 0
+    amount = min(room, max(_ROUND, int(share * graph.expanded.sum())))
     score = _scores(state, mass)
     if not (score > 0).any():
         # The policy reaches no leaf: it stays in end components of inexact beliefs. The oldest leaves follow.
