@@ -30,7 +30,12 @@ from jaxltl.core.array_types import PyTree
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 
 HparamsT = TypeVar("HparamsT")
-Progress = Callable[[int, Mapping[str, np.ndarray]], None]  # steps, and the newest metrics ``[N]``
+
+
+class MetricsReport(Protocol):
+    """A function of the number of steps and of the newest metrics, ``[N]`` each."""
+
+    def __call__(self, num_steps: int, metrics: Mapping[str, np.ndarray], /) -> None: ...
 
 
 class Algorithm(Protocol):
@@ -55,7 +60,7 @@ class Training:
 
     seed: int = 0
     num_seeds: int = 1
-    report: Progress | None = None
+    report: MetricsReport | None = None
     stage: Callable[[str], None] = lambda name: None
     checkpoint: Path | None = None
     mesh: Mesh | None = None
