@@ -23,7 +23,7 @@ import jaxltl
 from jaxltl.app.command_options import Failure, compiling, over_devices, plain_errors
 from jaxltl.app import compilation, processes, run_job
 from jaxltl.app.compilation import float64
-from jaxltl.app.reports.drawing import artist
+from jaxltl.plot.drawing import artist
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
@@ -432,7 +432,7 @@ def solve(
             file.write(solving.strategies(model, results, model_file))
         proofs: Record = {}
         if certificate is not None:
-            from jaxltl.app.reports.certificate import certificate_lines, write_certificates
+            from jaxltl.io.certificate.results import certificate_lines, write_certificates
 
             answered = [solving.certifiable(model, result) for result in results]
             records = write_certificates(certificate.parent, answered, certificate.name)

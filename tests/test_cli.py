@@ -22,12 +22,12 @@ from jaxltl import __main__ as entry
 from jaxltl.app import run_job
 from jaxltl.app.command_options import plain_errors
 from jaxltl.app.compilation import FAST_COMPILATION, cache_directory, xla_flags
-from jaxltl.app.reports.drawing import artist, draw, drawing
 from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.mesh.cores import over_cores
 from jaxltl.io.hoa.hoa import read_hoa_stream
+from jaxltl.plot.drawing import artist, draw, drawing
 from tests.app.test_task import SHOWN, TASK, write  # noqa: F401
 
 QUICK = (
@@ -546,7 +546,7 @@ import sys, click
 from click.testing import CliRunner
 import jaxltl
 from jaxltl import __main__ as entry
-from jaxltl.app.reports.drawing import artist, draw, drawing
+from jaxltl.plot.drawing import artist, draw, drawing
 from jaxltl.app.compilation import cache_directory
 from jaxltl.cli import main
 assert CliRunner().invoke(main, ["--help"]).exit_code == 0
@@ -693,7 +693,7 @@ def test_a_dead_process_draws_nothing_and_loses_nothing(monkeypatch):
         def result(self):
             raise BrokenExecutor
 
-    monkeypatch.setattr("jaxltl.app.reports.drawing.ProcessPoolExecutor", Pool)
+    monkeypatch.setattr("jaxltl.plot.drawing.ProcessPoolExecutor", Pool)
     task = drawing("automaton", to_automaton("F a"), layout="matplotlib")
     with artist(apart=True) as begin:
         assert begin(task)().endswith(b"</svg>\n")

@@ -10,7 +10,6 @@ from typing import Annotated as Key
 import pytest
 
 from jaxltl.app.files import (
-    demonstrations,
     game,
     schema,
     task,
@@ -18,6 +17,7 @@ from jaxltl.app.files import (
     task_grounding,
     task_mlirl,
     task_todirl,
+    worlds,
 )
 from jaxltl.app.files.schema import Count, TomlTable, table
 from jaxltl.core.environments.task_environment import make_task_tables
@@ -133,7 +133,7 @@ def test_defaults_in_words_are_those_of_the_code():
     ):
         value = default(function, name)
         assert stated(kind, name) in (f"{value:g}" if type(value) is float else str(value).lower())
-    length = inspect.getsource(demonstrations.synthetic_demonstrations)
+    length = inspect.getsource(worlds.synthetic_demonstrations)
     assert f"table.length or {stated(task.SyntheticTable, 'length')}\n" in length
     ending = stated(task_environment.TaskTable, "ending")
     assert ending.partition(",")[0] == default(make_task_tables, "ending")

@@ -312,7 +312,7 @@ def certify_and_write(
     log: Path, query: CertificateQuery, source: LogSource, outputs: Outputs
 ) -> Record:
     """Runs the command, output files opened first, and returns the result."""
-    from jaxltl.app.reports.certificate import (
+    from jaxltl.io.certificate.results import (
         Certifiable,
         certificate_lines,
         formula_question,

@@ -19,12 +19,12 @@ from jaxltl.algos.common.guarantees import (
     step_bound,
 )
 from jaxltl.algos.common.seeds import Training, make_hparams
-from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
+from jaxltl.app.files.worlds import load_demonstrations, synthetic_demonstrations
 from jaxltl.app.files.task_mlirl import MlirlFile
 from jaxltl.app.files.worlds import MappedModel, load_world
-from jaxltl.app.job import about, plain, postfix as postfix
+from jaxltl.app.wording import about, plain, postfix as postfix
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.certificate import Certifiable, policy_certificate
+from jaxltl.io.certificate.results import Certifiable, policy_certificate
 from jaxltl.app.reports.learn import (
     live as live,
     pictures as pictures,
@@ -184,7 +184,7 @@ def summary(outcome: MlirlOutcome) -> Record:
     starts, best = np.flatnonzero(initial > 0), setup.guarantee.best
     impossible = starts[from_starts(model, best.upper)[starts] <= 0].tolist()
     result = {
-        **about(task),
+        **about(task.name, task.formula, task.learner.method),
         "in": task.learner.in_,
         "num_states": world.mdp.num_states,
         "num_memory": model.num_memory,

@@ -16,10 +16,11 @@ from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_controller import ControllerFile
 from jaxltl.app.files.worlds import grid_options
-from jaxltl.app.job import about, automaton_picture, learning_picture, over_seeds, plain
-from jaxltl.app.reports.certificate import Certifiable, formula_question
-from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.explorer import (
+from jaxltl.app.wording import about, plain
+from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds
+from jaxltl.io.certificate.results import Certifiable, formula_question
+from jaxltl.plot.drawing import Picture, drawing
+from jaxltl.plot.explorer import (
     LONGEST_RUN,
     Curves,
     Explorer,
@@ -153,7 +154,7 @@ def summary(outcome: ControllerOutcome) -> Record:
     task, history, explored = setup.task, outcome.learned.history, outcome.learned.explored
     return plain(
         {
-            **about(task),
+            **about(task.name, task.formula, task.learner.method),
             "num_states": setup.pomdp.num_states,
             "num_observations": setup.pomdp.num_observations,
             "observations": task.world.observations,

@@ -19,18 +19,13 @@ from jaxltl.algos.common.guarantees import check_formula
 from jaxltl.algos.common.seeds import Training, run_seeds
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
-from jaxltl.app.reports.drawing import Picture
+from jaxltl.plot.drawing import Picture
 from jaxltl.app.environment_setup import LearnerSetup, load_environment, load_world, make_method
 from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
-from jaxltl.app.reports.explorer import Curves, curves
+from jaxltl.plot.explorer import Curves, curves
 from jaxltl.app.files.task_environment import EnvironmentFile
-from jaxltl.app.job import (
-    about,
-    automaton_picture,
-    learning_picture,
-    over_seeds,
-    plain,
-)
+from jaxltl.app.wording import about, plain
+from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds
 from jaxltl.core.types import Status
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.continuous import Dynamics, certify_policy, counterexample, state_policy
@@ -300,7 +295,7 @@ def summary(outcome: EnvironmentOutcome) -> Record:
     status = history["status"][:, outcome.chosen]
     return plain(
         {
-            **about(task),
+            **about(task.name, task.formula, task.learner.method),
             "environment": {
                 "name": task.world.function,
                 "arguments": task.world.arguments,

@@ -18,10 +18,11 @@ from jaxltl.app.files.schema import read_bytes, read_map
 from jaxltl.app.files.task_grounding import GroundingFile
 from jaxltl.app.files.task_todirl import map_file
 from jaxltl.app.files.worlds import grid_options, MappedModel
-from jaxltl.app.job import about, automaton_picture, plain
-from jaxltl.app.reports.certificate import Certifiable, policy_certificate
-from jaxltl.app.reports.drawing import drawing, Picture
-from jaxltl.app.reports.explorer import Explorer
+from jaxltl.app.wording import about, plain
+from jaxltl.plot.drawing import automaton_picture
+from jaxltl.io.certificate.results import Certifiable, policy_certificate
+from jaxltl.plot.drawing import drawing, Picture
+from jaxltl.plot.explorer import Explorer
 from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
 from jaxltl.app.wording import Record, Result, counted, enclosure
 from jaxltl.core.models import (
@@ -260,7 +261,7 @@ def summary(outcome: GroundingOutcome) -> Record:
     task, problem, members = setup.task, setup.problem, outcome.members
     level, first = task.grounding.level, members[:_LIMIT].tolist()
     result = {
-        **about(task),
+        **about(task.name, task.formula, task.learner.method),
         "demonstrations": {
             "number": len(problem.length),
             "pairs": int(jnp.sum(problem.length)),

@@ -19,7 +19,7 @@ from jaxltl.algos import todirl
 from jaxltl.algos.common.guarantees import check_formula
 from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.algos.todirl.worlds import part_of
-from jaxltl.app.files.demonstrations import require_cosafe, synthetic_demonstrations
+from jaxltl.app.files.worlds import require_cosafe, synthetic_demonstrations
 from jaxltl.app.files.scenes import (
     cell_kinds,
     load_automata,
@@ -28,7 +28,7 @@ from jaxltl.app.files.scenes import (
     ObservedScene,
 )
 from jaxltl.app.files.task_todirl import TodirlFile
-from jaxltl.app.job import postfix as postfix
+from jaxltl.app.wording import postfix as postfix
 from jaxltl.app.reports.learn_todirl import (
     live as live,
     pictures as pictures,

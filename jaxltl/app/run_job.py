@@ -17,18 +17,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, cast
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
 from jaxltl.app.compilation import float64
-from jaxltl.app.protocols import Job, O, S, SomeJob, T
-from jaxltl.app.wording import Result
+from jaxltl.app.wording import Record, Result
 
 if TYPE_CHECKING:
     import numpy as np
     from tqdm import tqdm
 
+    from jaxltl.algos.common.seeds import Training
+    from jaxltl.app.files.task import FormulaFile
     from jaxltl.app.processes import ProcessGroup
-    from jaxltl.app.reports.drawing import Artist, Drawing, Picture
+    from jaxltl.plot.drawing import Artist, Drawing, Picture
+    from jaxltl.plot.explorer import Curves, Explorer
     from jaxltl.app.reports.page import Part, Report
 
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
@@ -41,6 +43,32 @@ _JOBS = {  # the module of each kind of job, and that of its task file
 }
 
 Drawn = Callable[[], bytes]  # waits for a picture
+T = TypeVar("T", bound="FormulaFile")
+S = TypeVar("S")
+O = TypeVar("O")  # noqa: E741
+
+
+class Job(Protocol[T, S, O]):
+    """A kind of learning job, with its task, setup and outcome; implemented by modules."""
+
+    @property
+    def DOUBLE(self) -> bool: ...  # True if figures are computed in double precision
+    @property
+    def FILE(self) -> type[T]: ...  # the schema of task files
+    @property
+    def report(self) -> Report: ...
+    def prepare(self, task: T, seed: int) -> S: ...  # the objects that a task file describes
+    def describe(self, setup: S) -> str: ...  # sizes of a setup, in one line
+    def learn(self, setup: S, training: Training) -> O: ...  # with several seeds, keeping one
+    def postfix(self, metrics: Mapping[str, np.ndarray]) -> dict[str, str]: ...  # newest metrics
+    def summary(self, outcome: O) -> Record: ...  # the contents of ``result.json``
+    def save(self, out: Path, outcome: O) -> None: ...  # writes the policy into a directory
+    def task_pictures(self, setup: S) -> list[Picture]: ...  # those that need no outcome
+    def pictures(self, outcome: O) -> list[Picture]: ...
+    def live(self, outcome: O) -> Sequence[Explorer | Curves]: ...  # of the report
+
+
+SomeJob: TypeAlias = Job[Any, Any, Any]  # of a kind that a task file decides
 
 
 @dataclass(frozen=True)
@@ -98,7 +126,7 @@ def learn(task_file: Path, options: RunOptions, console: Console) -> Finished | 
     group = console.group
     with group.together():
         job = job_of(task_file)
-    from jaxltl.app.job import fingerprint
+    from jaxltl.app.wording import fingerprint
 
     with group.together():
         task = job.FILE.read(task_file)
@@ -284,8 +312,8 @@ class _JobRun(Generic[T, S, O]):
         return self.console.artist(drawing)
 
     def _write(self, outcome: O, seconds: float, pictures: list[tuple[Picture, Drawn]]) -> Result:
-        from jaxltl.app.job import took
-        from jaxltl.app.reports.certificate import write_certificates
+        from jaxltl.app.wording import took
+        from jaxltl.io.certificate.results import write_certificates
 
         job, begin = self.job, self.console.artist
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]

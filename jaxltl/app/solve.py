@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
-from jaxltl.app.reports.certificate import Certifiable
+from jaxltl.io.certificate.results import Certifiable
 from jaxltl.app.wording import Record
 from jaxltl.core.automata import Automaton
 from jaxltl.core.language.resolve import constant_value, resolve

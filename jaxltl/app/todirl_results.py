@@ -11,7 +11,7 @@ from jaxltl.algos.todirl import TransferredReward, WorldDemands, Worlds
 from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app.files.scenes import ObservedScene
 from jaxltl.app.files.task_todirl import TodirlFile
-from jaxltl.app.job import about, plain
+from jaxltl.app.wording import about, plain
 from jaxltl.app.reports.steps import front_entry
 from jaxltl.app.wording import Record, enclosure
 from jaxltl.core.types import Status
@@ -70,7 +70,7 @@ def summary(outcome: TodirlOutcome) -> Record:
     setup, task, demands = outcome.setup, outcome.setup.task, outcome.setup.demands
     pairs = [int(np.sum(trajectories.length)) for trajectories in demands.demonstrations]
     result = {
-        **about(task),
+        **about(task.name, task.formula, task.learner.method),
         "memory": task.memory,
         "label_on": task.label_on,
         "radius": task.learner.radius,

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import jaxltl
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Result = Mapping[str, Any]  # contents of result.json
 Record = dict[str, Any]  # values by name: JSON objects, keyword arguments
@@ -17,3 +24,57 @@ def enclosure(*numbers: object) -> Record:
 def counted(number: int, noun: str) -> str:
     """Number with its noun, in the plural unless the number is 1."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+# --- entries of result.json -----------------------------------------------------------------------
+
+
+def about(task: str, formula: str, method: str) -> Record:
+    """The first entries of a result."""
+    return {"task": task, "formula": formula, "method": method}
+
+
+def took(seconds: float) -> Record:
+    """The last entries of a result."""
+    import jax
+
+    versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
+    return {"seconds": round(seconds, 2), "versions": versions}
+
+
+def plain(value: object) -> Any:
+    """A value of JSON: arrays become lists, NaN and infinity become None."""
+    import jax  # here, since mistakes in files are reported before it is imported
+    import numpy as np
+
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return plain(np.asarray(value).tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
+    """Fingerprint of a run of a task, which a checkpoint must have to be resumed."""
+    import jax
+    import jax.numpy as jnp
+
+    parts = [
+        digest,
+        seed,
+        num_seeds,
+        jaxltl.__version__,
+        jax.__version__,
+        str(jnp.result_type(float)),
+    ]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+
+
+def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Least loss and greatest gradient norm over seeds, for the progress bar."""
+    return {
+        "loss": f"{metrics['loss'].min():.4f}",
+        "gradient": f"{metrics['gradient_norm'].max():.1e}",
+    }

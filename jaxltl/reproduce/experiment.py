@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import jax
 
-from jaxltl.app.job import plain
+from jaxltl.app.wording import plain
 from jaxltl.app.wording import Record
 from jaxltl.io.templates import render
 

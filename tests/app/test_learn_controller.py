@@ -9,8 +9,8 @@ import jaxltl as jl
 from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn_controller as job
 from jaxltl.app.files.task_controller import ControllerFile
-from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.run_job import job_of
+from jaxltl.plot.explorer import Explorer
 
 TEXT = """
 [world]
@@ -74,7 +74,7 @@ def test_two_rooms_need_two_memory_states_and_have_a_certified_controller(outcom
 
 
 def test_the_certificate_is_of_the_controller(outcome, tmp_path):
-    from jaxltl.app.reports.certificate import write_certificates
+    from jaxltl.io.certificate.results import write_certificates
 
     (record,) = write_certificates(tmp_path, job.certifiable(outcome))
     assert record["file"] == "certificate.umb" and "of a given policy is >=" in record["claims"][0]
@@ -101,7 +101,7 @@ def test_trajectories_have_beliefs_that_contain_the_robot(outcome):
 
 
 def test_the_report_shows_the_machine_beliefs_and_bounds(outcome):
-    from jaxltl.app.reports.drawing import draw
+    from jaxltl.plot.drawing import draw
 
     result = {
         **job.summary(outcome),

@@ -10,8 +10,8 @@ import jaxltl as jl
 from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn_grounding as job
 from jaxltl.app.files.task_grounding import GroundingFile
-from jaxltl.app.job import took
 from jaxltl.app.run_job import job_of
+from jaxltl.app.wording import took
 
 TEXT = """
 [world]

@@ -12,9 +12,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from jaxltl.app.reports import explorer as exploring
-from jaxltl.app.reports.drawing import Picture, draw, drawing
-from jaxltl.app.reports.explorer import (
+from jaxltl.app.reports.page import render_page
+from jaxltl.core.models.construct.lifting import lift_trajectories
+from jaxltl.core.models.product import product
+from jaxltl.core.models.trajectories import make_trajectories
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
+from jaxltl.plot import explorer as exploring
+from jaxltl.plot.drawing import Picture, draw, drawing
+from jaxltl.plot.explorer import (
     START,
     Explorer,
     MapLayer,
@@ -22,12 +28,6 @@ from jaxltl.app.reports.explorer import (
     demonstrated_runs,
     learned_runs,
 )
-from jaxltl.app.reports.page import render_page
-from jaxltl.core.models.construct.lifting import lift_trajectories
-from jaxltl.core.models.product import product
-from jaxltl.core.models.trajectories import make_trajectories
-from jaxltl.envs.gridworld import ACTIONS, gridworld
-from jaxltl.envs.text_map import parse_map
 
 MAP = """
 . . a .

@@ -12,10 +12,9 @@ import pytest
 
 import jaxltl
 from jaxltl.app import run_job
-from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
 from jaxltl.app.files.schema import File
 from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.files.worlds import load_world
+from jaxltl.app.files.worlds import load_demonstrations, load_world, synthetic_demonstrations
 from jaxltl.app.processes import ProcessGroup
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, plain, short_name
+from jaxltl.app.wording import plain
+from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.explorer import (
+from jaxltl.plot.drawing import Picture, drawing
+from jaxltl.plot.explorer import (
     START,
     Curves,
     Explorer,

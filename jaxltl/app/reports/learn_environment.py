@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from jaxltl.app.reports.drawing import Picture
+from jaxltl.plot.drawing import Picture
 from jaxltl.app.reports.page import number, probability, Report
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.array_types import Floats

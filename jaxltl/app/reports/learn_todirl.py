@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app.files.scenes import ObservedScene
-from jaxltl.app.job import automaton_picture, learning_picture, over_seeds, short_name
+from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds, short_name
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.explorer import (
+from jaxltl.plot.drawing import Picture, drawing
+from jaxltl.plot.explorer import (
     LONGEST_RUN,
     START,
     Curves,

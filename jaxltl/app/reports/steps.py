@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from jaxltl.algos.common.guarantees import StepBound, neg_log_likelihood
-from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.plot.drawing import Picture, drawing
 from jaxltl.app.reports.page import number, probability
 from jaxltl.app.wording import Record, Result, enclosure
 from jaxltl.core.models import Product

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import SolvedGame, task_text
-from jaxltl.app.job import plain, took
+from jaxltl.app.wording import plain, took
 from jaxltl.app.run_job import write_results
-from jaxltl.app.reports.certificate import Certifiable, formula_question, write_certificates
-from jaxltl.app.reports.drawing import Picture, draw
-from jaxltl.app.reports.explorer import Explorer, ReportTrajectory
+from jaxltl.io.certificate.results import Certifiable, formula_question, write_certificates
+from jaxltl.plot.drawing import Picture, draw
+from jaxltl.plot.explorer import Explorer, ReportTrajectory
 from jaxltl.app.reports.page import Report, aligned, number
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.games import GR1, Permissive, Winning

@@ -94,13 +94,16 @@ class Synthesis:
     @property
     def wins(self) -> np.ndarray:
         """``bool[S]``: the system wins the runs that start in a state of the world."""
-        return np.asarray(self.winning.region)[self.nodes.start]
+        wins: np.ndarray = np.asarray(self.winning.region)[self.nodes.start]
+        return wins
 
     @functools.cached_property
     def base(self) -> np.ndarray:
         """``int[N']``: the node of each state of the restricted game."""
         assert self.strategy is not None and self.restricted is not None
-        return np.asarray(self.strategy.base_state)[np.asarray(self.restricted.base_state)]
+        base = np.asarray(self.strategy.base_state)
+        nodes: np.ndarray = base[np.asarray(self.restricted.base_state)]
+        return nodes
 
     @property
     def starts(self) -> np.ndarray:
@@ -110,7 +113,8 @@ class Synthesis:
     @property
     def lost_starts(self) -> np.ndarray:
         """Those from which the environment wins."""
-        return self.starts[~self.wins[self.starts]]
+        lost: np.ndarray = self.starts[~self.wins[self.starts]]
+        return lost
 
 
 def synthesize(

@@ -1,4 +1,4 @@
-"""Certificates beside the results of commands, for ``jaxltl verify``."""
+"""Certificates beside results: written, verified, and described in lines of text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from jaxltl.app.wording import Record
+from jaxltl.core.array_types import PyTree
 from jaxltl.core.logic.ltl import parse_ltl
 from jaxltl.core.models.multiplayer import MultiplayerGame
 from jaxltl.core.models.pomdp import POMDP
@@ -26,7 +26,7 @@ class Certifiable:
     model: Model | MultiplayerGame | POMDP
     solution: Solution | DataGuarantee | FiniteMemoryPolicy | None
     question: str
-    options: Record = field(default_factory=dict)
+    options: dict[str, PyTree] = field(default_factory=dict)
     num_nodes: int = 0  # an estimate, compared with `MAX_NODES`
     reason: str = ""  # why there is none
 
@@ -53,7 +53,7 @@ def policy_certificate(
 
 def write_certificates(
     directory: Path, results: Sequence[Certifiable] | str, name: str = "certificate.umb"
-) -> list[Record]:
+) -> list[dict[str, PyTree]]:
     """Writes a certificate of each result, and verifies it; or the reason why there is none.
 
     Several files are numbered. The records have `file`, `claims` and `trust`, or `reason`.
@@ -63,7 +63,7 @@ def write_certificates(
 
     if isinstance(results, str):
         return [{"reason": results}]
-    records: list[Record] = []
+    records: list[dict[str, PyTree]] = []
     for i, one in enumerate(results):
         stem, suffix = Path(name).stem, Path(name).suffix
         path = directory / (name if len(results) == 1 else f"{stem}_{i + 1}{suffix}")
@@ -85,7 +85,7 @@ def write_certificates(
     return records
 
 
-def certificate_lines(records: Sequence[Record], directory: Path = Path()) -> list[str]:
+def certificate_lines(records: Sequence[dict[str, PyTree]], directory: Path = Path()) -> list[str]:
     """The records as lines of text: what each proves, takes on trust, and the command."""
     lines = []
     for record in records:
