@@ -7,7 +7,7 @@ Each part has a class and data attributes (``data-memory``, ``data-from`` and ``
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,8 @@ from jaxltl.core.automata import Automaton
 from jaxltl.envs.text_map import parse_map
 from jaxltl.io.templates import render
 from jaxltl.plot import layout
+from jaxltl.plot.live_graph import live_graph, svg
+from jaxltl.plot.machines import Transition, live_controller
 from jaxltl.plot.automata import edge_texts, on_the_host
 from jaxltl.plot.board import STEPS, triangle
 from jaxltl.plot.maps import kind_colors, kind_marks, TINTS
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 CELL = 40
 _MARGIN = 22
 _NAMED = 24  # cells a side, beyond which cells have marks and a legend
-_INCH = 96.0
 
 
 def live_automaton(automaton: Automaton, name: str) -> str:
@@ -70,77 +71,6 @@ def live_automaton(automaton: Automaton, name: str) -> str:
         ),
         f"An automaton of {len(table.delta)} states; a table follows",
     )
-
-
-def live_graph(
-    graph: layout.GraphLayout,
-    name: str,
-    initial: int,
-    states: Sequence[tuple[str, str]],
-    kind_of_edge: Callable[[layout.Key], str],
-    label: str,
-) -> str:
-    """A graph as SVG in which each state is a button.
-
-    Args:
-      graph, name, initial: the layout, the prefix of the ids, and the state with an arrow from outside.
-      states: the classes and the title of each state.
-      kind_of_edge: the classes of an edge.
-      label: the text alternative.
-
-    Example:
-      >>> texts = {(0, 0, 0): (("", "a"),)}
-      >>> graph = layout.arrange(np.array([[0]]), 0, np.array([False]), texts)
-      >>> live_graph(graph, "g", 0, [("state", "memory 0")], lambda key: "edge", "one").count("<text")
-      2
-    """
-    height = graph.size[1]
-
-    def at(points: ArrayLike) -> NDArray[np.float64]:
-        """Converts inches with y up to pixels with y down."""
-        return (np.asarray(points, float) * [1, -1] + [0, height]) * _INCH
-
-    labels = {label.key: label for label in graph.labels}
-    edges = []
-    for edge in graph.edges:
-        source, target, _ = edge.key
-        lines = _lines(labels[edge.key], at) if edge.key in labels else []
-        edges.append((kind_of_edge(edge.key), source, target, _arrow(at(edge.curve)), lines))
-    radius = layout.RADIUS * _INCH
-    start = at(graph.position[initial])
-    tail, rim = start - [radius + 40, 0], start - [radius + 2, 0]
-    places = at(graph.position).tolist()
-    return _svg(
-        "automaton",
-        f"{name}-automaton",
-        (0, 0, *np.array(graph.size) * _INCH),
-        label,
-        prefix=name,
-        edges=edges,
-        start=_arrow(np.array([tail, (tail + rim) / 2, rim])),
-        states=[(kind, x, y, text) for (kind, text), (x, y) in zip(states, places, strict=True)],
-        radius=radius,
-    )
-
-
-def _lines(
-    label: layout.Label, at: Callable[[ArrayLike], NDArray[np.float64]]
-) -> list[tuple[float, float, str, str]]:
-    """The guards of an edge, one per line, with their places and marks."""
-    x, y = at(label.center).tolist()
-    middle = (len(label.rows) - 1) / 2
-    return [(x, y + (i - middle) * 16, *row) for i, row in enumerate(label.rows)]
-
-
-def _arrow(curve: NDArray[np.float64]) -> tuple[str, str]:
-    """Paths of a Bezier curve and of its arrow head."""
-    along = curve[-1] - curve[-2]
-    along = along / max(float(np.hypot(*along)), 1e-9)
-    side, end = np.array([-along[1], along[0]]) * 4, curve[-1]
-    base = end - along * 9
-    first, *rest = [f"{x:.1f} {y:.1f}" for x, y in [*curve[:-1], base]]
-    head = " L".join(f"{x:.1f} {y:.1f}" for x, y in (base + side, end, base - side))
-    return f"M{first} {'Q' if len(curve) == 3 else 'C'}{' '.join(rest)}", f"M{head}Z"
 
 
 class _Ground(NamedTuple):
@@ -232,7 +162,7 @@ def live_map(
         x += 0.62 * font * (len(key) + 3)
     below = y + font - rows * CELL - beyond if keys else 0
     low, more = -beyond - margin, 2 * beyond + margin + 2
-    return _svg(
+    return svg(
         "map",
         f"{name}-map",
         (low, low, columns * CELL + more, rows * CELL + more + below),
@@ -324,7 +254,7 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
         ticks.append((margin - 6, f"{float(down(np.array(value))):.1f}", "end", text))
     for step, anchor, text in ((x[0], "start", ""), (x[-1], "end", "step ")):
         ticks.append((f"{float(across(step)):.1f}", high - 9, anchor, f"{text}{step:g}"))
-    return _svg(
+    return svg(
         "curve",
         f"{name}-curve",
         (0, 0, wide, high),
@@ -335,13 +265,6 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
         axis=f"M{margin} 6V{high - below}H{wide - 6}",
         ticks=ticks,
     )
-
-
-def _svg(
-    template: str, name: str, box: Sequence[float], label: str, zoom: float = 1.0, **parts: object
-) -> str:
-    frame = {"name": name, "kind": template, "box": box, "label": label, "zoom": zoom}
-    return render("jaxltl.plot", f"{template}.svg", **frame | parts)
 
 
 # --- animated trajectories ----------------------------------------------------------------
@@ -356,8 +279,11 @@ def playback(
     cells: str | NDArray[np.str_],
     states: ArrayLike,
     *,
-    automaton: Automaton | None = None,
+    automaton: Automaton | Sequence[Transition] | None = None,
     memory: ArrayLike | None = None,
+    actions: Sequence[str] = tuple(STEPS),
+    beliefs: ArrayLike | None = None,
+    window: int = 0,
     label: str = "",
     wait: float = 0.4,
     num_plays: int = 3,
@@ -370,7 +296,10 @@ def playback(
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       states: ``int[T]``, the cells of the run, in order.
-      automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
+      automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither. In its
+        place also the transitions of a controller, as for :func:`jaxltl.plot.controller`, and `actions`.
+      beliefs, window: ``float[T, S]``, shades of the cells where the robot may be at each step, and the
+        side of the frame of cells that it sees.
       label: the text alternative; default the number of steps.
       wait, num_plays, wall: seconds for each step, the number of repetitions, and the kind of walls.
 
@@ -383,7 +312,11 @@ def playback(
     """
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     run = _whole("states", states, kinds.size, "cells")
-    panes = [_plain(live_map(kinds, "run", {}, runs=[run], wall=wall))]
+    shades = _belief_groups(beliefs, len(run), kinds.shape)
+    panes = [
+        _plain(live_map(kinds, "run", {}, runs=[run], window=window or bool(shades), wall=wall))
+    ]
+    panes[0] = panes[0].replace('<g class="belief"></g>', shades)
     place = np.stack(np.divmod(run, kinds.shape[1])[::-1], 1) * CELL + CELL // 2
     done = np.cumsum([0.0, *np.hypot(*np.diff(place, axis=0).T)])
     animations = [
@@ -395,14 +328,33 @@ def playback(
             "linear",
         ),
     ]
+    corner = place - CELL // 2 - (window // 2) * CELL
+    if window:
+        frames = [f"transform:translate({x}px,{y}px)" for x, y in corner]
+        animations.append(("see", ".window", frames, "linear"))
+    if shades:
+        animations += [
+            (
+                f"belief{t}",
+                f".belief{t}",
+                [f"opacity:{int(t == now)}" for now in range(len(run))],
+                "step-end",
+            )
+            for t in range(len(run))
+        ]
     if automaton is not None:
-        states_of_it = _whole("memory", memory, len(automaton.delta), "states of the automaton")
+        if isinstance(automaton, Automaton):
+            count, pane = len(automaton.delta), live_automaton(automaton, "task")
+        else:
+            count = 1 + max((x[1] for x in automaton), default=0)
+            pane = live_controller(automaton, "task", actions)
+        states_of_it = _whole("memory", memory, count, "states of the automaton")
         if len(states_of_it) != len(run):
             raise ValueError(
                 f"memory has {len(states_of_it)} steps and the run {len(run)}; give "
                 "the automaton's state at each step of the run."
             )
-        panes.append(_plain(live_automaton(automaton, "task")))
+        panes.append(_plain(pane))
         animations += [
             (
                 f"{tag}{q}",
@@ -440,6 +392,27 @@ def playback(
         length=max(done[-1], 1),
         **_COLORS,
     )
+
+
+def _belief_groups(beliefs: ArrayLike | None, steps: int, shape: tuple[int, ...]) -> str:
+    """Groups of shaded cells, one for each step."""
+    if beliefs is None:
+        return ""
+    rows = np.asarray(beliefs, float)
+    if rows.shape != (steps, shape[0] * shape[1]):
+        raise ValueError(
+            f"beliefs has shape {list(rows.shape)}; give [{steps}, {shape[0] * shape[1]}], a distribution "
+            "over the cells of the map for each step."
+        )
+    groups = []
+    for t, row in enumerate(rows):
+        cells = "".join(
+            f'<rect x="{s % shape[1] * CELL}" y="{s // shape[1] * CELL}" width="{CELL}" height="{CELL}" '
+            f'fill-opacity="{0.12 + 0.78 * row[s]:.2f}"/>'
+            for s in np.flatnonzero(row > 5e-5).tolist()
+        )
+        groups.append(f'<g class="belief belief{t}">{cells}</g>')
+    return "".join(groups)
 
 
 def _whole(name: str, values: ArrayLike | None, count: int, noun: str) -> list[int]:

@@ -15,7 +15,7 @@ from jaxltl.envs.text_map import parse_map, plain_kind
 from jaxltl.plot import layout
 from jaxltl.plot.automata import draw_graph, draw_start, draw_state
 from jaxltl.plot.board import ROBOT, WALL, rule_cells, short_name
-from jaxltl.plot.live import live_graph
+from jaxltl.plot.live_graph import live_graph
 from jaxltl.plot.maps import kind_colors
 from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, write
 

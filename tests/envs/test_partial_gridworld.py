@@ -167,3 +167,32 @@ def _distributions(pomdp, policy):
 def test_policies_that_update_on_exit_are_refused(rooms, answer):
     with pytest.raises(ValueError, match="label_on"):
         jl.values.mealy_machine(rooms, answer.policy.replace(label_on="exit"))
+
+
+def test_the_controller_succeeds_in_gymnasium_as_often_as_certified(rooms, answer):
+    """In an environment that knows the map alone; the seed is fixed."""
+    gymnasium = pytest.importorskip("gymnasium")
+    kind, start = parse_map(TWO_ROOMS).ravel(), np.flatnonzero(rooms.initial)
+    seen, step = np.asarray(rooms.observation), (-13, 13, -1, 1)
+
+    class Rooms(gymnasium.Env):
+        observation_space = gymnasium.spaces.Discrete(rooms.num_observations)
+        action_space = gymnasium.spaces.Discrete(4)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.cell = int(self.np_random.choice(start))
+            return seen[self.cell], {"verdict": 0}
+
+        def step(self, action):
+            if self.np_random.random() < 0.1:
+                action = self.np_random.choice([2, 3] if action < 2 else [0, 1])
+            ahead = self.cell + step[action]
+            self.cell = ahead if kind[ahead] != "#" else self.cell
+            verdict = {"g": 1, "x": 2, "o": 2}.get(kind[self.cell], 0)
+            return seen[self.cell], 0.0, verdict > 0, False, {"verdict": verdict}
+
+    env = gymnasium.wrappers.TimeLimit(Rooms(), 2000)
+    found = jl.envs.run_policy(env, answer.policy, num_episodes=400, confidence=1 - 1e-4)
+    assert found.success.lower < float(answer.lower) < found.success.upper
+    assert found.success.upper < 0.94  # what a robot that sees its place attains

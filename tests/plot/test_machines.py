@@ -39,3 +39,26 @@ def test_windows_show_what_is_seen_and_not_what_is_hidden():
     figure = plot.windows("a . x . b", [0, 1, 2, 1, 3], hidden=["x"])
     assert [axes.get_title() for axes in figure.axes] == ["0", "1", "2", "3"]
     assert _texts(figure) == {"a", "b"}
+
+
+def test_a_run_is_played_with_beliefs_and_the_controller():
+    beliefs = [[0.5, 0, 0.5], [0, 1, 0]]
+    text = plot.playback(
+        "a . b",
+        [0, 1],
+        beliefs=beliefs,
+        window=3,
+        automaton=MACHINE,
+        memory=[0, 1],
+        actions=["up", "wait"],
+    )
+    shades = [text.split(f'class="belief belief{t}">')[1].split("</g>")[0] for t in (0, 1)]
+    assert [x.count("<rect") for x in shades] == [2, 1]
+    assert 'fill-opacity="0.51"' in shades[0] and 'fill-opacity="0.90"' in shades[1]
+    assert 'class="window"' in text and "wait .70" in text and "@keyframes belief1" in text
+    assert "belief" not in plot.playback("a . b", [0, 1]).split("</style>")[1]
+
+
+def test_beliefs_of_another_map_are_refused():
+    with pytest.raises(ValueError, match=r"beliefs has shape \[1, 3\]"):
+        plot.playback("a . b", [0, 1], beliefs=[[1, 0, 0]])
