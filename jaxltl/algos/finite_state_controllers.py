@@ -6,10 +6,11 @@ chain of states and memory states,
 
     v(m, s) = sum_a pi(a | m, o(s)) (g(s, a) + discount sum_t P(t | s, a) sum_n eta(n | m, o(t)) v(n, t)),
 
-which is solved, and differentiated implicitly; before the first observation the memory state is 0. Many
-starts are a ``vmap`` over keys. The learned value certifies nothing;
-``reachability_probability(pomdp, target, policy=...)`` or ``total_reward`` of the policy do, and
-:func:`learn_formula` learns and certifies a controller for a formula.
+which is solved, and differentiated implicitly; before the first observation the memory state is 0.
+``make_problem(pomdp, formula=...)`` takes any formula of linear temporal logic. Many starts are a ``vmap`` over
+keys. The learned value certifies nothing; ``reachability_probability(pomdp, target, policy=...)`` or
+``total_reward`` of the policy do, and :func:`learn_formula` learns and certifies a controller for a co-safe or
+safe formula.
 
 Example: a hidden coin; one guess, right in state 2. A look, which costs nothing, shows the coin.
   >>> import jax, numpy as np, jaxltl as jl
@@ -57,6 +58,11 @@ from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.linear import solve_linear
 from jaxltl.core.values.partial_observability.chains import controlled_chain
+from jaxltl.core.values.partial_observability.long_run import (
+    LEAK,
+    satisfaction_problem,
+    without_rare_actions,
+)
 from jaxltl.core.values.partial_observability.problem import (
     BeliefProblem,
     discounted_problem,
@@ -108,9 +114,11 @@ def make_problem(
     stay: Array | str | None = None,
     reward: Reward = None,
     discount: float | None = None,
+    formula: FormulaLike | None = None,
+    leak: float | None = LEAK,
     objective: str = "max",
 ) -> Problem:
-    """A checked :class:`Problem`.
+    """A checked :class:`Problem`: of a target, of a reward, or of a formula of linear temporal logic.
 
     Args:
       pomdp: a concrete POMDP.
@@ -121,14 +129,26 @@ def make_problem(
         :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: of rewards, below 1; default: none, for which every reachable state must be able to reach
         the target.
+      formula: satisfied in the product with its automaton; instead of a target and a reward.
+      leak: the probability in (0, 1) with which a transition of the least priority ends a run of the smooth
+        objective of a formula, see :mod:`~jaxltl.core.values.partial_observability.long_run`. None: the
+        exact satisfaction probability, which of random actions is often 0.
       objective: ``"max"`` or ``"min"``.
 
     Raises:
-      ValueError: neither a target nor a discounted reward, or a state that cannot reach the target of an
-        undiscounted reward.
+      ValueError: neither a target, a discounted reward nor a formula, several of them, or a state that
+        cannot reach the target of an undiscounted reward.
     """
     choice("objective", objective, ("max", "min"))
     maximize = objective == "max"
+    if formula is not None:
+        if target is not None or stay is not None or reward is not None or discount is not None:
+            raise ValueError(
+                "make_problem: formula is given; leave out target, stay, reward and discount."
+            )
+        if leak is not None:
+            require_in_range("leak", leak, Range(0, 1, open_above=True, open_below=True))
+        return _arrays(satisfaction_problem(pomdp, formula, maximize=maximize, leak=leak), 1.0)
     if reward is None:
         if target is None or discount is not None:
             raise ValueError(
@@ -361,15 +381,19 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
-def policy(state: State, problem: Problem, hparams: Hparams) -> FiniteMemoryPolicy:
+def policy(
+    state: State, problem: Problem, hparams: Hparams, *, least: float = 0.0
+) -> FiniteMemoryPolicy:
     """The finite-memory policy over observations: random actions, and the likeliest memory updates.
 
-    ``int[O, M]`` updates on entry, from memory state 0 before the first observation; on the host.
+    ``int[O, M]`` updates on entry, from memory state 0 before the first observation; on the host. Actions of
+    at most the probability `least` are left out: in the long run a rare action that violates a formula is
+    taken almost surely.
     """
     del hparams
     logits = jnp.where(problem.available, state.parameters.action, -jnp.inf)
     action = np.asarray(jax.nn.softmax(logits), np.float64).swapaxes(0, 1)
-    action = action / action.sum(-1, keepdims=True)
+    action = without_rare_actions(action, least)
     update = np.asarray(state.parameters.update).argmax(-1).T.astype(np.int32)
     return FiniteMemoryPolicy(action, update[:, 0].copy(), update)
 

@@ -7,7 +7,10 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import finite_state_controllers as fsc
+from jaxltl.core.values.partial_observability.long_run import controller_satisfaction
 from tests.algos.cases import LearnerCase
+
+FORMULA = "(G F right & G !wrong) | G F wrong"
 
 
 def coin():
@@ -62,7 +65,14 @@ def test_a_lane_is_its_own_run(learned):
 
 
 @pytest.mark.parametrize(
-    "kind", ["reach", *(pytest.param(k, marks=pytest.mark.slow) for k in ("reward", "discounted"))]
+    "kind",
+    [
+        "reach",
+        *(
+            pytest.param(k, marks=pytest.mark.slow)
+            for k in ("reward", "discounted", "formula", "exact")
+        ),
+    ],
 )
 def test_values_are_those_of_the_chain_and_derivatives_those_of_differences(kind):
     with jax.enable_x64(True):
@@ -70,6 +80,8 @@ def test_values_are_those_of_the_chain_and_derivatives_those_of_differences(kind
         cost = np.ones(pomdp.fully_observable.num_rows)
         problem = {
             "reach": lambda: fsc.make_problem(coin(), "right"),
+            "formula": lambda: fsc.make_problem(coin(), formula=FORMULA),
+            "exact": lambda: fsc.make_problem(coin(), formula=FORMULA, leak=None),
             "reward": lambda: fsc.make_problem(pomdp, "middle", reward=cost, objective="min"),
             "discounted": lambda: fsc.make_problem(
                 pomdp, "middle", reward=cost, discount=0.9, objective="min"
@@ -92,6 +104,14 @@ def test_values_are_those_of_the_chain_and_derivatives_those_of_differences(kind
             fsc.start_at(jax.random.key(0), sharp, problem, hparams), problem, hparams
         )
         value = float(evaluate(problem, sharp)[0])
+        if kind == "formula":
+            low, high = controller_satisfaction(coin(), policy, FORMULA)
+            assert low - 0.1 < value < high  # the smooth objective is below
+            return
+        if kind == "exact":
+            low, high = controller_satisfaction(coin(), policy, FORMULA)
+            assert low - 1e-6 < value < high + 1e-6
+            return
         if kind == "reach":
             known = jl.reachability_probability(coin(), "right", policy=policy)
         elif kind == "reward":
@@ -106,12 +126,30 @@ def test_values_are_those_of_the_chain_and_derivatives_those_of_differences(kind
         assert abs(float(known.value) - value) < 1e-6 * max(1, value)
 
 
+@pytest.mark.slow
+def test_controllers_learn_formulas_without_rare_actions():
+    problem = fsc.make_problem(coin(), formula="G F right & G !wrong")
+    hparams = fsc.Hparams(learning_rate=0.5)
+    train = jax.jit(jax.vmap(lambda key: fsc.train(key, problem, hparams, num_steps=60)))
+    state, metrics = train(jax.random.split(jax.random.key(0), 4))
+    best = jax.tree.map(lambda x: x[int(metrics.value[:, -1].argmax())], state)
+    learned = fsc.policy(best, problem, hparams, least=0.1)
+    low, high = controller_satisfaction(coin(), learned, "G F right & G !wrong")
+    assert low == high == 1
+    rare = fsc.policy(best, problem, hparams)
+    assert ((rare.action > 0).sum(-1) >= (learned.action > 0).sum(-1)).all()
+
+
 def test_wrong_problems():
     pomdp = coin()
     reward = np.ones(pomdp.fully_observable.num_rows)
     for options in ({}, {"reward": reward}, {"target": "right", "discount": 0.9}):
         with pytest.raises(ValueError, match="make_problem"):
             fsc.make_problem(pomdp, **options)
+    with pytest.raises(ValueError, match="formula is given"):
+        fsc.make_problem(pomdp, "right", formula="F right")
+    with pytest.raises(ValueError, match="leak=0"):
+        fsc.make_problem(pomdp, formula="G F right", leak=0)
     with pytest.raises(ValueError, match="cannot reach"):
         fsc.make_problem(pomdp, "right", reward=reward)
 

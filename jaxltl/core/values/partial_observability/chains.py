@@ -14,7 +14,9 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, make_sp
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
-from jaxltl.core.types import describe_row, row_tolerance
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.sparse.solvers.shortest_path_problem import Enclosure
+from jaxltl.core.types import Solution, Status, describe_row, row_tolerance
 
 Act = Callable[[Integers, Integers], Floats]  # weights [n, A] of memory states and observations
 # the memory state after a step, of memory states and the observations that are left and entered
@@ -227,3 +229,18 @@ def controlled_chain(pomdp: POMDP, policy: FiniteMemoryPolicy) -> SparseMDP:
         rewards=rewards,
         valuation=valuation | {"state": chain.state, "memory": chain.memory},
     )
+
+
+def chain_solution(bounds: Enclosure, initial: Floats) -> Solution:
+    """The solution of a chain, whose ``at_initial`` has the bounds from the initial belief."""
+    parts: dict[str, Array] = {
+        "value": bounds.value,
+        "policy": bounds.row,
+        "lower": bounds.lower,
+        "upper": bounds.upper,
+        "residual": np.float64(bounds.residual),
+        "num_steps": np.int32(bounds.rounds),
+        "status": np.int32(Status.CONVERGED),
+        "initial": initial,
+    }
+    return Solution(**parts, method=bounds.method)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _DECAY, _SQUARES = 0.9, 0.99  # of Adam (Kingma and Ba 2015)
 # memory states, scale of the random logits and rate of each start
 _STARTS = ((1, 0.0, 0.3), (1, 0.0, 0.05), (2, 0.5, 0.2), (2, 1.0, 0.1), (3, 0.5, 0.2))
 _STEPS = 80  # of a start
+_DENSE = 150  # pairs of states and memory states of full matrices
 _LARGE = 1200  # pairs of states and memory states of more than one start
 _SHARE = 0.1  # of the seconds of an exploration
 _SLOW = 1e5  # expected steps beyond which a chain counts as singular
@@ -94,6 +96,8 @@ class SoftmaxAscent:
         problem, seen = self.problem, self.problem.observation
         act, keep = self.weights
         num_memory, num = len(act), problem.num_states
+        if num_memory * num <= _DENSE:
+            return self._dense_gradient(act, keep)
         gain = np.zeros((num_memory, num))
         steps = []
         for m in range(num_memory):
@@ -130,6 +134,42 @@ class SoftmaxAscent:
             _softmax_gradient(act, by_action),
             _softmax_gradient(keep, by_memory),
         )
+
+    def _dense_gradient(self, act: Floats, keep: Floats) -> tuple[float, tuple[Floats, Floats]]:
+        """The same by full matrices, for small chains."""
+        problem, seen = self.problem, self.problem.observation
+        table, group = self._dense
+        act_at, keep_at = act[:, seen], keep[:, seen]
+        mixed = np.einsum("mna,ant->mnt", act_at, table)
+        gain = np.einsum("mna,an->mn", act_at, problem.gain)
+        system = np.eye(gain.size) - np.einsum("mnt,mtk->mnkt", mixed, keep_at).reshape(
+            gain.size, gain.size
+        )
+        start = np.zeros_like(gain)
+        start[0] = problem.initial
+        try:
+            value = np.linalg.solve(system, gain.ravel()).reshape(gain.shape)
+            visits = np.linalg.solve(system.T, start.ravel()).reshape(gain.shape)
+        except np.linalg.LinAlgError:
+            return np.nan, (np.zeros_like(act), np.zeros_like(keep))
+        if not np.abs(visits).sum() < _SLOW:
+            return np.nan, (np.zeros_like(act), np.zeros_like(keep))
+        after = np.einsum("mtk,kt->mt", keep_at, value)
+        worth = visits[:, None] * (problem.gain + np.einsum("ant,mt->man", table, after))
+        entered = np.einsum("mn,mnt->mt", visits, mixed)
+        by_action = np.einsum("man,no->moa", worth, group)
+        by_memory = np.einsum("mt,kt,to->mok", entered, value, group)
+        return float(problem.initial @ value[0]) + problem.initial_gain, (
+            _softmax_gradient(act, by_action),
+            _softmax_gradient(keep, by_memory),
+        )
+
+    @cached_property
+    def _dense(self) -> tuple[Floats, Floats]:
+        """Transitions ``float64[A, N, N]``, and the observation of each state ``float64[N, O]``."""
+        problem = self.problem
+        table = np.stack([matrix.toarray() for matrix in problem.transition])
+        return table, np.eye(problem.pomdp.num_observations)[problem.observation]
 
     def policies(self) -> list[FiniteMemoryPolicy]:
         """The controller with its likeliest memory updates, with random actions and with the likeliest ones."""

@@ -7,7 +7,7 @@ and concave for a minimum (Smallwood and Sondik 1973).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -140,6 +140,25 @@ def discounted_problem(
     return _problem(pomdp, ~target, target, nothing, reward, maximize=maximize)
 
 
+def leaking_problem(
+    pomdp: POMDP, ends: Floats, succeeds: Booleans, *, maximize: bool
+) -> BeliefProblem:
+    """The probability that a run ends with success, where transitions ``[T]`` end it with some probability."""
+    from scipy.sparse import csr_array
+
+    host = pomdp.fully_observable.host
+    index = host.successor, host.entry_start
+    shape = host.num_rows, host.num_states
+    chance = np.asarray(host.probability, np.float64)
+    matrix = csr_array((chance * (1 - ends), *index), shape=shape)
+    gain = np.zeros(host.num_rows)
+    np.add.at(gain, host.row, chance * ends * succeeds)
+    none = np.zeros(host.num_states, bool)
+    corner = np.full(host.num_states, float(maximize))
+    problem = _problem(pomdp, ~none, none, corner, gain, maximize=maximize, matrix=matrix)
+    return replace(problem, is_reward=False)
+
+
 def _problem(
     pomdp: POMDP,
     maybe: Booleans,
@@ -148,6 +167,7 @@ def _problem(
     reward: Floats | None,
     *,
     maximize: bool,
+    matrix: SparseMatrix | None = None,
 ) -> BeliefProblem:
     from scipy.sparse import csr_array
 
@@ -160,7 +180,7 @@ def _problem(
     state = state[np.argsort(seen[state], kind="stable")]
     number = np.full(host.num_states, -1)
     number[state] = np.arange(state.size)
-    table = pomdp.row_of_action
+    table, steps = pomdp.row_of_action, host.matrix if matrix is None else matrix
     entering = host.expectation(target.astype(np.float64)) if reward is None else reward
     gain = np.zeros((pomdp.num_actions, state.size))
     transition = []
@@ -168,11 +188,11 @@ def _problem(
         row = table[state, action]
         some = row >= 0
         gain[action, some] = entering[row[some]]
-        inner = host.matrix[row[some]][:, state].tocoo()
+        inner = steps[row[some]][:, state].tocoo()
         place = np.flatnonzero(some)[inner.coords[0]]
-        matrix = csr_array((inner.data, (place, inner.coords[1])), shape=(state.size, state.size))
-        matrix.sort_indices()
-        transition.append(matrix)
+        part = csr_array((inner.data, (place, inner.coords[1])), shape=(state.size, state.size))
+        part.sort_indices()
+        transition.append(part)
     initial = np.asarray(model.initial, np.float64)
     # Where the value is infinite, a large number is a lower bound that stays finite in sums.
     finite = np.isfinite(corner)

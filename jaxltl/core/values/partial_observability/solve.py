@@ -29,8 +29,9 @@ from jaxltl.core.values.partial_observability.controller_gradient import (
     SoftmaxAscent,
     first_controllers,
 )
-from jaxltl.core.values.partial_observability.chains import controlled_chain
+from jaxltl.core.values.partial_observability.chains import chain_solution, controlled_chain
 from jaxltl.core.values.partial_observability.exploration import BeliefBounds, explore
+from jaxltl.core.values.partial_observability.long_run import learned_satisfaction
 from jaxltl.core.values.partial_observability.problem import (
     BeliefProblem,
     reach_problem,
@@ -207,17 +208,7 @@ def controller_value(
         bounds = solver.total_reward(
             chain.host, choice_reward(chain), goal, maximize=False, tolerance=tolerance, depth=4
         )
-    parts: dict[str, Array] = {
-        "value": bounds.value,
-        "policy": bounds.row,
-        "lower": bounds.lower,
-        "upper": bounds.upper,
-        "residual": np.float64(bounds.residual),
-        "num_steps": np.int32(bounds.rounds),
-        "status": np.int32(Status.CONVERGED),
-        "initial": np.asarray(chain.initial),
-    }
-    solution = Solution(**parts, method=bounds.method)
+    solution = chain_solution(bounds, np.asarray(chain.initial))
     at = solution.at_initial
     width = float(at.upper - at.lower)
     scale = 1.0 if reward is None else max(abs(float(at.lower)), 1e-12)
@@ -241,19 +232,15 @@ def partially_observable_satisfaction(
     tolerance: jax.Array | float | None = None,
     max_beliefs: int = MAX_BELIEFS,
 ) -> Solution:
-    """Bounds of the optimal satisfaction probability of a co-safe or safe formula, over the product's beliefs.
+    """Bounds of the optimal satisfaction probability, of a co-safe or safe formula over the product's beliefs.
 
+    Of other formulas the one bound is a controller's, and the other one that of policies that see the states.
     The automaton's state is hidden as far as labels are; the controller reads observations alone.
     """
     joint, final, automaton = task_pomdp(pomdp, formula)
-    if final is None:
-        raise ValueError(
-            f"{formula}: the formula is neither co-safe nor safe. Optimal probabilities of such formulas "
-            "under partial observability are undecidable; evaluate a controller by "
-            "solve_property(controlled_chain(pomdp, policy), ...), a lower bound of the maximum, and ask for "
-            "the fully observable model's maximum, pomdp.fully_observable, an upper bound."
-        )
     width = TOLERANCE if tolerance is None else float(tolerance)
+    if final is None:
+        return learned_satisfaction(pomdp, automaton, objective=objective, tolerance=width)
     bounds = partial(belief_bounds, joint, tolerance=width, max_beliefs=max_beliefs)
     if automaton.is_safety:
         opposite = "min" if objective == "max" else "max"

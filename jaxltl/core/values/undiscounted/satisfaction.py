@@ -112,7 +112,8 @@ def optimal_satisfaction(
 
     Args:
       model: a product; or with `formula` a concrete model, an interval model or a game on one of them, or
-        a POMDP, with bounds from its initial belief for co-safe and safe formulas.
+        a POMDP, with bounds from its initial belief: of co-safe and safe formulas those of all controllers,
+        of others the value of a learned controller and the optimum of policies that see the states.
       formula: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       nature: for interval models, ``"adversarial"`` (default) or ``"cooperative"``.
