@@ -90,7 +90,7 @@ def train(
       callback: called after each chunk with the state and the newest metrics, numbers of NumPy. If it
         raises StopIteration, the run ends and is returned; after another exception, such as
         KeyboardInterrupt, the checkpoint remains.
-      every: steps of a chunk, rounded up to whole rows of metrics; default a fiftieth of the run.
+      every: steps of a chunk, rounded up to whole rows of metrics; default a fortieth of the run.
       checkpoint: a file, written atomically before each call of `callback`. If it exists, the run
         continues from it; with all steps made it is read only.
       max_rows: bound on the rows of metrics, evenly spaced steps that include the last.
@@ -104,7 +104,7 @@ def train(
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, limit=MAX_STEPS)
     stride = int(block_lengths(num_steps, _positive("max_rows", max_rows))[-1])
-    every = -(-num_steps // 50) if every is None else _positive("every", every)
+    every = -(-num_steps // 40) if every is None else _positive("every", every)
     if callback is not None:
         validation.function("callback", callback)
     state = _first_state(learner, start, problem, hparams)

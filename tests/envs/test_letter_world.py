@@ -7,12 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.letter_world import finite_task
+from jaxltl.core.automata.automaton import letter_index
+from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.episodes import auto_reset_step
 from jaxltl.envs.letter_world import ACTIONS, connected_cells, is_connected, letter_world
 
 MAX_PROGRAMS = 450  # that the default tests compile at most
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
+NAMES = ("a", "d", "e", "i", "k", "l", "other")
 MAP = """
 a . b
 . . .
@@ -159,3 +163,25 @@ def test_maps_without_ways_are_uniform():
 def test_what_does_not_fit_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         letter_world(**options)
+
+
+def test_tasks_of_the_benchmark_end_with_the_reach_part():
+    """``G !x`` holds up to the end, as in a formula with until in its place."""
+    avoid = "!(k | l)"
+    inner = f"{avoid} U d"
+    for name in "iea":
+        inner = f"{avoid} U ({name} & ({inner}))"
+    ours = finite_task("G !(k | l) & F(a & F(e & F(i & F d)))")
+    theirs = to_automaton(inner)
+    assert ours.is_cosafe
+    pairs = {(int(ours.initial), int(theirs.initial))}
+    queue = list(pairs)
+    letters = [[letter_index(x, {n} & set(x.propositions)) for n in NAMES] for x in (ours, theirs)]
+    while queue:
+        q, r = queue.pop()
+        assert ours.final[q] == theirs.final[r]
+        for i, j in zip(*letters, strict=True):
+            if (pair := (int(ours.delta[q, i]), int(theirs.delta[r, j]))) not in pairs:
+                pairs.add(pair)
+                queue.append(pair)
+    assert any(ours.final[q] for q, _ in pairs) and len(pairs) > 5
