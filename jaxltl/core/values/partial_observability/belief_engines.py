@@ -32,7 +32,7 @@ def reach(pomdp: POMDP, question: Question, accuracy: Accuracy) -> Solution:
 
 
 def earn(pomdp: POMDP, question: Question, accuracy: Accuracy) -> Solution:
-    """Total rewards until a target, of a controller or minimal between bounds."""
+    """Total rewards until a target, of a controller or optimal between bounds."""
     path = question.path
     assert isinstance(path, TotalReward)
     if path.target is None or path.unreached != "infinite":

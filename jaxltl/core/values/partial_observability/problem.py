@@ -41,13 +41,18 @@ class BeliefProblem:
     initial: Floats  # float64[N], the initial measure
     initial_gain: float  # the initial probability of the target, 0 of rewards
     corner: Floats  # float64[N], bound of the value of a policy that sees the states
-    has_infinite: bool  # whether total rewards of such policies are infinite somewhere
+    is_finite: Booleans  # bool[N], whether total rewards of such policies are finite
     is_infinite: bool  # whether they are from the initial belief
 
     @property
     def available(self) -> Booleans:
         """``bool[O, A]``."""
         return self.pomdp.available
+
+    @property
+    def has_infinite(self) -> bool:
+        """Whether total rewards of policies that see the states are infinite somewhere."""
+        return not self.is_finite.all()
 
     @property
     def num_states(self) -> int:
@@ -209,6 +214,6 @@ def _problem(
         initial[state],
         float(initial[target].sum()) if reward is None else 0.0,
         corner[state],
-        bool((~finite[state]).any()),
+        finite[state],
         bool((~finite & (initial > 0)).any()),
     )

@@ -59,7 +59,7 @@ def belief_bounds(
     report: Report | None = None,
     throw: bool = False,
 ) -> Solution:
-    """Maximal or minimal reachability probability, or minimal total reward, of a POMDP from its initial belief.
+    """Optimal reachability probability or total reward of a POMDP from its initial belief.
 
     Beliefs are explored between two certified bounds: that of all controllers, from the fast informed
     bound (Hauskrecht 2000) at beliefs where the exploration ends, and the value of one finite-memory
@@ -70,8 +70,9 @@ def belief_bounds(
       pomdp: a concrete POMDP.
       target: ``bool[S]``, a label or a formula of labels; it need not be observable.
       stay: the states through which the target must be reached; default: all.
-      reward: a reward of the model that is earned until the target is reached; a minimum only. Where the
-        target is not reached almost surely, the reward is infinite. Default: the probability.
+      reward: a reward of the model that is earned until the target is reached. Where the target is not
+        reached almost surely, the reward is infinite; a maximum needs a target that all policies reach
+        almost surely. Default: the probability.
       objective: ``"max"`` or ``"min"``.
       tolerance: width of the bounds, at which the exploration ends; of rewards relative to the value.
       max_beliefs: largest number of expanded beliefs, which bounds memory and time.
@@ -88,7 +89,7 @@ def belief_bounds(
       that doubles abbreviate: the shortest decimals if those of a row sum to one, else normalised doubles.
 
     Raises:
-      ValueError: an unknown label or reward, a maximum of rewards, or a controller of other observations.
+      ValueError: an unknown label or reward, an infinite maximum of rewards, or a controller of other observations.
 
     Example:
       >>> import jaxltl as jl
@@ -107,13 +108,17 @@ def belief_bounds(
         within = None if stay is None else target_states(pomdp, "stay", stay)
         problem = reach_problem(pomdp, goal, within, maximize=maximize)
     else:
-        if maximize or stay is not None:
-            raise ValueError(
-                "belief_bounds: rewards have a minimum until a target; there is no upper bound of a maximum "
-                "here. Ask for objective='min', without stay, or evaluate a controller by controlled_chain."
-            )
+        if stay is not None:
+            raise ValueError("belief_bounds: stay restricts probabilities; give reward without stay.")
         earned = nonnegative_reward(model, reward, "total rewards")
-        problem = reward_problem(pomdp, earned, goal, maximize=False)
+        problem = reward_problem(pomdp, earned, goal, maximize=maximize)
+        if maximize and problem.has_infinite:
+            state = int(problem.state[np.argmax(~problem.is_finite)])
+            raise ValueError(
+                f"belief_bounds: the maximal reward from state {state} is infinite if states are seen, since a "
+                "policy may miss the target; that is no upper bound. Ask for objective='min', or evaluate a "
+                "controller by controlled_chain."
+            )
     limit = validation.integer("max_beliefs", max_beliefs, least=1)
     seconds = np.inf if max_seconds is None else float(max_seconds)
     if not seconds > 0:

@@ -40,40 +40,48 @@ def controllers(num_observations, num_actions, num_memory=2):
             yield np.reshape(action, shape), np.reshape(update, shape)
 
 
-def controller_values(pomdp, table, target, sweeps=400, cost=None):
-    """Values from below of all controllers with two memory states, by value iteration in one batch."""
+def controller_values(pomdp, table, target, cost=None):
+    """Probabilities of reaching, or costs ``[S, A]`` until then, and probabilities, of all controllers of two
+    memory states: sums over 2**20 steps, from below, by repeated squaring of their chains in one batch."""
     seen, size = np.asarray(pomdp.observation), len(table)
-    all_controllers = list(controllers(pomdp.num_observations, pomdp.num_actions))
-    action = np.stack([c[0] for c in all_controllers])[:, seen]  # [C, S, M]
-    update = np.stack([c[1] for c in all_controllers])[:, seen]
-    number, memory = len(all_controllers), 2
-    value = np.zeros((number, size, memory))
-    reach = np.zeros((number, size, memory))
-    each = np.arange(number)[:, None, None]
-    entered = np.arange(size)[None, :, None], np.broadcast_to(update, (number, size, memory))
-    step = table[np.arange(size)[None, :, None], action]  # [C, S, M, S]
-    for _ in range(sweeps):
-        for x, gain in ((value, cost), (reach, None)):
-            x[:, target] = 1.0 if (gain is None and cost is None) or x is reach else 0.0
-            after = x[each, entered[0], entered[1]]  # value at s' if memory m: [C, S', M]
-            new = np.einsum("csmt,ctm->csm", step, after)
-            if gain is not None:
-                new += gain
-            x[...] = new
-            x[:, target] = 1.0 if x is reach or cost is None else 0.0
-    start = np.asarray(pomdp.initial)
-    return value[:, :, 0] @ start, reach[:, :, 0] @ start
+    both = list(controllers(pomdp.num_observations, pomdp.num_actions))
+    action = np.stack([c[0] for c in both])[:, seen]  # [C, S, M]
+    update = np.stack([c[1] for c in both])[:, seen]
+    state = np.arange(size)[None, :, None]
+    entered = update[..., None] == np.arange(2)  # [C, S', M, M']
+    step = np.einsum("csmt,ctmn->csmtn", table[state, action], entered)
+    step = step.reshape(len(both), 2 * size, 2 * size)
+    to_target = step[:, :, 2 * target : 2 * target + 2].sum(-1)
+    inner = np.arange(2 * size) // 2 != target
+    step = step * inner[:, None] * inner
+    gains = [to_target * inner]
+    if cost is not None:
+        gains.append(cost[state, action].reshape(len(both), -1) * inner)
+    value = np.stack(gains, -1)
+    for _ in range(20):
+        value = value + step @ value
+        step = step @ step
+    value[:, 2 * target, 0] = 1  # probability from the target
+    total = np.einsum("s,csg->cg", np.asarray(pomdp.initial), value[:, ::2])
+    return total[:, -1], total[:, 0]
 
 
-def tree_value(pomdp, table, target, depth, objective="max"):
-    """Bound of the optimum of reaching by an exact tree of beliefs, with values of the seen states at its leaves."""
+def tree_value(pomdp, table, target, depth, objective="max", cost=None):
+    """Bound of the optimum by an exact tree of beliefs, with values of the seen states at its leaves.
+
+    The probability of reaching, which the sink, the last state, does not; or the cost ``[S, A]`` until then.
+    """
     best = max if objective == "max" else min
-    leaf = jl.reachability_probability(
-        pomdp.fully_observable, np.eye(len(table), dtype=bool)[target], objective=objective
-    )
+    goal = np.eye(len(table), dtype=bool)[target]
+    world = pomdp.fully_observable
+    if cost is None:
+        leaf = jl.reachability_probability(world, goal, objective=objective)
+    else:
+        leaf = jl.total_reward(world, np.ravel(cost), goal, objective=objective)
     bound = leaf.upper if objective == "max" else leaf.lower
     exact = [Fraction(float(x)) for x in np.asarray(bound)]
-    exact[target] = Fraction(1)
+    exact[target] = Fraction(int(cost is None))
+    sink = len(table) - 1 if cost is None else None
     seen = np.asarray(pomdp.observation).tolist()
     rows = [[{t: Fraction(p) for t, p in enumerate(r) if p} for r in s] for s in table.tolist()]
 
@@ -86,10 +94,11 @@ def tree_value(pomdp, table, target, depth, objective="max"):
         for a in range(table.shape[1]):
             total, groups = Fraction(0), {}
             for s, w in belief.items():
+                total += 0 if cost is None else w * Fraction(float(cost[s, a]))
                 for t, p in rows[s][a].items():
                     if t == target:
-                        total += w * p
-                    elif t != len(table) - 1:
+                        total += w * p if cost is None else 0
+                    elif t != sink:
                         group = groups.setdefault(seen[t], {})
                         group[t] = group.get(t, Fraction(0)) + w * p
             options.append(total + sum(value(g, depth - 1) for g in groups.values()))
@@ -97,6 +106,6 @@ def tree_value(pomdp, table, target, depth, objective="max"):
 
     groups = {}
     for s, w in enumerate(np.asarray(pomdp.initial).tolist()):
-        if w:
+        if w and s != target:
             groups.setdefault(seen[s], {})[s] = Fraction(w)
     return sum(value(g, depth) for g in groups.values())
