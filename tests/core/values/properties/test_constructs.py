@@ -4,6 +4,7 @@ In `trap`, action a is certain and dear, b is cheap and ends in a state with rew
 with an interval. `duel` is a game in which p1 decides in state 0 and p2 in state 1.
 """
 
+import itertools
 from dataclasses import replace
 from fractions import Fraction
 
@@ -13,11 +14,11 @@ import pytest
 import jaxltl as jl
 from jaxltl.app.solve import load, parse_queries, read_queries
 from jaxltl.core.language.resolve import read_program
-from jaxltl.core.logic.comparisons import program_definitions
+from jaxltl.core.logic.comparisons import Definitions, program_definitions
 from jaxltl.core.logic.properties import parse_properties
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
-from jaxltl.io.hoa.hoa import read_hoa
+from jaxltl.io.hoa.hoa import read_hoa, write_hoa
 
 SOURCES = {
     "trap": """mdp module m s : [0..2]; [a] s=0 -> (s'=1); [b] s=0 -> 0.5:(s'=1) + 0.5:(s'=2);
@@ -400,3 +401,82 @@ def test_mistakes_are_named_with_their_place(models, name):
         with pytest.raises(ValueError, match=message):
             for prop in parse_properties(text, known):
                 solve_property(model, prop)
+
+
+FORMULAS = (
+    'G F "a"',
+    'F G "a"',
+    '(G F "a") & (F G "b")',
+    '(G F "a") => (G F "b")',
+    '"a" U ("b" & X "a")',
+    'G ("a" | X "b")',
+    'F ("a" & X G "b")',
+)
+
+
+def random_model(rng):
+    """Five states with one to three choices of two successors, and random labels."""
+    count = rng.integers(1, 4, 5)
+    start = np.append(0, np.cumsum(count))
+    successor = np.concatenate([rng.choice(5, 2, replace=False) for _ in range(start[-1])])
+    chance = np.tile([1 / 4, 3 / 4], start[-1])
+    label = rng.random((5, 2)) < 0.5
+    return jl.make_sparse(
+        start, np.arange(start[-1] + 1) * 2, successor, chance, label=label, propositions=["a", "b"]
+    )
+
+
+def with_all_choices(model, share):
+    """The model in which each choice takes every other one with a small probability."""
+    start, rows = np.asarray(model.row_start), []
+    matrix = np.zeros((model.num_rows, 5))
+    row = np.repeat(np.arange(model.num_rows), 2)
+    np.add.at(matrix, (row, np.asarray(model.successor)), np.asarray(model.probability))
+    for first, last in itertools.pairwise(start):
+        mean = matrix[first:last].mean(0)
+        rows += [(1 - share) * matrix[r] + share * mean for r in range(first, last)]
+    r, t = np.nonzero(np.array(rows))
+    entry_start = np.searchsorted(r, np.arange(model.num_rows + 1))
+    return jl.make_sparse(
+        start,
+        entry_start,
+        t,
+        np.array(rows)[r, t],
+        label=np.asarray(model.label),
+        propositions=["a", "b"],
+    )
+
+
+def test_fair_strategies_are_limits_of_those_that_take_all_choices():
+    """An optimum over fair strategies is that over strategies which take each choice, now and then."""
+    rng = np.random.default_rng(8)
+    differs = 0
+    for trial in range(len(FORMULAS)):
+        model, formula = random_model(rng), FORMULAS[trial % len(FORMULAS)]
+        limit = with_all_choices(model, 1e-6)
+        for objective in ("max", "min"):
+            text = f"P{objective}=? [ {formula} ]"
+            fair = solve_property(model, text, states=range(5), fair=True)
+            assert fair.status.name == "CONVERGED"
+            expected = solve_property(limit, text, states=range(5)).value
+            assert fair.value == pytest.approx(expected, abs=1e-3), text
+            differs += (
+                np.abs(solve_property(model, text, states=range(5)).value - expected).max() > 0.1
+            )
+    assert differs > 1
+
+
+def test_formulas_and_their_automata_have_the_same_probability():
+    rng = np.random.default_rng(6)
+    for formula in FORMULAS:
+        automaton = jl.to_automaton(formula.replace('"', ""))
+        known = Definitions(automaton=lambda _, x=automaton: read_hoa(write_hoa(x)))
+        model = random_model(rng)
+        for operator in ("Pmax=?", "Pmin=?"):
+            for sign in ("", "!"):
+                (prop,) = parse_properties(f'{operator} [ {sign}HOA: {{"x.hoa"}} ]', known)
+                actual = solve_property(model, prop, states=range(5))
+                expected = solve_property(
+                    model, f"{operator} [ {sign}({formula}) ]", states=range(5)
+                )
+                assert actual.value == pytest.approx(expected.value, abs=1e-6), prop.text
