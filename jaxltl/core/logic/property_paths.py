@@ -219,7 +219,7 @@ class PathParser(TokenStream, ABC):
             raise
 
     def comparison_of_variables(self) -> Formula:
-        start = self.token
+        start, before = self.token, self.place
         comparison = self.state_expression(SIMPLE)
         tree = comparison.expression
         if tree.is_literal and isinstance(tree.value, bool):
@@ -228,6 +228,9 @@ class PathParser(TokenStream, ABC):
         is_defined = is_variable or str(tree.value)[:1] in ('"', "[")
         self.require(is_defined, instead_of(start.text), start)
         self.require(not comparison.is_number, "a comparison, such as x+1<=3")
+        if tree.operator == "name" and tree.value in self.known.integers:
+            self.place = before  # which an error further on is preferred to
+            raise self.error(f"a comparison, such as {tree.value}>0; {tree.value} is a number")
         return Formula("ap", proposition=self.define(comparison))
 
     # --- bounds ---

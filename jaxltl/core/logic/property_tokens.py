@@ -269,15 +269,20 @@ class TokenStream:
 
     def expression(self, level: int) -> Expression:
         """An expression with constants and formulas substituted."""
+        end: int | None = None
         try:
             self.require(self.token.kind != "unknown", "an expression")
             parser = self.operands()
             self.tree = tree = parser.expression(level)
+            end = parser.end
             self.kind(tree)
             tree = substitute(tree, {**self.names, **self.meanings})
         except LanguageError as error:
             place = bisect.bisect_left(self.starts, error.place)
             token = self.tokens[min(place, len(self.tokens) - 1)]
+            # An error of types or values comes after the expression, and before one of another reading.
+            self.place = place if end is None else bisect.bisect_left(self.starts, end)
+            self.place = min(self.place, len(self.tokens) - 1)
             raise self.error(_expected(error.message), token) from None
         self.place = bisect.bisect_left(self.starts, parser.end)
         return tree
@@ -309,8 +314,12 @@ class TokenStream:
                     meaning.is_number or tree is None or tree.operator in _RELATIONS + _CONNECTIVES
                 )
                 return not meaning.is_number if is_known else None
-            if name in self.names:
-                return self.kind(self.names[name])
+            if (value := self.names.get(name)) is not None and value.operator != "name":
+                # Formulas may be large, and are checked where they are defined.
+                is_truth = value.operator in _RELATIONS + _CONNECTIVES
+                is_truth |= value.is_literal and isinstance(value.value, bool)
+                return None if value.operator == "?:" else is_truth
+            name = name if value is None else str(value.value)
             return True if name.startswith('"') else False if name in self.known.integers else None
         if e.operator == "literal":
             return isinstance(e.value, bool)

@@ -356,7 +356,7 @@ REFUSED = {
         'P=? [ F "goal" ] & true': "column 1: .*a truth value; & is applied to a number",
         'true & Pmax=? [ F "goal" ]': "column 8: .*a nested property with a threshold",
         "s & true": "column 1.*a truth value",
-        "s=0 | s": "s is a number",
+        "s=0 | s": "column 7.*a truth value",
         "-(s=0)": "column 3.*a number; - is",
         "(s=0) * 2": "column 2.*a number",
         "s=true": "column 1.*not one of each",
