@@ -473,7 +473,7 @@ def learn_formula(
     if final is None:
         raise ValueError(
             f"learn_formula: {formula} is neither co-safe nor safe; give such a formula, or learn with "
-            "make_problem and evaluate by solve_property(controlled_chain(pomdp, policy), ...)."
+            "make_problem(pomdp, formula=...) and evaluate by solve_property(controlled_chain(pomdp, policy), ...)."
         )
     objective, target = ("min", ~final) if automaton.is_safety else ("max", final)
     explored = belief_bounds(

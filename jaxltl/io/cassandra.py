@@ -38,7 +38,7 @@ _KINDS = ("states", "actions", "observations")
 _STATEMENTS = ("discount", "values", *_KINDS, "start", "T", "O", "R")
 _RESERVED = {*_STATEMENTS, "include", "exclude", "uniform", "identity", "reset", "reward", "cost"}
 _SUM = 1e-4  # admitted deviation of a row's sum from one; published files round to few digits
-_LARGEST = 50_000_000  # entries of all rows, which bounds memory
+_LARGEST = 10_000_000  # entries of all rows, which bounds memory
 _LABELS = 2**26  # entries of the labels of named states, beyond which there are none
 
 
@@ -72,7 +72,7 @@ class _PomdpText:
     """The statements of a file, interpreted one by one."""
 
     name: str
-    names: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of states, ...; "0", "1", ...
+    names: dict[str, dict[str, int]] = field(default_factory=dict)  # numbers of states, ... by name
     discount: float | None = None
     reward: str = "reward"
     start: Floats | None = None
@@ -82,7 +82,6 @@ class _PomdpText:
     rules: list[tuple[Sequence[int], float]] = field(default_factory=list)  # of rewards, last wins
     line_of_row: dict[tuple[str, int, int], int] = field(default_factory=dict)
     num_entries: int = 0
-    index_of_name: dict[str, dict[str, int]] = field(default_factory=dict)
 
     def error(self, line: int, message: str) -> NoReturn:
         raise ValueError(f"{self.name!r}, line {line}: {message}")
@@ -90,10 +89,10 @@ class _PomdpText:
     def count(self, kind: str) -> int:
         return len(self.names[kind])
 
-    def number(self, token: str, line: int, expected: str = "a number") -> float:
+    def number(self, token: str, line: int) -> float:
         value = as_double(token.encode())
         if value is None or not np.isfinite(value):
-            self.error(line, f"{token[:60]!r} stands where {expected} is expected.")
+            self.error(line, f"{token[:60]!r} stands where a number is expected.")
         return value
 
     def index(self, kind: str, token: str, line: int) -> int:
@@ -101,8 +100,8 @@ class _PomdpText:
         if token == "*":
             return -1
         names = self.names[kind]
-        if token in self.index_of_name[kind]:
-            return self.index_of_name[kind][token]
+        if token in names:
+            return names[token]
         if not (token.isdecimal() and int(token) < len(names)):
             self.error(line, f"{token[:60]!r} is none of the {len(names)} {kind}.")
         return int(token)
@@ -111,10 +110,8 @@ class _PomdpText:
         for kind in _KINDS:
             if kind not in self.names:
                 self.error(line, f"the line '{kind}: ...' is missing before this one.")
-        if not self.index_of_name:
-            self.index_of_name = {k: {x: i for i, x in enumerate(self.names[k])} for k in _KINDS}
-            if self.count("states") * self.count("actions") > _LARGEST:
-                self.error(line, f"states and actions have more than {_LARGEST} pairs.")
+        if self.count("states") * self.count("actions") > _LARGEST:
+            self.error(line, f"states and actions have more than {_LARGEST} pairs.")
 
     def numbers(self, statement: _Statement, shape: tuple[int, int]) -> NDArray[np.float64]:
         """The numbers of a matrix or of a row, ``float64[shape]``."""
@@ -179,8 +176,9 @@ def _statements(file: _PomdpText, text: str) -> Iterator[_Statement]:
         for i, word in enumerate(words)
         if word in _STATEMENTS and (i == 0 or words[i - 1] != ":") and _is_header(words, i)
     ]
-    if words and (not begins or begins[0] > 0):
-        file.error(tokens[0][1], f"{words[0][:60]!r}; expected one of {', '.join(_STATEMENTS)}.")
+    if not begins or begins[0] > 0:
+        first, line = tokens[0] if tokens else ("", 1)
+        file.error(line, f"{first[:60]!r}; expected one of {', '.join(_STATEMENTS)}.")
     for begin, end in zip(begins, [*begins[1:], len(words)], strict=True):
         keyword, line = tokens[begin]
         if keyword == "start" and words[begin + 1] in ("include", "exclude"):
@@ -245,13 +243,15 @@ def _read_names(file: _PomdpText, statement: _Statement) -> None:
         data = [str(i) for i in range(int(data[0]))]
     if not data or len({*data}) < len(data) or "*" in data:
         file.error(line, f"{kind} need a number, or distinct names.")
-    file.names[kind] = tuple(data)
+    file.names[kind] = {name: i for i, name in enumerate(data)}
 
 
 def _read_start(file: _PomdpText, statement: _Statement) -> None:
     keyword, _, data, line = statement
     size = file.count("states")
     start = np.zeros(size)
+    if "*" in data:
+        file.error(line, f"'*' stands where a state or a number of {keyword} is expected.")
     if keyword != "start":
         some = [file.index("states", x, line) for x in data]
         start[some] = 1
@@ -260,7 +260,7 @@ def _read_start(file: _PomdpText, statement: _Statement) -> None:
             file.error(line, f"{keyword} leaves no state.")
     elif data == ["uniform"]:
         start[:] = 1
-    elif len(data) == 1 and (size > 1 or data[0] in file.index_of_name["states"]):
+    elif len(data) == 1 and (size > 1 or data[0] in file.names["states"]):
         start[file.index("states", data[0], line)] = 1
     else:
         start = file.numbers(statement, (1, size))[0]
@@ -348,7 +348,7 @@ def _table(file: _PomdpText, rows: _Rows, keyword: str) -> tuple[Integers, Integ
         total = float(sum(p for _, p in entries))
         if not abs(total - 1) <= _SUM:
             action, state = (
-                file.names[k][i] for k, i in zip(("actions", "states"), key, strict=True)
+                [*file.names[k]][i] for k, i in zip(("actions", "states"), key, strict=True)
             )
             message = (
                 f"{keyword} of action {action!r} and state {state!r} sums to {total:g}; expected 1."
@@ -399,15 +399,13 @@ def _model(file: _PomdpText) -> POMDP:
     reward, first_entry = earned[entry], np.repeat(earned[entry][entry_start[:-1]], count)
     constant = bool((reward == first_entry).all())
     rewards = Rewards(choice=reward[entry_start[:-1]]) if constant else Rewards(transition=reward)
+    named = {k: () if "0" in x else tuple(x) for k, x in file.names.items()}
     options = {}
-    if not file.names["states"][0].isdecimal() and states.size * size <= _LABELS:
-        options = {
-            "label": states[:, None] == np.arange(size),
-            "propositions": file.names["states"],
-        }
-    names = file.names["observations"]
-    is_named = not names[0].isdecimal()
-    values = np.array([*names, ""]) if is_named else np.append(np.arange(num_seen), -1)
+    if named["states"] and states.size * size <= _LABELS:
+        options = {"label": states[:, None] == np.arange(size), "propositions": named["states"]}
+    values = np.append(np.arange(num_seen), -1)
+    if named["observations"]:
+        values = np.array([*named["observations"], ""])
     with errors_in(f"{file.name!r}: "):
         model = make_sparse(
             np.arange(states.size + 1) * num_actions,
@@ -416,7 +414,7 @@ def _model(file: _PomdpText) -> POMDP:
             value[entry],
             initial=belief,
             action=np.tile(np.arange(num_actions), states.size),
-            action_names=() if file.names["actions"][0].isdecimal() else file.names["actions"],
+            action_names=named["actions"],
             rewards={file.reward: rewards},
             valuation={"state": states.astype(np.int32)},
             **options,

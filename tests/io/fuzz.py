@@ -14,6 +14,7 @@ import tarfile
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.sparse import make_sparse
+from jaxltl.io.cassandra import read_cassandra
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.drn.parametric import read_parametric
 from jaxltl.io.log import read_log
@@ -31,7 +33,8 @@ from jaxltl.io.reward_machine import read_reward_machine
 from jaxltl.io.umb.umb import read_umb, write_umb
 from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
-from tests.io.same import full_interval, full_model
+from tests.io.same import full_interval, full_model, random_pomdp
+from tests.io.test_cassandra import TIGER
 from tests.io.test_drn import MDP as DRN
 from tests.io.test_parametric import CHAIN as PARAMETRIC
 from tests.io.test_program import PROGRAMS
@@ -259,6 +262,8 @@ def umb_samples(folder: Path) -> list[bytes]:
         samples.append(path.read_bytes())
     write_umb(path, full_interval(rng), compression=None)
     samples.append(path.read_bytes())
+    write_umb(path, random_pomdp(rng), compression=None)
+    samples.append(path.read_bytes())
     return [*samples, umb(*example()), umb(*classes_example(), folders=True)]
 
 
@@ -388,6 +393,15 @@ def _texts(*samples: str) -> Callable[[Path], list[bytes]]:
 
 _drn = _written(write_drn, "sample.drn")
 
+
+def _pomdp(folder: Path) -> list[bytes]:
+    pomdp = random_pomdp(np.random.default_rng(0))
+    world = pomdp.fully_observable
+    world = replace(world, rewards={"cost": world.rewards["cost"]})
+    write_drn(folder / "sample.drn", replace(pomdp, fully_observable=world))
+    return [(folder / "sample.drn").read_bytes()]
+
+
 _WORDS = (
     b"module endmodule init endinit rewards endrewards player endplayer label formula const int "
     b"double bool global true false x y -> => <=> ? : [ ] .. ' ( ) = != & | ! + - * / ^ , ; min( "
@@ -422,6 +436,8 @@ READERS = {
     "umb": Reader(read_umb, ".umb", umb_samples, damaged_archive),
     "npz": Reader(read_npz, ".npz", npz_samples, damaged_arrays),
     "drn": Reader(read_drn, ".drn", lambda folder: [DRN.encode(), *_drn(folder)]),
+    "pomdp": Reader(read_model, ".drn", _pomdp),
+    "cassandra": Reader(read_cassandra, ".pomdp", _texts(TIGER)),
     "parametric": Reader(read_parametric, ".drn", _texts(PARAMETRIC)),
     "pexp": Reader(read_prism, ".pexp", _written(write_prism, "sample.pexp")),
     "reward_machine": Reader(read_reward_machine, ".txt", _texts(OFFICE)),

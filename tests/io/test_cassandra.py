@@ -199,6 +199,7 @@ def test_what_the_format_cannot_hold(tmp_path):
 
 
 WRONG = [
+    (TIGER, "# nothing", "line 1: ''; expected one of discount, values, states"),
     ("discount: 0.95", "", "line 26: the line 'discount: ...' is missing"),
     ("discount: 0.95", "discount: 1.5", "line 2: the discount is 1.5; expected a number from 0"),
     ("discount: 0.95", "discount: x", "line 2: 'x' stands where a number is expected"),
@@ -225,6 +226,7 @@ WRONG = [
     ("7 8", "7 : 8", "line 25: ':' stands where the data of R are expected"),
     ("T: listen\n", "start: 0.5 0.4\nT: listen\n", "line 7: the initial belief sums to 0.9"),
     ("T: listen\n", "start exclude: 0 1\nT: listen\n", "line 7: start exclude leaves no state"),
+    ("T: listen\n", "start include: *\nT: listen\n", "line 7: '\\*' stands where a state"),
     ("T: listen\n", "start: 7\nT: listen\n", "line 7: '7' is none of the 2 states"),
     (
         "R: open-right : tiger-right\n-100 -100\n-100 -99",

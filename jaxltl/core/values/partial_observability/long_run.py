@@ -117,13 +117,18 @@ def learned_satisfaction(
     sign, at = 1 if maximize else -1, visible.at_initial
     outer = float(at.upper if maximize else at.lower)
     best, policy, count = -np.inf, None, 0
-    for one in _candidates(satisfaction_problem(pomdp, automaton, maximize=maximize), pomdp):
-        low, high = controller_satisfaction(pomdp, one, automaton)
-        value, count = low if maximize else -high, count + 1
-        if value > best:
-            best, policy = value, one
-        if sign * outer - best <= _DONE:
-            break
+    problem = satisfaction_problem(pomdp, automaton, maximize=maximize)
+    try:
+        for one in _candidates(problem):
+            low, high = controller_satisfaction(pomdp, one, automaton)
+            value, count = low if maximize else -high, count + 1
+            if value > best:
+                best, policy = value, one
+            if sign * outer - best <= _DONE:
+                break
+    except KeyboardInterrupt:  # keeps the best controller so far
+        if policy is None:
+            raise
     assert policy is not None
     inner = sign * best
     lower, upper = (inner, max(outer, inner)) if maximize else (min(outer, inner), inner)
@@ -143,7 +148,7 @@ def learned_satisfaction(
     return Solution(**parts, method=method)
 
 
-def _candidates(problem: BeliefProblem, pomdp: POMDP) -> Iterator[FiniteMemoryPolicy]:
+def _candidates(problem: BeliefProblem) -> Iterator[FiniteMemoryPolicy]:
     """Controllers by gradient ascent, each with its less likely actions and without them."""
     for seed, (num_memory, scale, rate) in enumerate(_STARTS):
         if seed and num_memory * problem.num_states > _LARGE:
