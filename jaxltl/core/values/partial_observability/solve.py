@@ -109,7 +109,9 @@ def belief_bounds(
         problem = reach_problem(pomdp, goal, within, maximize=maximize)
     else:
         if stay is not None:
-            raise ValueError("belief_bounds: stay restricts probabilities; give reward without stay.")
+            raise ValueError(
+                "belief_bounds: stay restricts probabilities; give reward without stay."
+            )
         earned = nonnegative_reward(model, reward, "total rewards")
         problem = reward_problem(pomdp, earned, goal, maximize=maximize)
         if maximize and problem.has_infinite:
