@@ -106,13 +106,19 @@ def test_the_digest_covers_named_files(write):
         (("discount = 0.9", "discount = true"), r"discount = True; it must be"),
         (("discount = 0.9", "discount = nan"), r"discount = nan; it must be a finite number"),
         (("discount = 0.9", "discount = 0.9\nsteps = 0"), r"steps = 0; it must be a whole number"),
-        (("discount = 0.9", "discount = 0.9\nmu = -1"), r"must be a finite number of at least 0"),
+        (("discount = 0.9", "discount = 0.9\nmu = -1"), r"must be a number, at least 0 and finite"),
         (
             ("discount = 0.9", "discount = 0.9\nmu = inf"),
-            r"mu = inf; it must be a finite number of at least 0",
+            r"mu = inf; it must be a number, at least 0 and finite",
         ),
-        (("discount = 0.9", "discount = 0.9\nl2 = nan"), r"l2 = nan; it must be a finite number"),
-        (("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"), r"it must be a finite number"),
+        (
+            ("discount = 0.9", "discount = 0.9\nl2 = nan"),
+            r"l2 = nan; it must be a number, at least 0 and finite",
+        ),
+        (
+            ("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"),
+            r"it must be a number, at least 0 and finite",
+        ),
         (
             ("discount = 0.9", "discount = 0.9\nguess = [1, inf]"),
             r"a list of finite numbers, one per",

@@ -11,7 +11,6 @@ from jaxltl.app.files.schema import (
     Discount,
     File,
     Legend,
-    NonNegative,
     Propositions,
     TomlTable,
     Text,
@@ -138,9 +137,6 @@ class LearnerTable(TomlTable):
 @table
 class OptimizerTable(LearnerTable):
     """Keys of ``[learner]`` of all methods of learning from demonstrations."""
-
-    l2: TomlKey[NonNegative | None, "Precision of the Gaussian prior on the parameters."] = None
-    learning_rate: TomlKey[NonNegative | None, "Step size of the optimizer."] = None
 
     @property
     def hides_formula(self) -> str | None:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 from typing import Annotated as TomlKey
 
-from jaxltl.algos import finite_state_controllers
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
@@ -24,7 +23,7 @@ from jaxltl.app.files.schema import (
     table,
 )
 from jaxltl.app.files.task import FormulaFile, FormulaTable, GridTable, LearnerTable as AnyTable
-from jaxltl.app.files.task_environment import hparams_table
+from jaxltl.app.files.hyperparameters import hparams_table
 
 Observations = Annotated[
     Count | list[str],
@@ -70,7 +69,7 @@ class LearnerTable(AnyTable):
 
 
 @table
-class ControllerTable(hparams_table(finite_state_controllers.Hparams)):  # type: ignore[misc]
+class ControllerTable(hparams_table("finite_state_controllers")):  # type: ignore[misc]
     """``[controller]``: hyperparameters, among them the memory states."""
 
 

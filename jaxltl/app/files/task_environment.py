@@ -6,15 +6,13 @@ for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` show
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from typing import Annotated as TomlKey
 
 import attrs
 
-from jaxltl.algos import cce, ppo, trust_region
-
+from jaxltl.app.files.hyperparameters import hparams_table
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
@@ -132,41 +130,8 @@ class LearnerTable(AnyLearnerTable):
     steps: TomlKey[Count, "Steps of the learner."]
 
 
-def hparams_table(hparams: type[Any], *omit: str) -> Any:
-    """A base class with the declared hyperparameters of a learner, documented and defaulted there."""
-    fields = {}
-    for field in dataclasses.fields(hparams):
-        if "valid" in field.metadata and field.name not in omit:
-            kind: Any = TomlKey[_type_of(field) | None, ""]
-            fields[field.name] = attrs.field(default=None, type=kind)
-    return attrs.make_class(
-        "HparamsTable", fields, bases=(TomlTable,), frozen=True, kw_only=True, slots=False
-    )
-
-
-def _type_of(field: dataclasses.Field[Any]) -> Any:
-    """The type of a hyperparameter in a file, from its declared valid values."""
-    valid, first = field.metadata["valid"], field.default
-    values = valid.values
-    if values is bool:
-        return bool
-    if isinstance(values, tuple):
-        return Literal[values]
-    if values.integer:
-        whole = Annotated[
-            int, Meta(str(values), values.contains, "16" if first is None else str(first))
-        ]
-        return Widths if "tuple" in str(field.type) else whole
-    example = "0.05" if first is None else str(first)
-    number = Annotated[float, Meta(f"a number, {values}", values.contains, example)]
-    if not valid.may_be_schedule:
-        return number
-    title = f"a number, {values}; or [first, last], linear over all steps"
-    return Annotated[number | tuple[number, number], Meta(title, example=f"[{example}, 0]")]
-
-
 @table
-class PpoTable(hparams_table(ppo.Hparams)):  # type: ignore[misc]
+class PpoTable(hparams_table("ppo")):  # type: ignore[misc]
     """``[ppo]``: hyperparameters, and the networks."""
 
     discount: TomlKey[Unit, "Discount of rewards.", "0.99"] = 1.0
@@ -182,7 +147,7 @@ class PpoTable(hparams_table(ppo.Hparams)):  # type: ignore[misc]
 
 
 @table
-class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # type: ignore[misc]
+class CceTable(hparams_table("cce", "sample_share", "num_samples")):  # type: ignore[misc]
     """``[cce]``: hyperparameters, the policy network, and the scores of samples."""
 
     rate: TomlKey[Schedule, "Smoothing of the distribution's parameters."] = 0.5
@@ -209,7 +174,7 @@ class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # ty
 
 
 @table
-class CpoTable(hparams_table(trust_region.Hparams, "method", "penalty")):  # type: ignore[misc]
+class CpoTable(hparams_table("trust_region", "method", "penalty")):  # type: ignore[misc]
     """``[cpo]``: hyperparameters, and the cost."""
 
     discount: TomlKey[Unit, "Discount of rewards.", "0.99"] = 1.0

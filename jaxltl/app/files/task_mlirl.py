@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 from typing import Annotated as TomlKey
 
+from jaxltl.app.files.hyperparameters import hparams_table
 from jaxltl.app.files.schema import (
     Confidence,
     Count,
@@ -121,7 +122,7 @@ class DemonstrationsTable(SyntheticTable):
 
 
 @table
-class LearnerTable(OptimizerTable):
+class LearnerTable(hparams_table("mlirl", base=OptimizerTable)):  # type: ignore[misc]
     """``[learner]``: hyperparameters; see ``jaxltl.algos.mlirl.Hparams`` for other defaults."""
 
     # Files of todirl are read by task_todirl.
@@ -132,16 +133,10 @@ class LearnerTable(OptimizerTable):
         Literal["product", "world"], "State space of the reward: the product, or the world alone."
     ] = "product"
     discount: TomlKey[Discount, "Discount of the learned reward."]
-    mu: TomlKey[NonNegative | None, "Weight of the satisfaction probability, equation (2.6)."] = (
-        None
-    )
     steps: TomlKey[Count, "Largest number of steps of the optimizer."] = 500
-    policy: TomlKey[Literal["boltzmann", "soft"] | None, "Policy of a reward."] = None
-    adjoint: TomlKey[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
     optimizer: TomlKey[Optimizer, "Optimizer of the likelihood."] = "lbfgs"
     tolerance: TomlKey[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
     guess: TomlKey[Start | None, "Initial weights; default zeros."] = None
-    guess_scale: TomlKey[NonNegative | None, "Standard deviation of the initial weights."] = None
     satisfaction_over: TomlKey[
         Literal["initial", "all"], "States over which mu weighs the satisfaction probability."
     ] = "initial"

@@ -13,6 +13,7 @@ from typing import Annotated as TomlKey
 
 import attrs
 
+from jaxltl.app.files.hyperparameters import hparams_table
 from jaxltl.app.files.schema import (
     Count,
     Discount,
@@ -111,7 +112,7 @@ class DemonstrationsTable(SyntheticTable):
 
 
 @table
-class LearnerTable(OptimizerTable):
+class LearnerTable(hparams_table("todirl", "mu", "tolerance", "method", base=OptimizerTable)):  # type: ignore[misc]
     """``[learner]``: hyperparameters; see ``jaxltl.algos.todirl.Hparams`` for other defaults."""
 
     method: TomlKey[Literal["todirl"], "Learning algorithm."]
@@ -127,7 +128,6 @@ class LearnerTable(OptimizerTable):
     ] = None
     held_out: TomlKey[Discount, "Share of the demonstrations that is held out.", "0.1"] = 0.2
     optimizer: TomlKey[Optimizer | None, "Optimizer of the likelihood."] = None
-    horizon: TomlKey[Count | None, "Steps of an episode; default unbounded."] = None
 
     def __attrs_post_init__(self) -> None:
         self.require(
