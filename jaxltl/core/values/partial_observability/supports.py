@@ -226,7 +226,7 @@ def _shielded(pomdp: POMDP, graph: _SupportGraph, goal: Booleans, allowed: Boole
     size = int(winning.sum())
     place = np.zeros(pomdp.num_states, np.int64)
     place[targets] = size + np.arange(targets.size)
-    after = np.where(to < 0, place[np.where(to < 0, -1 - to, 0)], number[to])
+    after = np.where(to < 0, place[np.where(to < 0, -1 - to, 0)], number[np.maximum(to, 0)])
     num = pomdp.num_actions
     key = number[pair] * num + action
     order = np.argsort(key, kind="stable")
