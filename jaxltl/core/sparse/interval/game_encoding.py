@@ -15,7 +15,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,13 @@ class EncodedChoices:
         """Original rows of a policy; nature's most likely one where it chooses."""
         size = int(self.source.size - np.count_nonzero(np.arange(self.source.size) != self.source))
         policy = self.row[row[:size]].copy()
-        mdp = self.model.mdp
-        for s in np.flatnonzero(policy < 0):
-            first, last = mdp.entry_start[row[s]], mdp.entry_start[row[s] + 1]
-            policy[s] = self.chosen[first + int(probability[first:last].argmax())]
+        places = np.flatnonzero(policy < 0)
+        entry, count = row_entries(self.model.mdp.entry_start, row[places])
+        if places.size:
+            weight, first = probability[entry], offsets_from_counts(count)[:-1]
+            likely = weight == np.repeat(np.maximum.reduceat(weight, first), count)
+            place, at = np.unique(np.repeat(places, count)[likely], return_index=True)
+            policy[place] = self.chosen[entry[likely][at]]
         return policy
 
     def nature(self, probability: Floats, otherwise: Floats) -> Floats:

@@ -150,9 +150,9 @@ def sides_of(
         return _under(host, system, aims, weights)
     if system is None:
         return Sides(aims.system, aims.nature, _rows_of(host, np.arange(host.mdp.num_rows)))
-    # The player with nature's direction becomes nature, and the other one is the policy.
+    # The player with nature's direction becomes nature where it has a choice; the rest is the policy's.
     rows = np.ones(host.mdp.num_rows)
-    moved = system if aims.system == aims.nature else ~system
+    moved = (system if aims.system == aims.nature else ~system) & (np.diff(host.mdp.row_start) > 1)
     return Sides(not aims.nature, aims.nature, choices_as_nature(host, moved, 0 * rows, rows))
 
 
