@@ -9,8 +9,7 @@ chain of states and memory states,
 which is solved, and differentiated implicitly; before the first observation the memory state is 0.
 ``make_problem(pomdp, formula=...)`` takes any formula of linear temporal logic. Many starts are a ``vmap`` over
 keys. The learned value certifies nothing; ``reachability_probability(pomdp, target, policy=...)`` or
-``total_reward`` of the policy do, and :func:`learn_formula` learns and certifies a controller for a co-safe or
-safe formula.
+``total_reward`` of the policy do, and :func:`learn_formula` learns and certifies a controller for a formula.
 
 Example: a hidden coin; one guess, right in state 2. A look, which costs nothing, shows the coin.
   >>> import jax, numpy as np, jaxltl as jl
@@ -79,6 +78,7 @@ from jaxltl.core.values.partial_observability.solve import (
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 
 _CERTIFIED = 5  # starts whose controllers are certified
+_RARE = 0.1  # probability up to which actions are left out of a variant of a controller
 
 
 @struct.dataclass
@@ -405,7 +405,8 @@ class CertifiedController:
     Attributes:
       policy: the best controller of at most M memory states, over observations.
       satisfaction: its satisfaction probability at the initial belief, certified.
-      explored: bounds of all controllers by explored beliefs, with the controller of the lower bound.
+      explored: bounds of all controllers, by explored beliefs or those of `optimal_satisfaction`, with the
+        controller of the lower bound.
       reduced: that controller with merged memory states, perhaps of more than M.
       fully_observable: the optimum of policies that see the states, ``Solution`` of the model.
       start: of the policy: ``"random"`` logits, ``"beliefs"``, a start at the explored controller, or
@@ -439,28 +440,31 @@ def learn_formula(
     max_seconds: float | None = None,
     options: ChunkOptions | None = None,
 ) -> CertifiedController:
-    """A finite-state controller for a co-safe or safe formula, learned from several starts and certified.
+    """A finite-state controller for a formula, learned from several starts and certified.
 
-    Beliefs are explored for both bounds. Their controller, if it can be reduced to the memory of
-    `hparams`, is one start of the policy gradient; the other starts are random. The five best of them
-    are certified with random and with likeliest actions. Of all controllers within the tolerance of
-    the best value, the one of fewest expected steps to a decision is kept.
+    Beliefs are explored for both bounds of a co-safe or safe formula; of others they are those of
+    :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`. Their controller, if it
+    can be reduced to the memory of `hparams`, is one start of the policy gradient; the other starts are
+    random. The five best of them are certified with random, without rare, and with likeliest actions. Of
+    all controllers within the tolerance of the best value, the one of fewest expected steps to a
+    decision is kept.
 
     Args:
       key: random key.
       pomdp: a concrete POMDP.
-      formula: co-safe or safe; its automaton is hidden, and the memory has to keep what matters of it.
+      formula: its automaton is hidden, and the memory has to keep what matters of it.
       hparams: of the learner; ``num_memory`` bounds the memory of the policy.
       num_starts, num_steps: number of starts, and gradient steps of each.
       discount: of steps, for the learner of a co-safe formula alone: below 1 it favours quick controllers.
-      tolerance, max_beliefs, max_seconds: of :func:`~jaxltl.core.values.partial_observability.solve.belief_bounds`.
+      tolerance, max_beliefs, max_seconds: of the exploration, see
+        :func:`~jaxltl.core.values.partial_observability.solve.belief_bounds`.
       options: reports, and a checkpoint from which a run resumes.
 
     Returns:
       :class:`CertifiedController`.
 
     Raises:
-      ValueError: another formula, or one with unknown propositions.
+      ValueError: a formula with unknown propositions, or a discount out of range.
 
     Example:
       >>> import jaxltl as jl
@@ -470,27 +474,27 @@ def learn_formula(
       1.0
     """
     joint, final, automaton = task_pomdp(pomdp, formula)
-    if final is None:
-        raise ValueError(
-            f"learn_formula: {formula} is neither co-safe nor safe; give such a formula, or learn with "
-            "make_problem(pomdp, formula=...) and evaluate by solve_property(controlled_chain(pomdp, policy), ...)."
-        )
-    objective, target = ("min", ~final) if automaton.is_safety else ("max", final)
-    explored = belief_bounds(
-        joint,
-        target,
-        objective=objective,
-        tolerance=tolerance,
-        max_beliefs=max_beliefs,
-        max_seconds=max_seconds,
-    )
-    decided = np.ones(joint.num_states, bool)
-    decided[reach_problem(joint, target, None, maximize=objective == "max").state] = False
-    reduced = reduced_controller(joint, _controller_of(explored), decided=decided)
     require_in_range("discount", discount, Range(0, 1, open_below=True))
-    problem = make_problem(joint, target, objective=objective)
-    if not automaton.is_safety:
-        problem = replace(problem, discount=jnp.asarray(discount, problem.gain.dtype))
+    decided = np.zeros(joint.num_states, bool)
+    if final is None:
+        explored = optimal_satisfaction(pomdp, automaton, tolerance=tolerance)
+        problem = make_problem(pomdp, formula=automaton)
+    else:
+        objective, target = ("min", ~final) if automaton.is_safety else ("max", final)
+        explored = belief_bounds(
+            joint,
+            target,
+            objective=objective,
+            tolerance=tolerance,
+            max_beliefs=max_beliefs,
+            max_seconds=max_seconds,
+        )
+        decided[:] = True
+        decided[reach_problem(joint, target, None, maximize=objective == "max").state] = False
+        problem = make_problem(joint, target, objective=objective)
+        if not automaton.is_safety:
+            problem = replace(problem, discount=jnp.asarray(discount, problem.gain.dtype))
+    reduced = reduced_controller(joint, _controller_of(explored), decided=decided)
     keys = jax.random.split(key, num_starts)
     states = jax.vmap(lambda one: init(one, problem, hparams))(keys)
     fits = reduced.next_memory.shape[1] <= hparams.num_memory
@@ -514,13 +518,16 @@ def learn_formula(
     for lane in np.argsort(-last, kind="stable")[:_CERTIFIED].tolist():
         one = policy(jax.tree.map(lambda x, i=lane: x[i], chunks.state), problem, hparams)
         likeliest = one.replace(action=np.eye(one.num_actions)[one.action.argmax(-1)])
+        common = one.replace(action=without_rare_actions(np.asarray(one.action), _RARE))
         name = "beliefs" if fits and lane == 0 else "random"
-        candidates += [(one, name), (likeliest, name)]
+        candidates += [(one, name), (common, name), (likeliest, name)]
     small = [reduced_controller(joint, one, decided=decided) for one, _ in candidates]
     values = [_satisfaction(pomdp, one, formula) for one in small]
     lower = np.array([float(x.lower) for x in values])
     slow = [
-        _expected_steps(joint, one, decided) if value >= lower.max() - tolerance else np.inf
+        _expected_steps(joint, one, decided)
+        if decided.any() and value >= lower.max() - tolerance
+        else np.inf
         for one, value in zip(small, lower, strict=True)
     ]
     best = (

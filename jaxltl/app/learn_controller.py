@@ -47,7 +47,10 @@ DOUBLE, FILE = True, ControllerFile
 LIVE = "controller"
 _RUNS = 3
 _FIGURES = ("value", "gradient_norm")
-_CURVES = "Satisfaction probability of the softmax controller and gradient before each step"
+_CURVES = (
+    "Objective of the softmax controller, a satisfaction probability with discounted steps, and gradient "
+    "before each step"
+)
 
 
 @dataclass(frozen=True)
@@ -82,12 +85,7 @@ def prepare(task: ControllerFile, seed: int) -> ControllerSetup:
             text, world.observations, hidden=world.hidden or (), **grid_options(world)
         )
     with errors_in(f"{task.path}: [task] "):
-        _, final, automaton = task_pomdp(pomdp, task.formula)
-        if final is None:
-            raise ValueError(
-                f"formula = {task.formula!r} is neither co-safe nor safe; controllers of maps that are "
-                "seen in part are learned for these."
-            )
+        _, _, automaton = task_pomdp(pomdp, task.formula)
     hparams = make_hparams(fsc.Hparams, task.controller.specified())
     return ControllerSetup(task, parse_map(text), pomdp, automaton, hparams)
 

@@ -118,12 +118,34 @@ def test_the_report_shows_the_machine_beliefs_and_bounds(outcome):
     assert {"controller.svg", "observations.svg", "learning.svg"} <= drawn
 
 
+@pytest.mark.slow
+def test_a_patrol_has_a_certified_controller(write):
+    """A formula without explored bounds: the learned controller remembers the landmark for ever."""
+    path = write(('"!x U g"', '"G F g & G F (a | b) & G !x"'), ("num_memory = 2", "num_memory = 3"))
+    outcome = job.learn(job.prepare(ControllerFile.read(path), 0), Training(0, 1))
+    result = job.summary(outcome)
+    assert result["satisfaction"]["lower"] > 1 - 1e-6 <= result["bounds"]["upper"]
+    assert result["fully_observable"]["value"] == pytest.approx(1)
+    alone = job.learn(
+        job.prepare(
+            ControllerFile.read(
+                write(
+                    ('"!x U g"', '"G F g & G F (a | b) & G !x"'),
+                    ("num_memory = 2", "num_memory = 1"),
+                )
+            ),
+            0,
+        ),
+        Training(0, 1),
+    )
+    assert 0 <= job.summary(alone)["satisfaction"]["upper"] <= 0.5 + 1e-9
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [
         (("observations = 3", "observations = 2"), "observations"),
         (("observations = 3", 'observations = ["wall"]'), "hidden"),
-        (('"!x U g"', '"G F g"'), "co-safe"),
         (('"!x U g"', '"F q"'), "q"),
         (("num_memory = 2", "num_memory = 0"), "num_memory"),
         (('method = "controller"', 'method = "mlirl"'), "controller"),
