@@ -25,6 +25,7 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.sparse.graph.accepting import accepting_region
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.types import Solution, Status
@@ -90,6 +91,13 @@ def _union(host: HostMDP, priority: Integers) -> tuple[HostMDP, Integers]:
     return HostMDP(rows, start, successor, chance), priority[first]
 
 
+def lost_states(pomdp: POMDP, formula: FormulaLike, *, maximize: bool) -> Booleans:
+    """Product states ``bool[S * Q]`` from which no policy satisfies a formula, or of a minimum violates it."""
+    model, priority, _ = _rows_of_product(pomdp.fully_observable, formula)
+    region = accepting_region(model.host, priority if maximize else priority + 1).region
+    return ~backward_reachable(model.host, region)
+
+
 def controller_satisfaction(
     pomdp: POMDP, policy: FiniteMemoryPolicy, formula: FormulaLike
 ) -> tuple[float, float]:
@@ -144,7 +152,9 @@ def learned_satisfaction(
         "status": np.int32(Status.CONVERGED if done else Status.MAX_STEPS),
         "initial": np.ones(()),
     }
-    method = f"{count} finite-state controllers; the other bound is of policies that see the states"
+    method = (
+        f"{count} finite-state controllers; policies that see the states, or beliefs that have lost"
+    )
     return Solution(**parts, method=method)
 
 

@@ -31,7 +31,7 @@ from jaxltl.core.values.partial_observability.controller_gradient import (
 )
 from jaxltl.core.values.partial_observability.chains import chain_solution, controlled_chain
 from jaxltl.core.values.partial_observability.exploration import BeliefBounds, explore
-from jaxltl.core.values.partial_observability.long_run import learned_satisfaction
+from jaxltl.core.values.partial_observability.long_run import learned_satisfaction, lost_states
 from jaxltl.core.values.partial_observability.problem import (
     BeliefProblem,
     reach_problem,
@@ -241,18 +241,47 @@ def partially_observable_satisfaction(
 ) -> Solution:
     """Bounds of the optimal satisfaction probability, of a co-safe or safe formula over the product's beliefs.
 
-    Of other formulas the one bound is a controller's, and the other one that of policies that see the states.
+    Of other formulas the one bound is a controller's, and the other one that of policies that see the states,
+    or of avoiding, over beliefs, the states in which such a policy has lost.
     The automaton's state is hidden as far as labels are; the controller reads observations alone.
     """
     joint, final, automaton = task_pomdp(pomdp, formula)
     width = TOLERANCE if tolerance is None else float(tolerance)
     if final is None:
-        return learned_satisfaction(pomdp, automaton, objective=objective, tolerance=width)
+        answer = learned_satisfaction(pomdp, automaton, objective=objective, tolerance=width)
+        lost = lost_states(pomdp, automaton, maximize=objective == "max")
+        if answer.status == Status.CONVERGED or not lost.any():
+            return answer
+        limit = belief_bounds(
+            joint, lost, objective="min", tolerance=width, max_beliefs=max_beliefs
+        )
+        return _limited(answer, limit, objective, width)
     bounds = partial(belief_bounds, joint, tolerance=width, max_beliefs=max_beliefs)
     if automaton.is_safety:
         opposite = "min" if objective == "max" else "max"
         return complement_event(bounds(~final, objective=opposite))
     return bounds(final, objective=objective)
+
+
+def _limited(answer: Solution, limit: Solution, objective: str, tolerance: float) -> Solution:
+    """The answer with the bound by beliefs of the probability of lost states, if it is the better one.
+
+    From them a maximum is 0 and a minimum 1: it is at most that of avoiding them, or at least that of
+    reaching them.
+    """
+    lower, upper = float(answer.lower), float(answer.upper)
+    if objective == "max":
+        upper = max(lower, min(upper, float(complement_event(limit).upper)))
+    else:
+        lower = min(upper, max(lower, float(limit.lower)))
+    done = upper - lower <= tolerance
+    parts: dict[str, Array] = {
+        "lower": np.float64(lower),
+        "upper": np.float64(upper),
+        "residual": np.float64(upper - lower),
+        "status": np.int32(Status.CONVERGED if done else Status.MAX_STEPS),
+    }
+    return replace(answer, **parts)
 
 
 def task_pomdp(pomdp: POMDP, formula: FormulaLike) -> tuple[POMDP, Booleans | None, Automaton]:
