@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxltl.app import distributed_errors
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
@@ -219,6 +218,8 @@ def process_group(
     except Exception as error:
         if not is_loss(error):
             raise
+        from jaxltl.app import distributed_errors  # of several processes alone
+
         line = f"process {launch.process} stops: another process has ended. {distributed_errors.AGAIN}."
         os.write(2, f"{distributed_errors.END}{line}\n".encode())
         raise SystemExit(LOST) from None
@@ -357,6 +358,8 @@ def _read_apart(launch: Launch) -> None:
 
     The runtime writes to the file descriptors and ends at once; Python's streams get others.
     """
+    from jaxltl.app import distributed_errors
+
     out, err = os.dup(1), os.dup(2)
     source, sink = os.pipe()
     subprocess.Popen(
