@@ -142,6 +142,10 @@ _NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
 
 
+def _no_rational_names() -> RationalNames:
+    return {}, {}
+
+
 @brief
 @dataclass(frozen=True)
 class Definitions:
@@ -166,7 +170,9 @@ class Definitions:
     integers: frozenset[str] = frozenset()
     rewards: tuple[str, ...] = ()
     constant_values: Mapping[str, Value] = field(default_factory=dict)
-    rational: Callable[[], RationalNames] = field(default=lambda: ({}, {}), repr=False)
+    rational: Callable[[], RationalNames] = field(
+        default_factory=lambda: _no_rational_names, repr=False
+    )
     automaton: Callable[[str], PyTree] | None = field(default=None, repr=False)
 
     @cached_property
