@@ -179,13 +179,10 @@ def summary(outcome: ControllerOutcome) -> Record:
 
 def certifiable(outcome: ControllerOutcome) -> list[Certifiable] | str:
     """The satisfaction probability of the controller."""
-    pomdp, policy = (
-        outcome.setup.pomdp,
-        policy_of_states(outcome.setup.pomdp, outcome.learned.policy),
-    )
+    pomdp, policy = outcome.setup.pomdp, outcome.learned.policy
     question = formula_question(outcome.setup.task.formula)
     size = pomdp.num_states * policy.next_memory.shape[1] * len(outcome.setup.automaton.delta)
-    return [Certifiable(pomdp.fully_observable, None, question, {"policy": policy}, size)]
+    return [Certifiable(pomdp, None, question, {"policy": policy}, size)]
 
 
 def save(out: Path, outcome: ControllerOutcome) -> None:
