@@ -63,8 +63,8 @@ def conveyor_world(
     height, width = free.shape
     successor = _successor(free, flow)
     label = np.zeros((free.size, chain + 1), bool)
-    for (x, y), number in items.items():
-        label[y * width + x, number] = True
+    for (column, row), number in items.items():
+        label[row * width + column, number] = True
     y, x = np.divmod(np.arange(free.size), width)
     world = make_environment(
         Partial(_begin, np.int32(start[1] * width + start[0])),
