@@ -45,6 +45,10 @@ class Algorithm(Protocol):
     step: Callable[..., tuple[PyTree, PyTree]]
 
 
+def _silent(_: str) -> None:
+    pass
+
+
 @dataclasses.dataclass(frozen=True)
 class Training:
     """Seeds of a run, and what happens during it.
@@ -61,7 +65,7 @@ class Training:
     seed: int = 0
     num_seeds: int = 1
     report: MetricsReport | None = None
-    stage: Callable[[str], None] = lambda name: None
+    stage: Callable[[str], None] = dataclasses.field(default_factory=lambda: _silent, repr=False)
     checkpoint: Path | None = None
     mesh: Mesh | None = None
 
