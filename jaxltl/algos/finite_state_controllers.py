@@ -60,7 +60,6 @@ from jaxltl.core.values.partial_observability.chains import controlled_chain
 from jaxltl.core.values.partial_observability.long_run import (
     LEAK,
     satisfaction_problem,
-    without_rare_actions,
 )
 from jaxltl.core.values.partial_observability.problem import (
     BeliefProblem,
@@ -68,7 +67,10 @@ from jaxltl.core.values.partial_observability.problem import (
     reach_problem,
     reward_problem,
 )
-from jaxltl.core.values.partial_observability.reduction import reduced_controller
+from jaxltl.core.values.partial_observability.reduction import (
+    reduced_controller,
+    without_rare_actions,
+)
 from jaxltl.core.values.partial_observability.solve import (
     belief_bounds,
     controller_value as value_of_policy,
@@ -381,19 +383,15 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
-def policy(
-    state: State, problem: Problem, hparams: Hparams, *, least: float = 0.0
-) -> FiniteMemoryPolicy:
+def policy(state: State, problem: Problem, hparams: Hparams) -> FiniteMemoryPolicy:
     """The finite-memory policy over observations: random actions, and the likeliest memory updates.
 
-    ``int[O, M]`` updates on entry, from memory state 0 before the first observation; on the host. Actions of
-    at most the probability `least` are left out: in the long run a rare action that violates a formula is
-    taken almost surely.
+    ``int[O, M]`` updates on entry, from memory state 0 before the first observation; on the host.
+    :func:`~jaxltl.core.values.without_rare_actions` leaves out actions that are taken now and then.
     """
     del hparams
     logits = jnp.where(problem.available, state.parameters.action, -jnp.inf)
     action = np.asarray(jax.nn.softmax(logits), np.float64).swapaxes(0, 1)
-    action = without_rare_actions(action, least)
     update = np.asarray(state.parameters.update).argmax(-1).T.astype(np.int32)
     return FiniteMemoryPolicy(action, update[:, 0].copy(), update)
 
@@ -518,7 +516,7 @@ def learn_formula(
     for lane in np.argsort(-last, kind="stable")[:_CERTIFIED].tolist():
         one = policy(jax.tree.map(lambda x, i=lane: x[i], chunks.state), problem, hparams)
         likeliest = one.replace(action=np.eye(one.num_actions)[one.action.argmax(-1)])
-        common = one.replace(action=without_rare_actions(np.asarray(one.action), _RARE))
+        common = without_rare_actions(one, _RARE)
         name = "beliefs" if fits and lane == 0 else "random"
         candidates += [(one, name), (common, name), (likeliest, name)]
     small = [reduced_controller(joint, one, decided=decided) for one, _ in candidates]

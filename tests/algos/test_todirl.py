@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import todirl
+from jaxltl.algos.todirl import learner
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import predecessor_table, successor_table
 from tests import reference
@@ -222,7 +223,7 @@ class Plain(nn.Module):
 
 def test_the_split_first_layer_is_a_dense_layer_on_everything():
     problem = small()
-    inputs = todirl._network_inputs(lazy(), problem.observation[0])
+    inputs = learner._network_inputs(lazy(), problem.observation[0])
     found = parameters(problem)
     mine = found["params"]
     names = ("Dense_0", "Dense_1", "Dense_2")

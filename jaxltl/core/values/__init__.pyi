@@ -49,6 +49,7 @@ from .partial_observability.reduction import (
     MealyTransition as MealyTransition,
     mealy_machine as mealy_machine,
     reduced_controller as reduced_controller,
+    without_rare_actions as without_rare_actions,
 )
 from .partial_observability.solve import belief_bounds as belief_bounds
 from .partial_observability.supports import (

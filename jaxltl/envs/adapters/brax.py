@@ -90,6 +90,12 @@ def from_playground(
     Raises:
       ValueError: not a Playground environment, or an auto-reset or batch wrapper.
       ImportError: playground is not installed.
+
+    >>> from mujoco_playground import registry
+    >>> env = registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
+    >>> world = from_playground(env)
+    >>> world.actions.shape, world.observations.shape
+    ((1,), (5,))
     """
     root = package("mujoco_playground", "playground")
     training = package("brax.envs.wrappers.training")

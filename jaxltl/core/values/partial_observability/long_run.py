@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import FormulaLike, to_automaton
 from jaxltl.core.models.construct.convert import to_sparse
@@ -36,6 +36,7 @@ from jaxltl.core.values.partial_observability.problem import (
     leaking_problem,
     reach_problem,
 )
+from jaxltl.core.values.partial_observability.reduction import without_rare_actions
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 
 LEAK = 0.1  # of the least priority
@@ -173,18 +174,9 @@ def _candidates(problem: BeliefProblem) -> Iterator[FiniteMemoryPolicy]:
                 break
         policy = ascent.policies()[0]
         yield policy
-        before = np.asarray(policy.action)
         for cut in _CUTS:
-            action = without_rare_actions(before, cut)
-            if (action != before).any():
-                before = action
-                yield policy.replace(action=action)
+            fewer = without_rare_actions(policy, cut)
+            if (fewer.action != policy.action).any():
+                policy = fewer
+                yield policy
         yield ascent.policies()[-1]
-
-
-def without_rare_actions(action: Floats, cut: float) -> Floats:
-    """Distributions without the actions of at most the probability `cut`, but for the likeliest one."""
-    kept: Booleans = (action > cut) | (action == action.max(-1, keepdims=True))
-    weight = np.where(kept, action, 0.0)
-    result: Floats = weight / weight.sum(-1, keepdims=True)
-    return result

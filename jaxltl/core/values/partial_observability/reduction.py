@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Array
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.components import forward_reachable
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.values.partial_observability.chains import controlled_chain, machine_of
@@ -18,6 +20,7 @@ START = -1  # stands for the memory before the first observation
 MAX_REDUCED = 300  # memory states whose pairs are compared
 
 
+@brief
 class MealyTransition(NamedTuple):
     """A transition of a controller: it enters an observation and chooses actions there.
 
@@ -193,3 +196,26 @@ def _merged(
             classes.append(state)
         classes = [c for c in classes if find(root, c) == c]
     return {state: find(root, state) for state in every}
+
+
+def without_rare_actions(policy: FiniteMemoryPolicy, least: float) -> FiniteMemoryPolicy:
+    """The policy without the actions of at most a probability, but for the likeliest ones of each distribution.
+
+    In the long run a rare action that violates a formula is taken almost surely.
+
+    Args:
+      policy: a finite-memory policy with distributions of actions, ``action`` ``float[..., A]``.
+      least: the probability, at least 0 and below 1.
+
+    Returns:
+      The policy, with distributions that sum to one; on the host.
+
+    >>> policy = FiniteMemoryPolicy(np.array([[[0.9, 0.1]]]), np.zeros(1, int), np.zeros((1, 1), int))
+    >>> without_rare_actions(policy, 0.2).action.tolist()
+    [[[1.0, 0.0]]]
+    """
+    validation.require_in_range("least", least, validation.Range(0, 1, open_above=True))
+    action: Floats = np.asarray(policy.action)
+    kept: Booleans = (action > least) | (action == action.max(-1, keepdims=True))
+    weight: Floats = np.where(kept, action, 0.0)
+    return policy.replace(action=weight / weight.sum(-1, keepdims=True))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.models.sparse import Rewards, reward_structure
+from jaxltl.core.models.sparse import reward_structure
 from jaxltl.core.sparse.bounded.backup import StepReward
 from jaxltl.core.sparse.bounded.reward_bounded import BudgetLevel, in_units, until_at_cost
 from jaxltl.core.sparse.bounded.row_game import RowGame
@@ -92,10 +92,7 @@ def reward_after_steps(
     path = question.path
     assert isinstance(path, RewardAfterSteps)
     steps, problem = validation.integer("num_steps", path.num_steps), _problem(model, question)
-    structure = problem.form.reward(path.reward)
-    if structure.state is None and (path.reward is None or isinstance(path.reward, str)):
-        structure = Rewards(state=np.zeros(problem.form.sparse.num_states))  # of choices alone
-    final = state_reward(problem.form.sparse, structure)
+    final = state_reward(problem.form.sparse, problem.form.reward(path.reward))
     zero = np.zeros(problem.game.mdp.num_rows)
     values = total(problem.game, StepReward(zero, zero), final, steps, by_step)
     return problem.solution(values, (float(final.min()), float(final.max())))

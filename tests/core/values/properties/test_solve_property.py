@@ -282,8 +282,8 @@ def test_models_of_every_kind_have_properties():
     for model in (world, jl.models.to_dense(world), jl.to_sparse(world), jl.product(world, "F a")):
         assert solve_property(model, 'Pmax=? [ F "a" ]').value.tolist() == [0.5]
         assert solve_property(model, 'P>=0.25 [ F "a" ]').holds == [True]
-    with pytest.raises(ValueError, match=r"no game.*leave out the coalition"):
-        solve_property(world, '<<system>> Pmax=? [ F "a" ]')
+    # All players are one where there is no game.
+    assert solve_property(world, '<<system>> Pmax=? [ F "a" ]').value.tolist() == [0.5]
     with pytest.raises(ValueError, match="give a property or its text"):
         solve_property(chance(0.5), 0.5)
 
