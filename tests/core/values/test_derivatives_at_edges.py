@@ -322,9 +322,9 @@ OTHERS = ["dense", "max", "min", "sweeps", "reward_max", "reward_min"]
     ("kind", "count"),
     [
         ("policy", 30),
-        pytest.param("reward", 30, marks=pytest.mark.slow),
-        *(pytest.param(kind, 100, marks=pytest.mark.slow) for kind in OTHERS),
-        *(pytest.param(kind, 400, marks=pytest.mark.slow) for kind in ("policy", "reward")),
+        *(pytest.param(kind, 30, marks=pytest.mark.slow) for kind in ("reward", *OTHERS)),
+        *(pytest.param(kind, 100, marks=pytest.mark.exhaustive) for kind in OTHERS),
+        *(pytest.param(kind, 400, marks=pytest.mark.exhaustive) for kind in ("policy", "reward")),
     ],
 )
 def test_derivatives_are_those_of_the_exact_value(kind, count):

@@ -66,7 +66,7 @@ def test_bounds_are_on_the_right_side(seed, kind):
     check_bounds(seed, kind)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", QUESTIONS)
 def test_bounds_of_many_models_are_on_the_right_side(kind):
     checked = [check_bounds(seed, kind) for seed in range(300)]

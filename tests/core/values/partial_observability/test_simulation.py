@@ -58,7 +58,7 @@ def test_values_of_controllers_agree_with_episodes(objective):
         check_frequency(seed, objective, 20_000)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("objective", ["max", "min"])
 def test_values_of_many_controllers_agree_with_episodes(objective):
     for seed in range(10):
@@ -117,6 +117,6 @@ def test_no_violation_inside_the_shield():
     assert check_shield(100, 50, range(30)) >= 10**4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_violation_in_a_million_steps():
     assert check_shield(1000, 500, range(12)) >= 10**6

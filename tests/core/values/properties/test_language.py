@@ -654,7 +654,7 @@ def test_a_malformed_property_does_not_stop_the_others(models):
 PIECES = "P=? [ ] ( ) { } F G X U W R & | ! => <=> = < <= s d 1 1/3 filter(max, E A ? : ; const ceil( + - * / ^ << #"
 
 
-@pytest.mark.parametrize("count", [1000, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1000, pytest.param(100_000, marks=pytest.mark.exhaustive)])
 def test_mutated_texts_have_an_answer_or_an_error_with_a_place(models, count):
     rng = random.Random(count)
     texts = {

@@ -113,14 +113,14 @@ def test_rewards_that_count_if_the_target_is_reached(seed):
     check_reached(seed, most=4, limit=60)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("first", range(0, 40, 10))
 def test_many_rewards_that_count_if_the_target_is_reached(first):
     for seed in range(first, first + 10):
         check_reached(seed, most=6, limit=150)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("first", range(3, 503, 50))
 def test_many_games(first):
     for seed in range(first, first + 50):
