@@ -108,9 +108,9 @@ def partial_gridworld(
       ValueError: a window that is no odd number, an unknown proposition or kind, or an argument that
         :func:`gridworld` refuses.
 
-    >>> world = partial_gridworld("a . . . b", 3)
-    >>> world.observation.tolist()  # the middle cells look alike
-    [2, 0, 1, 1, 3]
+    >>> world = partial_gridworld("a . . . . b", 3)
+    >>> world.observation.tolist()  # the two cells in the middle look alike
+    [0, 4, 1, 1, 2, 3]
     >>> partial_gridworld("a . . b", ["wall"]).observables["wall left"].tolist()
     [0, 0, 1]
     """
