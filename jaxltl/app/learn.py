@@ -56,7 +56,7 @@ class MlirlSetup:
 
     @functools.cached_property
     def demands(self) -> mlirl.Demands:
-        """What the policy is learned from, and what it must satisfy."""
+        """Demonstrations and required guarantees of the policy."""
         table, model, demonstrations = self.task.learner, self.model, self.demonstrations
         avoid, used = table.avoid or (), self.guarantee.until_lost(demonstrations)
         # Without a guarantee, those of the dissertation's Table 1 alone.

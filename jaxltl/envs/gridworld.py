@@ -89,7 +89,7 @@ def partial_gridworld(
 ) -> POMDP:
     """Partially observable gridworld: a robot that sees a window around its cell, or senses a few facts.
 
-    Equal windows are one observation, so that look-alike places are told apart by memory alone. The
+    Equal windows are one observation, so that only memory distinguishes look-alike places. The
     border of the map looks like a wall.
 
     Args:

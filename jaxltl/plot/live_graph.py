@@ -87,5 +87,6 @@ def _arrow(curve: NDArray[np.float64]) -> tuple[str, str]:
 def svg(
     template: str, name: str, box: Sequence[float], label: str, zoom: float = 1.0, **parts: object
 ) -> str:
+    """SVG text of a template of this package in a frame: its box, an accessible label and the zoom."""
     frame = {"name": name, "kind": template, "box": box, "label": label, "zoom": zoom}
     return render("jaxltl.plot", f"{template}.svg", **frame | parts)

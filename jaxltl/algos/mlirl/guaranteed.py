@@ -105,7 +105,7 @@ class Attempt(NamedTuple):
 
 @dataclass(frozen=True)
 class Demands:
-    """What a policy of a product is learned from, and what it must satisfy.
+    """Demonstrations and required guarantees of a policy of a product.
 
     Attributes:
       model: the product of the world with the task.

@@ -502,7 +502,7 @@ class _Parser(PathParser):
         return None if factor == 1 else factor
 
     def collected(self) -> Earned:
-        """What stands after C."""
+        """Rewards collected for ever or for some steps: the text after C."""
         relation = self.accept("<=", "<")
         if relation is None:
             following = [x.text for x in self.tokens[self.place + 2 : self.place + 4]]

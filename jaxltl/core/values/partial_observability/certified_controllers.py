@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -210,7 +211,9 @@ class Library:
         # Of minima, steps are unsafe away from their belief: unseen pairs have no value.
         self._frozen = [pairs] if self.problem.maximize else []
         self.__dict__.pop("_alpha", None)
-        return np.where(start >= blocks, number[np.maximum(start - blocks, 0)] + blocks, start)
+        start, moved = start.copy(), start >= blocks
+        start[moved] = number[start[moved] - blocks] + blocks
+        return start
 
     def alternatives(
         self, measures: Measures, evaluated: Evaluated, num_frozen: int
@@ -236,9 +239,9 @@ class Library:
         seen = self.problem.observation[state]
         order = np.lexsort((memory, seen))
         memory, state, value, seen = memory[order], state[order], value[order], seen[order]
-        starts = np.flatnonzero(np.append(True, seen[1:] != seen[:-1]))
+        _, starts = np.unique(seen, return_index=True)
         table = {}
-        for first, last in zip(starts, np.append(starts[1:], seen.size), strict=True):
+        for first, last in pairwise([*starts, seen.size]):
             numbers = np.unique(memory[first:last])[-_ALTERNATIVES:]
             part = slice(first + np.searchsorted(memory[first:last], numbers[0]), last)
             column = np.searchsorted(numbers, memory[part])

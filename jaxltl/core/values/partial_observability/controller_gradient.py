@@ -198,12 +198,12 @@ def _softmax_gradient(weight: Floats, slope: Floats) -> Floats:
     return result
 
 
-def first_controllers(problem: BeliefProblem, seconds: float | None) -> list[FiniteMemoryPolicy]:
+def first_controllers(problem: BeliefProblem, seconds: float) -> list[FiniteMemoryPolicy]:
     """Controllers of one to three memory states by gradient ascent; of large models fewer ones."""
     policies = SoftmaxAscent.random(problem, 1, 0.0, 0).policies()
     if not problem.num_states or (problem.is_reward and problem.has_infinite):
         return policies
-    end = np.inf if seconds is None else time.monotonic() + _SHARE * seconds
+    end = time.monotonic() + _SHARE * seconds
     steps = _STEPS if problem.num_states <= _LARGE else _STEPS // 2
     for number, (num_memory, scale, rate) in enumerate(_STARTS):
         if number and num_memory * problem.num_states > _LARGE:

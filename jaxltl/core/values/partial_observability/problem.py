@@ -51,7 +51,7 @@ class BeliefProblem:
 
     @property
     def has_infinite(self) -> bool:
-        """Whether total rewards of policies that see the states are infinite somewhere."""
+        """True if total rewards of policies that see the states are infinite somewhere."""
         return not self.is_finite.all()
 
     @property

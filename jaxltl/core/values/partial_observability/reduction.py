@@ -204,11 +204,14 @@ def without_rare_actions(policy: FiniteMemoryPolicy, least: float) -> FiniteMemo
     In the long run a rare action that violates a formula is taken almost surely.
 
     Args:
-      policy: a finite-memory policy with distributions of actions, ``action`` ``float[..., A]``.
+      policy: a finite-memory policy. One that chooses single actions is returned as it is.
       least: the probability, at least 0 and below 1.
 
     Returns:
       The policy, with distributions that sum to one; on the host.
+
+    Raises:
+      ValueError: `least` out of range, or numbers that are no distribution.
 
     >>> policy = FiniteMemoryPolicy(np.array([[[0.9, 0.1]]]), np.zeros(1, int), np.zeros((1, 1), int))
     >>> without_rare_actions(policy, 0.2).action.tolist()
@@ -216,6 +219,15 @@ def without_rare_actions(policy: FiniteMemoryPolicy, least: float) -> FiniteMemo
     """
     validation.require_in_range("least", least, validation.Range(0, 1, open_above=True))
     action: Floats = np.asarray(policy.action)
+    if not np.issubdtype(action.dtype, np.floating):
+        return policy
+    wrong = ~((action >= 0).all(-1) & (np.abs(action.sum(-1) - 1) < 1e-3))
+    if wrong.any():
+        at = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"policy: the actions at {at} have the probabilities {action[at].tolist()}; give a distribution, "
+            "at least 0 with sum 1."
+        )
     kept: Booleans = (action > least) | (action == action.max(-1, keepdims=True))
     weight: Floats = np.where(kept, action, 0.0)
     return policy.replace(action=weight / weight.sum(-1, keepdims=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -132,14 +133,17 @@ def belief_bounds(
         return _solution(problem, BeliefBounds(value, value, policy, 0, 0, True), width)
     known = [*controllers, *SoftmaxAscent.random(problem, 1, 0.0, 0).policies()]
     size, bounds = min(limit, _FEW), None
+    end = time.monotonic() + seconds
     while True:
+        rest = max(end - time.monotonic(), 0.0)
         more = explore(
-            problem, known, tolerance=width, max_beliefs=size, max_seconds=seconds, report=report
+            problem, known, tolerance=width, max_beliefs=size, max_seconds=rest, report=report
         )
         bounds = more if bounds is None else bounds.joined(more, maximize)
-        if bounds.is_complete or problem.is_infinite or size == limit:
+        rest = end - time.monotonic()
+        if bounds.is_complete or problem.is_infinite or size == limit or rest <= 0:
             break
-        known, size = [*controllers, *first_controllers(problem, max_seconds)], limit
+        known, size = [*controllers, *first_controllers(problem, rest)], limit
     solution = _solution(problem, bounds, float(tolerance))
     return check(solution) if throw else solution
 

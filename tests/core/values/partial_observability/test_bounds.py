@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.values.partial_observability.solve import belief_bounds, controller_value
 
 from .reference import controller_values, random_pomdp, tree_value
@@ -127,6 +128,25 @@ def test_a_limit_keeps_the_bounds_and_an_interrupt_too():
     assert seen and seen[0][1] <= seen[0][2]
 
 
+def test_one_limit_of_time_holds_for_both_explorations():
+    """After the first beliefs controllers are learned, and a second exploration begins, if time is left."""
+    for seed in (3, 24, 36):
+        pomdp, _ = random_pomdp(seed)
+        for objective in ("max", "min"):
+            rounds = []
+            answer = belief_bounds(
+                pomdp,
+                "goal",
+                objective=objective,
+                tolerance=0.0,
+                max_seconds=1e-9,
+                report=lambda *x, rounds=rounds: rounds.append(x),
+            )
+            assert len(rounds) == 1 and answer.lower <= answer.upper
+            again = controller_value(pomdp, answer.policy, "goal")
+            assert abs(float(again.value) - float(answer.value)) < 1e-5
+
+
 def test_a_controller_as_a_chain():
     pomdp = jl.models.make_pomdp(CYCLE, [0, 0, 1, 2])
     # Swap twice, then guess 1.
@@ -154,3 +174,23 @@ def test_infinite_rewards_are_decided_without_warnings_and_rewards_are_finite():
     for wrong in (np.nan, np.inf, -1.0):
         with pytest.raises(ValueError, match="finite rewards of at least 0"):
             ask([wrong, 0, 0])
+
+
+def test_rare_actions_are_left_out_of_distributions_alone():
+    start = np.zeros(2, int), np.zeros((2, 1), int)
+    mixed = FiniteMemoryPolicy(np.array([[[0.05, 0.95, 0]], [[0.5, 0.1, 0.4]]]), *start)
+    fewer = jl.values.without_rare_actions(mixed, 0.1).action
+    np.testing.assert_allclose(fewer, [[[0, 1, 0]], [[5 / 9, 0, 4 / 9]]], atol=1e-15)
+    np.testing.assert_array_equal(jl.values.without_rare_actions(mixed, 0.0).action, mixed.action)
+    rare = FiniteMemoryPolicy(np.array([[[0.3, 0.3, 0.4]], [[0.5, 0.5, 0]]]), *start)
+    fewer = jl.values.without_rare_actions(rare, 0.9).action  # the likeliest actions stay
+    np.testing.assert_array_equal(fewer, [[[0, 0, 1]], [[0.5, 0.5, 0]]])
+    chosen = FiniteMemoryPolicy(np.array([[1], [2]]), *start)
+    assert jl.values.without_rare_actions(chosen, 0.1) is chosen
+    for row in ([np.nan] * 2, [0.0, 0.0], [1.5, -0.5], [0.5, np.inf]):
+        wrong = FiniteMemoryPolicy(np.array([[[0.5, 0.5]], [row]]), *start)
+        with pytest.raises(ValueError, match=r"actions at \(1, 0\) have the probabilities"):
+            jl.values.without_rare_actions(wrong, 0.1)
+    for least in (-0.1, 1.0, np.nan):
+        with pytest.raises(ValueError, match="least"):
+            jl.values.without_rare_actions(mixed, least)
