@@ -31,6 +31,7 @@ _ROUND = 300  # beliefs that a round expands at least
 _SHARE = 0.3  # of the expanded beliefs that a round expands at most
 _IMPROVED = 0.5  # share of the time so far, beyond which the improvement of controllers waits
 _SHARE_INTERPOLATED = 0.1  # the same where decompositions of leaves are useful
+_GROWTH = 2  # of the time of an improvement over the one before
 _REPEATS = 30  # evaluations of a controller that continues in its own steps
 _IMPROVING = 4  # pairs of these for each transition between beliefs, on average at most
 # Depth of the beliefs that a round expands below its first ones; the great one, in rounds 1, 2, 4, 8 ...,
@@ -84,6 +85,7 @@ class Exploration:
     end: float  # the time after which controllers are improved no more
     interpolation: Interpolation
     seconds: float = 0.0  # spent on the improvement of controllers
+    latest: float = 0.0  # seconds of the latest improvement
     wait: tuple[int, int] = (
         0,
         1,
@@ -171,7 +173,8 @@ class Exploration:
         """Evaluates controllers of the explored beliefs, and counts the time; True if one is better."""
         begin = time.monotonic()
         better = self._improve(rows)
-        self.seconds += time.monotonic() - begin
+        self.latest = time.monotonic() - begin
+        self.seconds += self.latest
         return better
 
     def _improve(self, rows: BeliefRows) -> bool:
@@ -284,7 +287,10 @@ def explore(
             state.best_outer = narrower(state.best_outer, at_root)
             expanded = int(graph.expanded.sum())
             leaves = rows.reaches_leaves()
-            early = state.seconds <= _IMPROVED * (time.monotonic() - begin)
+            now = time.monotonic()
+            # An improvement, the last one too, takes longer than the one before.
+            late = now + _GROWTH * state.latest > state.end
+            early = not late and state.seconds <= _IMPROVED * (now - begin)
             if (early and expanded >= 1.25 * checked + 20) or not leaves:
                 checked = expanded
                 state.improve(rows)
@@ -296,7 +302,7 @@ def explore(
                 complete = state.gap <= tolerance
                 break
             room = max_beliefs - expanded
-            late = room <= 0 or time.monotonic() - begin > max_seconds
+            late = room <= 0 or time.monotonic() + _GROWTH * state.latest > state.end
             depth = _DEEP if rounds & (rounds - 1) == 0 else _DEPTH
             if late or not _grow(state, mass, room, depth):
                 state.improve(rows)

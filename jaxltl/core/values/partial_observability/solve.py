@@ -77,7 +77,7 @@ def belief_bounds(
       objective: ``"max"`` or ``"min"``.
       tolerance: width of the bounds, at which the exploration ends; of rewards relative to the value.
       max_beliefs: largest number of expanded beliefs, which bounds memory and time.
-      max_seconds: of the exploration; default: no limit.
+      max_seconds: of the exploration; default: no limit. The last evaluation of a controller may exceed it.
       controllers: finite-memory policies over observations to begin with, beside those by gradients.
       report: is called with the number of beliefs and both bounds after each round.
       throw: raise NotConverged unless the solution converged.
