@@ -134,6 +134,10 @@ def save_network(
 
 
 def _program(agent: Agent, environment: Environment, automaton: Automaton | None) -> bytes:
+    if not isinstance(agent, Agent):
+        raise ValueError(
+            f"agent is a {type(agent).__name__}; give an Agent, as learner.policy(state, problem, hparams)."
+        )
     if jax.tree.leaves(agent.memory):
         raise ValueError("the agent has memory; only agents without memory are exported.")
 

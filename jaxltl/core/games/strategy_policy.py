@@ -12,11 +12,14 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.games.permissive import Permissive, pursuing
 from jaxltl.core.games.winning import Winning, objective_at
+from jaxltl.core.models.action_numbers import named_actions
+from jaxltl.core.models.construct.lifting import with_named_actions
 from jaxltl.core.models.construct.restrict import restrict
-from jaxltl.core.models.game import Game
+from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import base_model
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.sparse.rows import concatenated_ranges
 
@@ -46,7 +49,7 @@ def strategy_policy(
       strategy: of :func:`~jaxltl.core.games.winning.winning_region` or
         :func:`~jaxltl.core.games.permissive.permissive_strategy`.
       player: ``"system"``, or ``"environment"`` for the counter-strategy of a `Winning`.
-      actions: names of the actions.
+      actions: names of the actions; default: those of a sparse model.
 
     Returns:
       :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy`; its memory is the automaton's
@@ -73,7 +76,14 @@ def strategy_policy(
     task = strategy.game.mdp
     if not isinstance(task, Product) or not {*task.automaton.propositions} <= {*game.propositions}:
         task = None
-    return policy_of_nodes(part, count, task=task, actions=actions)
+    policy = policy_of_nodes(part, count, task=task, actions=actions)
+    world = base_model(game.mdp)
+    rows = getattr(world, "nominal", world)
+    if actions or not isinstance(rows, SparseMDP):
+        return policy
+    weight = np.asarray(with_named_actions(rows, policy.action))
+    weight = weight / weight.sum(-1, keepdims=True)  # where it is not reached, over the choices
+    return policy.replace(action=weight, actions=named_actions(rows)[1])
 
 
 def explored(strategy: Winning | Permissive, player: str = "system") -> ReachedNodes:
@@ -98,7 +108,7 @@ def explored(strategy: Winning | Permissive, player: str = "system") -> ReachedN
 
 def _moves(winning: Winning, system: bool) -> tuple[Game, Booleans, Booleans, Integers, Integers]:
     """The game with the strategy's memory, region and moves; world and automaton states."""
-    game, region = winning.game, np.asarray(winning.region) == system
+    game, region = as_padded_game(winning.game), np.asarray(winning.region) == system
     action = np.asarray(winning.action if system else winning.counter_action)
     base = np.arange(base_model(game.mdp).num_states)
     old = np.zeros_like(base)

@@ -8,6 +8,7 @@ from jaxltl.core import validation
 from jaxltl.core.array_types import Integers
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import describe_row
 from jaxltl.core.validation import first_true
 
@@ -17,6 +18,19 @@ def row_actions(model: SparseMDP) -> Integers:
     if not isinstance(model, SparseMDP):
         raise ValueError(validation.unsupported_model(model))
     return model.action_number
+
+
+def named_actions(model: SparseMDP) -> tuple[Integers, tuple[str, ...]]:
+    """The number ``int[R]`` of each row's action in a :class:`FiniteMemoryPolicy`, and the names by number.
+
+    The numbers of the names where these tell the choices of every state apart, or else those of
+    :attr:`SparseMDP.action_number`, without names.
+    """
+    named = model.rank if model.action is None else np.asarray(model.action, np.int64)
+    place = model.host.state * np.int64(named.max(initial=0) + 1) + named
+    if np.unique(place).size < place.size:
+        return row_actions(model), ()
+    return named, model.action_names
 
 
 def rows_of_policy(
@@ -81,3 +95,40 @@ def _named(state: int, shape: tuple[int, ...] | None) -> str:
     if shape is None or len(shape) == 1:
         return str(state)
     return str(tuple(int(i) for i in np.unravel_index(state, shape)))
+
+
+def with_action_numbers(model: SparseMDP, policy: FiniteMemoryPolicy) -> FiniteMemoryPolicy:
+    """The policy with the action numbers of the model in place of those of the actions' names.
+
+    Raises:
+      ValueError: an action that its state does not have.
+    """
+    policy, state, number = policy.on_host(), model.host.state, row_actions(model)
+    named, names = named_actions(model)
+    table, width = np.asarray(policy.action), int(named.max(initial=0)) + 1
+    if policy.is_random:
+        weight = np.moveaxis(table, (-3, -1), (0, 1))  # [S, W, ..., Q]
+        if weight.shape[1] < width:
+            raise ValueError(
+                f"policy has {weight.shape[1]} actions and the model {width}; give the model that "
+                "the policy was projected to."
+            )
+        moved = np.zeros((len(weight), int(number.max(initial=0)) + 1, *weight.shape[2:]))
+        moved[state, number] = weight[state, named]
+        wrong = (moved.sum(1) < weight.sum(1) - 1e-5).reshape(len(weight), -1).any(1)
+        moved = np.moveaxis(moved, (0, 1), (-3, -1)).astype(table.dtype)
+    else:
+        row = np.full((policy.num_states, width), -1)
+        row[state, named] = number
+        place = np.arange(policy.num_states)[:, None]
+        known = (table >= 0) & (table < width)
+        moved = np.where(known, row[place, np.where(known, table, 0)], -1)
+        wrong = (moved < 0).any(axis=tuple(i for i in range(moved.ndim) if i != moved.ndim - 2))
+        moved = moved.astype(np.int32)
+    for at in np.flatnonzero(wrong)[:1].tolist():
+        own = named[state == at].tolist()
+        raise ValueError(
+            f"policy: an action of state {at} is not one of its choices, "
+            f"{[names[x] for x in own] if names else own}."
+        )
+    return policy.replace(action=moved)

@@ -141,10 +141,13 @@ def as_game(model: Model) -> Game:
 
 
 def as_padded_game(model: Model) -> Game:
-    """The game of :func:`as_game`, with a sparse model padded."""
+    """The game of :func:`as_game`, with a sparse model padded, also that of a product."""
     game = as_game(model)
-    if isinstance(game.mdp, SparseMDP):
-        game = replace(game, mdp=to_padded(game.mdp))
+    arena, world = game.mdp, getattr(game.mdp, "mdp", None)
+    if isinstance(arena, SparseMDP):
+        game = replace(game, mdp=to_padded(arena))
+    elif isinstance(world, SparseMDP):
+        game = replace(game, mdp=replace(arena, mdp=to_padded(world)))
     return game
 
 

@@ -36,7 +36,7 @@ from jaxltl.core.sparse.rows import SCIPY_SIZE, offsets_from_counts
 _PADDED = (
     "this takes models that are padded: give to_padded(model). Sparse models have choices "
     "in rows, and are taken by the primitives, the functions of graphs and games, the "
-    "solvers of values, and prepare; not by permissive strategies, learners and rollouts."
+    "solvers of values, rollouts, and prepare; not by learners."
 )
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 

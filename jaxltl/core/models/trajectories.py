@@ -16,12 +16,14 @@ from jaxltl.core import struct, validation
 from jaxltl.core.validation import first_true
 
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.models.action_numbers import with_action_numbers
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import jax_array, is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
 from jaxltl.core.models.pomdp import POMDP, policy_of_states
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 
 
@@ -183,7 +185,7 @@ def rollout(
     """Simulated trajectories of a policy.
 
     Args:
-      model: an MDP, a DenseMDP, a POMDP or a Product (states then numbered ``s * Q + q``).
+      model: an MDP, a DenseMDP, a SparseMDP, a POMDP or a Product (states then numbered ``s * Q + q``).
       policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product; or a
         :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy` of the model, in a POMDP of its
         observations.
@@ -210,6 +212,10 @@ def rollout(
             policy_of_states(model, cast(FiniteMemoryPolicy, policy)),
             to_padded(model.fully_observable),
         )
+    elif isinstance(model, SparseMDP):
+        if isinstance(policy, FiniteMemoryPolicy) and policy.num_states == model.num_states:
+            policy = with_action_numbers(model, policy)
+        model = to_padded(model)
     if not isinstance(policy, FiniteMemoryPolicy):
         distribution = policy_distribution(model, policy).reshape(-1, 1, model.num_actions)
         zeros = np.zeros((len(distribution), 1), np.int32)

@@ -122,6 +122,27 @@ def test_a_policy_of_a_task_has_its_automaton(tmp_path):
     assert {"a", "b"} <= met
 
 
+def test_a_policy_of_a_sparse_game_has_its_names():
+    # The system chooses "down" to the bad state 2 or "up" to 1, where the other player returns.
+    world = jl.make_sparse(
+        [0, 2, 3, 4],
+        range(5),
+        [2, 1, 0, 2],
+        [1.0] * 4,
+        initial=[1, 0, 0],
+        label={"bad": [2]},
+        action=[0, 2, 1, 1],
+        action_names=["down", "go", "up"],
+    )
+    game = make_game(world, [True, False, True])
+    for solve in (winning_region, permissive_strategy):
+        policy = strategy_policy(game, solve(game, "G !bad"))
+        assert policy.actions == ("down", "go", "up")
+        assert np.asarray(policy.action)[:, 0].tolist() == [[0, 0, 1], [0, 1, 0], [0, 1, 0]]
+    runs = jl.rollout(world, policy, jax.random.key(0), num_trajectories=1, num_steps=4)
+    assert runs.state.tolist() == [[0, 1, 0, 1]]
+
+
 def test_what_is_refused():
     game = next(g for g in games(0) if bool(winning_region(g, "G !c").realizable))
     found = winning_region(game, "G !c")

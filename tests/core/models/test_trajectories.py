@@ -143,3 +143,37 @@ def test_steps_are_pairs_of_integers(sequences, message):
         jl.make_trajectories(path, sequences)
     pairs = np.array([[(0, 0), (1, 0)]])
     assert jl.make_trajectories(path, pairs).state.tolist() == [[0, 1]]
+
+
+def test_rollouts_of_sparse_models_follow_the_names_of_actions():
+    # State 0 has the choices "b" (to 1) and "a" (to 2); 1 and 2 return by "c".
+    names = {"action": [1, 0, 2, 2], "action_names": ["a", "b", "c"]}
+    model = jl.make_sparse(
+        [0, 2, 3, 4], range(5), [1, 2, 0, 0], [1.0] * 4, initial=[1, 0, 0], **names
+    )
+    policy = jl.project_policy(model, np.array([1, 0, 0]))
+    assert np.asarray(policy.action).tolist() == [[0], [2], [2]] and policy.actions == (
+        "a",
+        "b",
+        "c",
+    )
+    weight = policy.replace(action=np.eye(3)[np.asarray(policy.action)])
+    for given in (policy, weight, np.array([1, 0, 0])):
+        runs = jl.rollout(model, given, jax.random.key(0), num_trajectories=1, num_steps=4)
+        assert runs.state.tolist() == [[0, 2, 0, 2]]
+    for wrong in (policy, weight):
+        table = np.asarray(wrong.action)[[1, 0, 2]]
+        with pytest.raises(ValueError, match=r"state 0 .*'b', 'a'"):
+            jl.rollout(
+                model,
+                wrong.replace(action=table),
+                jax.random.key(0),
+                num_trajectories=1,
+                num_steps=4,
+            )
+    # Names that do not tell the choices of a state apart are no numbers of a policy.
+    alike = jl.make_sparse(
+        [0, 2, 3, 4], range(5), [1, 2, 0, 0], [1.0] * 4, action=[0] * 4, action_names=[""]
+    )
+    policy = jl.project_policy(alike, np.array([1, 0, 0]))
+    assert np.asarray(policy.action).tolist() == [[1], [0], [0]] and policy.actions == ()

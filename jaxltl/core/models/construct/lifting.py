@@ -13,7 +13,7 @@ from jaxltl.core.validation import first_true
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.action_numbers import row_actions
+from jaxltl.core.models.action_numbers import named_actions, row_actions
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree, base_model
 from jaxltl.core.models.sparse import SparseMDP
@@ -191,7 +191,8 @@ def project_policy(
     world, table = base_model(model), policy
     rows = getattr(world, "nominal", world)
     rows = rows if isinstance(rows, SparseMDP) else None
-    named = tuple(actions) or tuple(getattr(rows, "action_names", ())), tuple(states)
+    names = () if rows is None else named_actions(rows)[1]
+    named = tuple(actions) or names, tuple(states)
     if isinstance(policy, ProductPolicy) and rows is not None:
         memory = Product(rows, policy.automaton, policy.letter, policy.label_on)
         count = len(policy.automaton.delta)
@@ -203,7 +204,7 @@ def project_policy(
     else:
         memory, zeros = None, np.zeros((model.num_states, 1), np.int32)
     if rows is not None:
-        table = _named_actions(rows, table)
+        table = with_named_actions(rows, table)
     elif memory is None:
         operators.policy_distribution(model, table)
     else:
@@ -223,10 +224,10 @@ def project_policy(
     )
 
 
-def _named_actions(world: SparseMDP, policy: PyTree) -> jax.Array:
+def with_named_actions(world: SparseMDP, policy: PyTree) -> jax.Array:
     """Actions ``[S, Q]`` or weights ``[S, Q, A]`` by the names' numbers, from a policy of a sparse world."""
     own, state, number = np.asarray(policy), world.host.state, row_actions(world)
-    named = world.rank if world.action is None else np.asarray(world.action)
+    named, names = named_actions(world)
     if own.dtype.kind in "iu":
         if own.shape[:1] != (world.num_states,):
             raise ValueError(
@@ -245,7 +246,7 @@ def _named_actions(world: SparseMDP, policy: PyTree) -> jax.Array:
         return jnp.asarray(named[taken].astype(np.int32))
     if own.shape[0] == world.num_states and own.ndim > 1 and own.shape[-1] > number.max():
         own = np.moveaxis(own, -1, 1)[state, number]
-    width = max(int(named.max(initial=0)) + 1, len(world.action_names))
+    width = max(int(named.max(initial=0)) + 1, len(names))
     weight = np.zeros((world.num_states, width, *own.shape[1:]), own.dtype)
     np.add.at(weight, (state, named), own)
     return jnp.asarray(np.moveaxis(weight, 1, -1))
