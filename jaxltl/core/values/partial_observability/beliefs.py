@@ -193,10 +193,13 @@ class BeliefGraph:
         return node, mass * share, float(mass @ lost)
 
     def corners(self, states: Integers) -> Integers:
-        """The nodes of the beliefs that know the state, of some states; new ones where they are missing."""
+        """The nodes of the beliefs that know the state, of some states; new ones where they are missing.
+
+        Their masses are one up to twice `_UNIT`, far below the rounding of bounds.
+        """
         whole = Measures(np.arange(states.size + 1), states, np.ones(states.size))
         node, share, _ = self._insert(whole, np.full(states.size, -1), -1)
-        if not (share == 1).all():
+        if not (np.abs(share - 1) <= 2 * _UNIT).all():
             raise ArithmeticError("two beliefs have one hash; explore the model in another order.")
         return node
 

@@ -22,22 +22,33 @@ from jaxltl.core.values.partial_observability.certified_controllers import (
 from jaxltl.core.values.partial_observability.interpolation import (
     Interpolation,
     improve_bounds,
+    near_visits,
     visits,
 )
 from jaxltl.core.values.partial_observability.problem import BeliefProblem
+from jaxltl.core.values.partial_observability.rollouts import (
+    action_guides,
+    deviations,
+    heaviest,
+    roll_out,
+)
 
 Report = Callable[[int, float, float], None]  # of the number of beliefs and the bounds so far
 _ROUND = 300  # beliefs that a round expands at least
 _SHARE = 0.3  # of the expanded beliefs that a round expands at most
 _IMPROVED = 0.5  # share of the time so far, beyond which the improvement of controllers waits
+_SMALL = 1000  # beliefs of an exploration without rollouts
 _SHARE_INTERPOLATED = 0.1  # the same where decompositions of leaves are useful
 _GROWTH = 2  # of the time of an improvement over the one before
+_ROLLED = 1e-2  # relative gain of a rollout that is worth the next one
+_ROLLOUTS = 0.25  # share of the beliefs that rollouts expand, most
 _REPEATS = 30  # evaluations of a controller that continues in its own steps
 _IMPROVING = 4  # pairs of these for each transition between beliefs, on average at most
 # Depth of the beliefs that a round expands below its first ones; the great one, in rounds 1, 2, 4, 8 ...,
 # finds controllers, the small one narrows the bound of all controllers.
 _DEPTH, _DEEP = 12, 300
 _MOVING = 1e-3  # share of mass that is left in cycles, at which the certified engine solves them
+_TIE = 1e-2  # width, relative to the gap, within which actions are as good as the best one
 _NARROW = 1e-3  # width of a leaf, relative to that of the initial belief, that needs no expansion
 _LONGEST = 8  # rounds
 _COVERED = 1e-3  # weight of a leaf that one expanded belief covers
@@ -160,6 +171,26 @@ class Exploration:
             mass, _ = visits(rows, decomposed, solved.row)
         return rows, mass
 
+    def begin_by_rollouts(self, room: int) -> None:
+        """Expands beliefs along guides while the policy of the rows gets better by that."""
+        sign = 1 if self.problem.maximize else -1
+        guides, before = action_guides(self.problem), -np.inf
+        node, weight, _ = self.graph.root
+        mass: Floats = np.bincount(node, weight, minlength=self.graph.size).astype(np.float64)
+        while room > 0:
+            for guide in guides:
+                leaves = np.append(mass, np.zeros(self.graph.size - mass.size))
+                leaves[self.graph.expanded] = 0
+                room -= roll_out(self.graph, leaves, guide, room)
+            self.extend()
+            rows = BeliefRows(self.graph, self.graph.rows())
+            policy = rows.solve(self.inner, safe=False, tolerance=1e-5)
+            value = sign * rows.at_root(policy.value)
+            if not value > before + _ROLLED * abs(value) or time.monotonic() > self.end:
+                break
+            mass, before = deviations(rows, policy.row), value
+        self.improve(rows)
+
     def keep(self, evaluated: Evaluated, start: Integers) -> bool:
         """Keeps a controller if it is the best one."""
         sign = 1 if self.problem.maximize else -1
@@ -276,6 +307,8 @@ def explore(
     for start in library.start:
         state.keep(library.evaluate(library.machine(start), initial), start)
     state.extend()
+    if max_beliefs > _SMALL:
+        state.begin_by_rollouts(int(_ROLLOUTS * max_beliefs))
     rounds, complete, checked = 0, False, 0
     try:
         while True:
@@ -345,10 +378,9 @@ def _grow(state: Exploration, mass: Floats, room: int, deepest: int) -> bool:
         deepest = 0
     done = 0
     for depth in range(deepest + 1):
-        chosen = np.flatnonzero(score > 1e-12 * score.max())
-        chosen = chosen[np.argsort(-score[chosen], kind="stable")][: max(amount - done, 1)]
+        chosen = heaviest(score, max(amount - done, 1))
         size, before = graph.size, graph.num_rows
-        graph.expand(np.sort(chosen))
+        graph.expand(chosen)
         state.extend()
         done += chosen.size
         if done >= amount or depth == deepest:
@@ -358,6 +390,12 @@ def _grow(state: Exploration, mass: Floats, room: int, deepest: int) -> bool:
         score, mass = _below(state, chosen, mass, before)
         if not (score > 0).any():
             break
+    if done < amount:
+        # The policy has few leaves: those of other actions that are nearly as good follow.
+        rows = BeliefRows(graph, graph.rows())
+        mass = near_visits(rows, state.outer, _TIE * abs(state.best_outer - state.best_inner))
+        graph.expand(heaviest(np.where(graph.expanded, 0, mass), amount - done))
+        state.extend()
     return True
 
 

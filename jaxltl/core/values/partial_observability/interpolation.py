@@ -32,6 +32,7 @@ _CANDIDATES = (
 _WORK = 1e9  # products of a refinement of decompositions, some two seconds
 _SAVING = 1e-6  # least relative saving of a term
 _SWEEPS = 60  # of value iteration in a round
+_STEPS = 300  # of visits
 _STILL = 1e-2  # change of a sweep, relative to the tolerance, at which value iteration ends
 
 
@@ -214,9 +215,7 @@ def improve_bounds(
     return NodeValues(bound, row)
 
 
-def visits(
-    rows: BeliefRows, decomposed: Interpolated, policy: Integers, *, sweeps: int = 300
-) -> tuple[Floats, float]:
+def visits(rows: BeliefRows, decomposed: Interpolated, policy: Integers) -> tuple[Floats, float]:
     """Expected visits of each node under rows ``int[nodes]`` from the initial measure, from below.
 
     Leaves continue in the nodes of their decompositions. Also the mass that still moves after the last sweep.
@@ -233,12 +232,49 @@ def visits(
     )
     moves = policy >= 0
     moves[decomposed.leaf] = True
+    total, mass = _flow(rows, matrix)
+    return total, float(mass[moves].sum())
+
+
+def policy_visits(rows: BeliefRows, policy: Integers) -> Floats:
+    """The same without decompositions: every leaf is an end."""
+    inner = np.flatnonzero(policy >= 0)
+    return _visits_of_choices(rows, inner, policy[inner], np.ones(inner.size))
+
+
+def near_visits(rows: BeliefRows, bound: Floats, width: float) -> Floats:
+    """The same where all actions within a width of the best one are equally likely."""
+    table, maximize = rows.table, rows.problem.maximize
+    node = table["node"]
+    first = np.flatnonzero(np.append(True, node[1:] != node[:-1]))
+    count = np.diff(np.append(first, node.size))
+    value = table["gain"] + table["lost"] + rows.matrix @ bound
+    best = (np.maximum if maximize else np.minimum).reduceat(value, first).repeat(count)
+    with np.errstate(invalid="ignore"):
+        is_near = ~(np.abs(value - best) > width)  # also where both are infinite
+    share = is_near / np.add.reduceat(is_near.astype(np.float64), first).repeat(count)
+    return _visits_of_choices(rows, node, np.arange(node.size), share)
+
+
+def _visits_of_choices(rows: BeliefRows, node: Integers, row: Integers, share: Floats) -> Floats:
+    """Expected visits if a node takes a row with the probability `share`."""
+    from scipy.sparse import csr_array
+
+    shape = rows.graph.size, rows.table["node"].size
+    total, _ = _flow(
+        rows, csr_array((csr_array((share, (node, row)), shape=shape) @ rows.matrix).T)
+    )
+    return total
+
+
+def _flow(rows: BeliefRows, matrix: SparseMatrix) -> tuple[Floats, Floats]:
+    """Expected visits from the initial measure, from below, and the measure after the last sweep."""
     node, weight, _ = rows.graph.root
-    mass: Floats = np.bincount(node, weight, minlength=size).astype(np.float64)
+    mass: Floats = np.bincount(node, weight, minlength=rows.graph.size).astype(np.float64)
     total = mass.copy()
-    for _ in range(sweeps):
+    for _ in range(_STEPS):
         mass = matrix @ mass
         total += mass
         if mass.sum() < 1e-6:
             break
-    return total, float(mass[moves].sum())
+    return total, mass

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxltl as jl
 from jaxltl.core.values.partial_observability.beliefs import BeliefGraph
 from jaxltl.core.values.partial_observability.bounds import BeliefRows
 from jaxltl.core.values.partial_observability.certified_controllers import Library
@@ -54,3 +55,20 @@ def test_decompositions_add_up_and_bound_every_controller(maximize):
         mass, moving = visits(rows, parts, values.row)
         assert (mass >= 0).all() and 0 <= moving <= 1 + 1e-9
     assert saved > 0
+
+
+def test_the_belief_of_a_state_whose_stored_mass_is_one_up_to_rounding():
+    # Ten weights of .1 add up to less than one, and lead to one state.
+    table = np.zeros((13, 1, 13))
+    table[0, 0, 1:11] = 0.1
+    table[1:11, 0, 11] = 1
+    table[11:, 0, 12] = 1
+    model = jl.to_sparse(jl.from_dense(table, initial=np.eye(13)[0]))
+    pomdp = jl.models.make_pomdp(model, np.minimum(np.arange(13), 1))
+    problem = reach_problem(pomdp, np.eye(13, dtype=bool)[12], None, maximize=True)
+    graph = BeliefGraph(problem)
+    for _ in range(2):
+        graph.expand(np.flatnonzero(~graph.expanded))
+    known = np.flatnonzero(problem.state == 11)
+    weight = graph.measures().take(graph.corners(known)).weight
+    assert weight.size == 1 and 0 < 1 - weight[0] < 1e-15
