@@ -12,7 +12,6 @@ import typing
 from functools import cache
 from pathlib import Path
 
-import pytest
 from jax.tree_util import Partial
 
 import jaxltl
@@ -124,12 +123,23 @@ def test_every_module_has_a_layer():
     assert not homeless, "give it a folder of the tree"
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_imports_flow_down(name):
-    level = layer(name)
-    if level is not None:
-        up = sorted(other for other in below(name) if (layer(other) or 0) > level)
-        assert not up, f"{name} imports {up}"
+def modules_in(*folders: str) -> list[str]:
+    return [x for x in MODULES if f"{x}.".startswith(tuple(f"jaxltl.{y}." for y in folders))]
+
+
+def all_but_empty(faults: dict[str, list]) -> dict[str, list]:
+    """The modules with a fault: assertions show all of them at once."""
+    assert faults, "no module was looked at"
+    return {name: found for name, found in faults.items() if found}
+
+
+def test_imports_flow_down():
+    up = {
+        name: sorted(other for other in below(name) if (layer(other) or 0) > layer(name))
+        for name in MODULES
+        if layer(name) is not None
+    }
+    assert not all_but_empty(up), "imports of a later layer"
 
 
 def test_there_is_no_circle_of_files():
@@ -139,54 +149,55 @@ def test_there_is_no_circle_of_files():
     assert not graph, f"a circle among {sorted(graph)}"
 
 
-@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.core.")])
-def test_the_core_stands_alone(name):
-    assert not imports_any(name, ("optax", "flax.linen", "flax.nnx", "matplotlib", "click", "tqdm"))
+def test_the_core_stands_alone():
+    foreign = ("optax", "flax.linen", "flax.nnx", "matplotlib", "click", "tqdm")
+    assert not all_but_empty({x: imports_any(x, foreign) for x in modules_in("core")})
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in MODULES if f"{n}.".startswith(tuple(f"jaxltl.{x}." for x in NO_JAX))]
-)
-def test_logic_automata_statistics_and_sparse_never_import_jax(name):
-    assert not imports_any(name, ("jax", "jaxlib", "flax", "chex"))
+def test_logic_automata_statistics_and_sparse_never_import_jax():
+    foreign = ("jax", "jaxlib", "flax", "chex")
+    assert not all_but_empty({x: imports_any(x, foreign) for x in modules_in(*NO_JAX)})
 
 
-@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos.")])
-def test_learners_import_themselves_and_common_modules_alone(name):
-    learner = name.split(".")[2]  # "common" is a folder of its own, which imports no learner
-    others = [
-        found
-        for found in imports_any(name, ("jaxltl.algos",))
-        if found != "jaxltl.algos" and found.split(".")[2] not in (learner, "common")
-    ]
-    assert not others
-    assert not imports_any(name, ("jaxltl.cli", "jaxltl.plot", "jaxltl.reproduce", "matplotlib"))
+def test_learners_import_themselves_and_common_modules_alone():
+    foreign = ("jaxltl.cli", "jaxltl.plot", "jaxltl.reproduce", "matplotlib")
+    others = {
+        name: [
+            found
+            for found in imports_any(name, ("jaxltl.algos",))
+            # "common" is a folder of its own, which imports no learner
+            if found != "jaxltl.algos" and found.split(".")[2] not in (name.split(".")[2], "common")
+        ]
+        + imports_any(name, foreign)
+        for name in modules_in("algos")
+    }
+    assert not all_but_empty(others)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_private_modules_of_learners_stay_in_their_folder(name):
-    folder = name.rpartition(".")[0]
-    foreign = [
-        other
-        for other in below(name)
-        if other.startswith("jaxltl.algos.")
-        and other.rpartition(".")[2].startswith("_")
-        and other.rpartition(".")[0] != folder
-    ]
-    assert not foreign
+def test_private_modules_of_learners_stay_in_their_folder():
+    foreign = {
+        name: [
+            other
+            for other in below(name)
+            if other.startswith("jaxltl.algos.")
+            and other.rpartition(".")[2].startswith("_")
+            and other.rpartition(".")[0] != name.rpartition(".")[0]
+        ]
+        for name in MODULES
+    }
+    assert not all_but_empty(foreign)
 
 
-@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.envs.")])
-def test_worlds_import_the_core_alone(name):
-    outside = [
-        n
-        for n in imports_any(name, ("jaxltl",))
-        if not n.startswith(("jaxltl.core", "jaxltl.envs"))
-    ]
-    assert not outside
-
-
-LEARNER_MODULES = [n for n in MODULES if n.startswith("jaxltl.algos.") and "._" not in n]
+def test_worlds_import_the_core_alone():
+    outside = {
+        name: [
+            other
+            for other in imports_any(name, ("jaxltl",))
+            if not other.startswith(("jaxltl.core", "jaxltl.envs"))
+        ]
+        for name in modules_in("envs")
+    }
+    assert not all_but_empty(outside)
 
 
 def public_callables(module):
@@ -202,15 +213,18 @@ def public_callables(module):
             yield name, found
 
 
-@pytest.mark.parametrize("name", LEARNER_MODULES)
-def test_what_is_called_has_help_of_its_own(name):
+def test_what_is_called_has_help_of_its_own():
     lent = {inspect.getdoc(functools.partial), inspect.getdoc(Partial), None, ""}
-    bare = [
-        called
-        for called, found in public_callables(importlib.import_module(name))
-        if inspect.getdoc(found) in lent or inspect.getdoc(found).startswith(f"{called}(")
-    ]
-    assert not bare
+    bare = {
+        name: [
+            called
+            for called, found in public_callables(importlib.import_module(name))
+            if inspect.getdoc(found) in lent or inspect.getdoc(found).startswith(f"{called}(")
+        ]
+        for name in modules_in("algos")
+        if "._" not in name
+    }
+    assert not all_but_empty(bare)
 
 
 def test_importing_changes_no_setting_and_stays_light():
