@@ -22,7 +22,7 @@ import re
 import sys
 import tarfile
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import compress, groupby
 from operator import add, ge, itemgetter, le, mul, or_, sub
@@ -38,7 +38,8 @@ INDEX = "version:int producer:str numbers:str question:dict claims:list members:
 RULE = " policy?:str memory?:int next?:str"
 QUESTION = "text:str path:dict objective:str nature?:str environment?:str observations?:str"
 QUESTION += " initial?:str" + RULE
-CLAIM = "side:str bound:str values:str" + RULE
+CLAIM = "side:str bound:str values:str beliefs?:dict" + RULE
+BELIEFS = "vectors:str covers:str values:str"
 COUNTS = "member:str method:str confidence:str assumption:str"
 PATHS = {
     "until": "kind:str target:str|list stay?:str|list steps?:int",
@@ -586,6 +587,12 @@ class CertificateFile:
         dtype = "double64" if dtype == "double" else dtype
         return read_numbers(self.contents, f"certificate/{name}", dtype, math.prod(shape))
 
+    def stream(self, name: str) -> Sequence:
+        """An array of whole numbers, of any length."""
+        return self.array(
+            name, uint=record(self.members.get(name), "dtype:str shape:list")["shape"]
+        )
+
     def check_counts(self, table: dict) -> None:
         """The intervals of the model contain confidence sets of all rows together, from counts.
 
@@ -633,7 +640,21 @@ class ClaimChecker:
         self.counts, self.memory = "steps" in path, [*sizes, 1][0]
         axes = [file.automaton.num_states, *sizes] if file.automaton else sizes
         shape, self.width = [states, *axes], math.prod(axes)
+        directions = file.direction["system"], file.direction["environment"], ""
+        self.beliefs: Any = None
+        if "beliefs" in claim:  # values of rows, then those of beliefs
+            is_covered = "observations" in file.question and kind in ("until", "reward", "formula")
+            is_covered &= not (sizes or any(self.model.opponents.values()) or directions[0] == ours)
+            is_covered &= "policy" not in file.question and "policy" not in claim
+            hold(is_covered, "beliefs are for optima of all policies that see observations")
+            table, shape[0] = record(claim["beliefs"], BELIEFS), len(self.model.rows)
+            pairs = iter(file.stream(table["vectors"]))
+            self.beliefs = [{next(pairs): next(pairs) for _ in range(n)} for n in pairs]
         self.values = file.array(claim["values"], double=shape, rational=shape)
+        if self.beliefs is not None:
+            count = [len(self.beliefs)]
+            more = file.array(table["values"], double=count, rational=count)
+            self.values, self.covers = [*self.values, *more], file.stream(table["covers"])
         # A policy of the question knows states and memory alone, that of the claim nodes.
         axes = [self.memory] if "memory" in file.question else []
         rule, inner = (file.question, axes) if axes else (claim, shape[1:])
@@ -642,9 +663,10 @@ class ClaimChecker:
             self.next = file.array(rule["next"], uint=[states, *inner])
             self.block = math.prod(inner)
         need(max(self.next, default=0) < self.memory, "a memory state is out of range")
-        directions = file.direction["system"], file.direction["environment"], ""
         self.is_ours = [directions[owner] == ours for owner in self.model.owner]
         self.is_our_nature, num_rows = file.direction["nature"] == ours, len(self.model.rows)
+        name, same = "actions/choices/values", [0] * num_rows
+        self.action = [*read_numbers(file.contents, name, "uint32", num_rows, same)]
         hold(not (self.is_our_nature and file.confidence), "counts prove what all intervals prove")
         fixing = {i: (claim, shape[1:]) for i in (0, 1) if directions[i] == ours}
         fixing |= {0: (file.question, axes)} if "policy" in file.question else {}
@@ -659,13 +681,11 @@ class ClaimChecker:
             seen: Any = file.observation
             choices: dict[tuple, tuple] = {}
             hold(0 in self.policy, "a policy that sees observations is missing")
-            starts, zeros = self.model.row_start, [0] * num_rows
-            name = "actions/choices/values"
-            action = read_numbers(file.contents, name, "uint32", len(zeros), zeros)
+            starts = self.model.row_start
             for v in range(states * self.width):
                 s = v // self.width
                 chosen, weights = self.taken(v, 0)
-                names = [action[r] for r in range(starts[s], starts[s + 1])]
+                names = self.action[starts[s] : starts[s + 1]]
                 choice = [r - starts[s] for r in chosen], weights, names, self.after(v)
                 is_same = choices.setdefault((seen[s], v % self.memory), choice) == choice
                 hold(is_same, f"state {s}: the policy depends on more than observations")
@@ -691,6 +711,8 @@ class ClaimChecker:
             self.y[v] = sign * self.infinity
 
     def place(self, v: int) -> str:
+        if v < 0:
+            return f"{self.claim['side']} bound: belief {-1 - v}"
         s, k = divmod(v, self.width)
         more = f", automaton and memory state {divmod(k, self.memory)}" if self.width > 1 else ""
         return f"{self.claim['side']} bound: state {s}{more}"
@@ -787,9 +809,120 @@ class ClaimChecker:
                 return is_some
         return not is_some
 
-    def check(self) -> tuple[int, str]:
-        """Checks the claim; returns the number of nodes, and what the claim says."""
-        path, kind, width, y = self.file.path, self.file.kind, self.width, self.y
+    def seen(self, v: int) -> int:
+        return self.file.observation[v // self.width]
+
+    def row(self, v: int, k: int) -> int:
+        """The place of a node's row among the values of rows."""
+        return (self.model.row_start[v // self.width] + k) * self.width + v % self.width
+
+    def informed(self, mass: dict) -> int:
+        """A bound for a measure on nodes of one observation: that of its best first row."""
+        count = len(self.graph[next(iter(mass))])
+        return max(sum([n * self.y[self.row(v, k)] for v, n in mass.items()]) for k in range(count))
+
+    def moved(self, mass: dict, k: int) -> tuple[Any, dict, int]:
+        """What row k of each node earns, the measure after it, and the denominator of both."""
+        options = [self.graph[v][k] for v in mass]
+        common, gain = math.lcm(*[option[2] for option in options]), 0
+        after: dict = {}
+        for n, (targets, low, total, _, rewards, _) in zip(mass.values(), options):
+            scale = n * (common // total)
+            gain += scale * sum(map(mul, low, rewards))
+            for t, p in zip(targets, low):
+                if p:
+                    after[t] = after.get(t, 0) + scale * p
+        return gain, after, common
+
+    def parts(self, mass: dict) -> tuple[int, list[dict]]:
+        """The value of what has ended, and the rest by observations."""
+        parts: dict = {}
+        ended = 0
+        for v, n in mass.items():
+            if v in self.ends:
+                ended += n * self.ends[v]
+            else:
+                parts.setdefault(self.seen(v), {})[v] = n
+        return ended, [parts[o] for o in sorted(parts)]
+
+    def taken_out(self, rest: dict, j: int) -> tuple[int, int, dict]:
+        """The largest n/d so that n/d times belief j is within a measure, and d times the rest."""
+        belief, n, d = self.beliefs[j], 1, 0
+        for v, m in belief.items():
+            if rest.get(v, 0) * d < n * m:
+                n, d = rest.get(v, 0), m
+        common = math.gcd(n, d)
+        n, d = n // common, d // common
+        rest = {v: x * d - n * belief.get(v, 0) for v, x in rest.items()}
+        return n, d, {v: x for v, x in rest.items() if x}
+
+    def bound(self, mass: dict, covers: Iterator | None = None) -> tuple[Any, list]:
+        """A bound for a measure on nodes, and the nodes and beliefs of which it is made.
+
+        For each observation it is that of the best first row, or of a cover by stored beliefs.
+        """
+        total: Any
+        total, parts = self.parts(mass)
+        used: list = [None] * (len(mass) > sum(map(len, parts)))
+        for rest in parts:
+            best, terms = self.informed(rest), [*rest]
+            cover = [next(covers) for _ in range(next(covers))] if covers else []
+            need(len(cover) <= 64, "a cover has over 64 beliefs")
+            value, scale, taken = 0, 1, []
+            for j in cover:
+                n, d, rest = self.taken_out(rest, j)
+                value, scale = value * d + n * self.worth[j], scale * d
+                taken += [-1 - j] * (n > 0)
+            value += self.informed(rest) if rest and cover else 0
+            if cover and value < best * scale:
+                total, best, terms = total + Fraction(value, scale), 0, [*taken, *rest]
+            total, used = total + best, used + terms
+        return total, used
+
+    def check_beliefs(self, graph: dict, ends: dict, starts: list[dict]) -> list[Fraction]:
+        """Checks the inequalities of rows and of stored beliefs; returns bounds of some measures."""
+        hold(
+            not (self.infinite or self.is_signed), "values with beliefs are finite and of one sign"
+        )
+        self.graph, self.ends = graph, ends
+        top, floor = (self.one, 0) if self.is_upper else (0, -math.inf)
+        is_reward = self.file.kind == "reward"
+        nodes = {v: {v: 1} for v in graph if v not in ends}
+        actions: dict = {}
+        for v in nodes:
+            names = self.action[self.row(v, 0) // self.width :][: len(graph[v])]
+            is_same = actions.setdefault(self.seen(v), names) == names
+            hold(is_same, f"{self.place(v)}: a state of equal observation has other actions")
+        for j, belief in enumerate(self.beliefs):
+            fits = belief and all(v in nodes and n for v, n in belief.items())
+            hold(fits and len(self.parts(belief)[1]) == 1, f"belief {j} has not one observation")
+        y = self.y[len(self.y) - len(self.beliefs) :]
+        self.worth = [sum(belief.values()) * x for belief, x in zip(self.beliefs, y)]
+        region: dict = {}
+        covers = iter(self.covers)
+        bounds = [self.bound(start, covers)[0] for start in starts]
+        nodes |= {-1 - j: belief for j, belief in enumerate(self.beliefs)}
+        for v, mass in nodes.items():
+            region[v] = []
+            for k in range(len(graph[next(iter(mass))])):
+                gain, moved, common = self.moved(mass, k)
+                least, used = self.bound(moved, covers if v < 0 else None)
+                x = self.y[self.row(v, k)] if v >= 0 else y[-1 - v]
+                holds = x >= floor and x * sum(mass.values()) * common >= gain + least
+                why = f"{self.place(v)}, choice {k}: the value does not follow from its successors"
+                hold(holds or (x >= top and not is_reward), why)
+                if x < top or is_reward:
+                    region[v].append((used, [1] * len(used), len(used), None, (), ()))
+        hold(next(covers, None) is None, "there are more covers than successors of beliefs")
+        if self.file.kind != "formula" and self.is_upper == is_reward:
+            for v in staying(region):
+                raise Refusal(f"{self.place(v)}: paths may stay forever, and miss the target")
+        means = [Fraction(x, sum(start.values()) * self.one) for x, start in zip(bounds, starts)]
+        return [1 - x if self.is_negated else x if self.is_upper else -x for x in means]
+
+    def explored(self) -> tuple[dict, dict, list[int]]:
+        """The options of all nodes, the values y of those where the question ends, the initial ones."""
+        path, width = self.file.path, self.width
         target = self.file.states(path.get("target", ["false"]))
         stay = self.file.states(path.get("stay", ["true"]))
 
@@ -805,16 +938,23 @@ class ClaimChecker:
             edges = [automaton.edges[i] for i in automaton.letter_of]
             priority = {v: edges[v // width][v % width // self.memory][1] for v in graph}
             accepted = accepting(graph, priority, self.is_negated, [])
+        final = [v for v, options in graph.items() if not options or v in accepted]
+        is_one = (v in accepted or ("reward" not in path and target[v // width]) for v in final)
+        one = self.one if self.is_upper else -self.one
+        return graph, {v: one * x for v, x in zip(final, is_one)}, initial
+
+    def check(self) -> tuple[int, str]:
+        """Checks the claim; returns the number of nodes, and what the claim says."""
+        path, kind, width, y = self.file.path, self.file.kind, self.width, self.y
+        graph, ends, initial = self.explored()
         # The inequality is needed below `top`, and values are not below `floor`.
-        sign, is_reward = 1 if self.is_upper else -1, "reward" in path
-        top = self.infinity if is_reward else self.one
+        top = self.infinity if "reward" in path else self.one
         top, floor = (top, 0) if self.is_upper else (0, -self.infinity)
         if self.is_signed:
             top, floor = self.infinity, -self.infinity
-        for v, options in graph.items():
-            if not options or v in accepted:
-                is_one = v in accepted or (target[v // width] and not is_reward)
-                holds = y[v] >= sign * self.one * is_one
+        for v, options in graph.items() if self.beliefs is None else ():
+            if v in ends:
+                holds = y[v] >= ends[v]
             else:
                 holds = y[v] >= top or v in self.infinite
                 holds = holds or (y[v] >= floor and self.is_inductive(v, options))
@@ -822,11 +962,11 @@ class ClaimChecker:
                 raise Refusal(f"{self.place(v)}: the value does not follow from its successors")
         # Where paths must not stay forever.
         nodes, region = {v: options for v, options in graph.items() if options}, {}
-        ends = "steps" in path or "discount" in path
-        hold(ends or kind != "total" or not self.is_signed, "totals of both signs are not covered")
-        if kind == "reward" and (self.is_upper or self.is_signed):
+        stops = "steps" in path or "discount" in path or self.beliefs is not None
+        hold(stops or kind != "total" or not self.is_signed, "totals of both signs are not covered")
+        if self.beliefs is None and kind == "reward" and (self.is_upper or self.is_signed):
             region = {v: options for v, options in nodes.items() if v not in self.infinite}
-        elif kind in ("until", "total") and not self.is_upper and not ends:
+        elif kind in ("until", "total") and not self.is_upper and not stops:
             # Options that earn a reward, whatever nature does, have an infinite total if they recur.
             for v in [v for v in nodes if y[v] < 0]:
                 idle = [o for o in nodes[v] if not any(map(mul, o[1], o[4]))]
@@ -842,16 +982,21 @@ class ClaimChecker:
         text, is_lower = self.claim["bound"], self.claim["side"] == "lower"
         bound = math.inf if text == "inf" else to_fraction(text)
         relation, worst = (ge, min) if is_lower else (le, max)
-        v = worst(initial, key=self.values.__getitem__)
-        value, weights = self.values[v], self.file.weights
+        v = worst(initial, key=self.values.__getitem__) if self.beliefs is None else initial[0]
+        value, weights, starts = self.values[v], self.file.weights, [{v: 1} for v in initial]
         if weights:
             used = [s for s, w in enumerate(weights) if w]
             fits = used and all(weights[s] > 0 and self.model.initial[s] for s in used)
             need(fits, "the weights of initial states are no distribution of them")
-            pairs = [(Fraction(weights[s]), self.values[s * width + start]) for s in used]
-            is_infinite = any(x == math.inf for _, x in pairs)
-            mean = 0 if is_infinite else sum(w * Fraction(x) for w, x in pairs)
-            value = math.inf if is_infinite else mean / sum(w for w, _ in pairs)
+            numbers = to_integers([weights[v // width] for v in initial])[0][0]
+            starts = [{v: n for v, n in zip(initial, numbers) if n}]
+        if self.beliefs is not None:
+            value = worst(self.check_beliefs(graph, ends, starts))
+        elif weights:
+            is_infinite = any(self.values[v] == math.inf for v in starts[0])
+            pairs = [] if is_infinite else starts[0].items()
+            mean = sum(Fraction(self.values[v]) * n for v, n in pairs) / sum(numbers)
+            value = math.inf if is_infinite else mean
         hold(relation(value, bound), f"{self.place(v)}: {value!s:.40} is beyond {text:.40}")
         claimed = f"{self.file.question['text']} is {'>=' if is_lower else '<='} {text}"
         place = "" if weights else " in every initial state"

@@ -40,21 +40,27 @@ def _doubles_of(model: SparseMDP) -> RationalNumbers:
 
 
 def decimal_numbers(model: SparseMDP) -> RationalNumbers:
-    """Rows and rewards of a text file, read as fractions and decimals.
+    """Rows and rewards of a text file, read as fractions and decimals: see `written_probabilities`."""
+    rewards = {
+        name: (_written(reward.state), _written(reward.choice), _written(reward.transition))
+        for name, reward in model.rewards.items()
+    }
+    return RationalNumbers(_normalised(model, written_probabilities(model)), rewards)
+
+
+def written_probabilities(model: SparseMDP) -> list[Fraction]:
+    """The number of each entry: a fraction or a decimal that rounds to it.
 
     A double stands for the fraction with a denominator of at most 10^6 that rounds to it, else for
     its shortest decimal; in rows of which these numbers do not sum to one, for itself.
     """
     probability = [Fraction(x) for x in model.host.probability.tolist()]
+    number = {x: written_number(float(x)) for x in set(probability)}
     for entries in pairs(model.host.entry_start.tolist()):
-        written = [written_number(float(probability[e])) for e in entries]
+        written = [number[probability[e]] for e in entries]
         if sum(written) == 1:
             probability[entries.start : entries.stop] = written
-    rewards = {
-        name: (_written(reward.state), _written(reward.choice), _written(reward.transition))
-        for name, reward in model.rewards.items()
-    }
-    return RationalNumbers(_normalised(model, probability), rewards)
+    return probability
 
 
 def written_number(x: float) -> Fraction:

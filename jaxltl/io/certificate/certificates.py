@@ -31,9 +31,12 @@ from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, reward_structure
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import Solution
+from jaxltl.core import validation
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee
+from jaxltl.core.values.partial_observability.solve import MAX_BELIEFS, TOLERANCE
+from jaxltl.io.certificate.belief_claims import BeliefSearch, Improvement
 from jaxltl.io.certificate.formula_claims import formula_claims
 from jaxltl.io.certificate.induced_model import induced_problem, solved
 from jaxltl.io.certificate.inductive_bounds import (
@@ -63,6 +66,7 @@ def write_certificate(
     reward: Rewards | chex.Array | None = None,
     discount: float | None = None,
     policy: FiniteMemoryPolicy | chex.Array | None = None,
+    max_beliefs: int = MAX_BELIEFS,
 ) -> None:
     """Writes a model with a certificate of a solution's bounds in its initial states.
 
@@ -74,7 +78,8 @@ def write_certificate(
       path: the file, a UMB archive.
       model: a SparseMDP, MDP or DenseMDP, an IntervalMDP without L1 balls, or a Game of one of them,
         whose environment is adversarial; for a formula also a Product. Of a POMDP, from its initial
-        belief: the bound that a controller attains, and that of policies that see the states.
+        belief: the bound that a controller attains, and that of all policies by explored beliefs, or of those
+        that see the states where it is as good.
       solution: of the question, such as of :func:`~jaxltl.reachability_probability`, with bounds
         and a deterministic policy, of a POMDP a finite-memory policy over its observations; of a formula
         that of :func:`~jaxltl.optimal_satisfaction`, or the guarantee of :func:`~jaxltl.learn_guarantee`,
@@ -90,6 +95,8 @@ def write_certificate(
       policy: the question is about this policy of the system: actions ``int[S]`` or weights
         ``float[S, A]``, of a product ``[S, Q]`` and ``[S, Q, A]``, or with a finite memory; of a POMDP
         over its observations.
+      max_beliefs: largest number of beliefs of a POMDP that are explored for the bound of all policies, until
+        the bounds are as close as those of the solution; 0 for policies that see the states.
 
     Raises:
       ValueError: the model or the question is of another kind, the solution has no bounds, or they
@@ -155,19 +162,26 @@ def write_certificate(
             file = checker.CertificateFile(contents)
         except checker.Refusal as error:
             raise ValueError(f"the checker refuses the model or the question: {error}.") from None
-        problems = [problem]
+        problems, search = [problem], None
         if induced is not None:
             problems = [induced]
             for name, (values, shape) in arrays.items():
                 store(file, name, values, shape)
-        elif controller is not None:
-            problems = _of_controller(problem, file, controller)
+        elif pomdp is not None and controller is not None:
+            problems = _of_controller(problem, file, policy_of_states(pomdp, controller))
+            limit = validation.integer("max_beliefs", max_beliefs, least=0)
+            width = TOLERANCE
+            if isinstance(solution, Solution):  # of rewards relative
+                scale = abs(float(solution.value)) if prop.operator == "R" else 1.0
+                width = max(float(solution.upper - solution.lower), 0.0) / max(scale, 1e-300)
+            search = BeliefSearch(pomdp, controller, width, limit) if limit else None
         claims = []
         for part in problems:
+            improve = None if search is None or part is problems[0] else search.improve
             if automaton is not None:
-                claims += formula_claims(part, file, automaton)
+                claims += formula_claims(part, file, automaton, improve)
             else:
-                claims += _claims(part, file, solved(part) if simple is None else simple)
+                claims += _claims(part, file, solved(part) if simple is None else simple, improve)
         if answer is not None:
             _check_initial(answer, model, claims)
     index = json.loads(contents["certificate/index.json"])
@@ -189,7 +203,8 @@ def _policies(
             "certificates of a POMDP are written for a controller; give a solution that has one, or policy=, "
             "a FiniteMemoryPolicy over observations."
         )
-    return policy_of_states(pomdp, attained), None
+    policy_of_states(pomdp, attained)
+    return attained, None
 
 
 def _of_controller(
@@ -330,7 +345,10 @@ def nested(formula: Formula) -> str | list[object]:
 
 
 def _claims(
-    problem: Certified, file: checker.CertificateFile, solution: Solution
+    problem: Certified,
+    file: checker.CertificateFile,
+    solution: Solution,
+    improve: Improvement | None = None,
 ) -> list[dict[str, object]]:
     """Claims of reachability and rewards, of both sides where they have bounds."""
     steps, claims, host = problem.path.get("steps"), [], problem.host
@@ -355,7 +373,8 @@ def _claims(
         elif side == "lower" or np.isfinite(bound[problem.initial]).any():
             value = np.array(solution.value).ravel()
             bounds = candidates(problem, side, bound, value, rows)
-            claims.append(proven(problem, file, side, bounds, policy=name))
+            claim = proven(problem, file, side, bounds, policy=name)
+            claims.append(claim if improve is None else improve(problem, file, claim))
     return claims
 
 

@@ -17,6 +17,7 @@ from jaxltl.core.models.protocols import Array, LabelledModel
 from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.row_form import row_form, row_of_action
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+from jaxltl.io.certificate.belief_claims import Improvement
 from jaxltl.io.certificate.inductive_bounds import (
     Certified,
     Integers,
@@ -30,7 +31,10 @@ _OTHER = {"adversarial": "cooperative", "cooperative": "adversarial"}
 
 
 def formula_claims(
-    problem: Certified, file: checker.CertificateFile, automaton: Automaton
+    problem: Certified,
+    file: checker.CertificateFile,
+    automaton: Automaton,
+    improve: Improvement | None = None,
 ) -> list[dict[str, object]]:
     """A lower and an upper claim of the probability of a formula, with values ``[S, Q]``.
 
@@ -69,7 +73,8 @@ def formula_claims(
             policy[whole.node] = _rows(whole, answer) - form.host.row_start[:-1]
             name = f"{side}_policy"
             store(file, name, policy, whole.shape)
-        claims.append(proven(whole, file, side, _bounds(whole, side, answer), policy=name))
+        claim = proven(whole, file, side, _bounds(whole, side, answer), policy=name)
+        claims.append(claim if improve is None else improve(whole, file, claim))
     return claims
 
 

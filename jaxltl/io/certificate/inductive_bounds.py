@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import jaxltl
 from jaxltl import checker
+from jaxltl.core.models.exact_numbers import written_probabilities
 from jaxltl.core.models.pomdp import POMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -109,7 +110,8 @@ def contents_of(
 ) -> dict[str, bytes]:
     """Members of the archive, without claims; of a guarantee from data with its counts.
 
-    Those of a POMDP have its observations and its initial belief.
+    Those of a POMDP have its observations, its initial belief, and the probabilities for which its
+    doubles stand as rational numbers.
     """
     known: dict[str, object] = {}
     arrays: dict[str, tuple[str, NDArray[np.generic]]] = {}
@@ -129,6 +131,13 @@ def contents_of(
         "members": known,
     }
     members = {name: bytes(content) for name, content in umb_contents(model)}
+    if isinstance(model, POMDP):  # exact, as otherwise few cycles of beliefs are
+        written = written_probabilities(model.fully_observable)
+        bits, members["branch-to-probability.bin"] = _rationals(written)
+        table = json.loads(members["index.json"])
+        kind = {"type": "rational", "size": bits}
+        table["transition-system"]["branch-probability-type"] = kind
+        members["index.json"] = json.dumps(table, separators=(",", ":")).encode()
     for name, (_, values) in arrays.items():
         members[f"certificate/{name}.bin"] = values.tobytes()
     if automaton:
@@ -163,14 +172,21 @@ def store(
         dtype = "double" if values.dtype.kind == "f" else "uint32"
         content = values.astype("<f8" if dtype == "double" else "<u4").tobytes()
     else:
-        ratios = [x.as_integer_ratio() for x in values]
-        words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
-        dtype, size = f"rational{128 * words}", 8 * words
-        content = b"".join(
-            n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
-        )
+        bits, content = _rationals(values)
+        dtype = f"rational{bits}"
     file.contents[f"certificate/{name}.bin"] = content
     file.members[name] = {"dtype": dtype, "shape": [*shape]}
+
+
+def _rationals(values: list[Fraction]) -> tuple[int, bytes]:
+    """Numerators and denominators, and the bits of both."""
+    ratios = [x.as_integer_ratio() for x in values]
+    words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
+    size = 8 * words
+    pairs = (
+        n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios
+    )
+    return 128 * words, b"".join(pairs)
 
 
 def proven(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,6 +67,7 @@ class BeliefBounds:
     num_beliefs: int  # expanded
     rounds: int
     is_complete: bool  # False if a limit ended the exploration
+    exploration: Exploration | None = field(default=None, repr=False)  # the last one
 
     def joined(self, other: BeliefBounds, maximize: bool) -> BeliefBounds:
         """The bounds of another exploration, or of this one where they are narrower."""
@@ -350,6 +351,7 @@ def explore(
         int(graph.expanded.sum()),
         rounds,
         complete,
+        state,
     )
 
 
