@@ -14,33 +14,36 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 import jaxltl
-from jaxltl.app.command_options import Failure, compiling, over_devices, plain_errors
 from jaxltl.app import compilation, processes, run_job
+from jaxltl.app.command_options import (
+    PATH as _PATH,
+    CertifyOptions,
+    DeviceOptions,
+    Failure,
+    RunOptions,
+    SolveOptions,
+    compiling,
+    options as with_options,
+    plain_errors,
+)
 from jaxltl.app.compilation import float64
 from jaxltl.plot.drawing import artist
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jaxltl.core.automata.automaton import Automaton
-    from jaxltl.core.statistics.confidence_sets import Method
 
-_PATH = click.Path(path_type=Path)
 _task_file = click.argument("task_file", metavar="TASK.toml", type=_PATH)
 _out = click.option("--out", type=_PATH, help="Directory for the results.  [default: out/NAME]")
 _as_json = click.option(
     "--json", "as_json", is_flag=True, help="End with the result as one JSON line."
-)
-_certificate = click.option(
-    "--certificate",
-    type=_PATH,
-    metavar="FILE",
-    help="File for a certificate, which `jaxltl verify` checks; numbered if there are several.",
 )
 
 
@@ -70,32 +73,12 @@ def main() -> None:
 
 @main.command()
 @_task_file
-@_out
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1))
-@click.option(
-    "--seeds",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of seeds, which learn in parallel; the best is kept.",
-)
-@click.option(
-    "--again", is_flag=True, help="Repeat a finished run, or overwrite the result of another task."
-)
+@with_options(RunOptions, "options")
 @_as_json
-@over_devices
+@with_options(DeviceOptions, "devices")
 @compiling(fast=True)
 @plain_errors
-def learn(
-    task_file: Path,
-    *,
-    out: Path | None,
-    seed: int,
-    seeds: int,
-    again: bool,
-    as_json: bool,
-    devices: processes.DeviceOptions,
-) -> None:
+def learn(task_file: Path, options: RunOptions, as_json: bool, devices: DeviceOptions) -> None:
     """Learn a policy for a formula, and certify its satisfaction probability.
 
     Writes policy.npz, result.json, report.html and pictures; with method = "todirl", the learned
@@ -113,7 +96,7 @@ def learn(
     # First, so that matplotlib is imported in the background.
     with artist(apart=apart) as begin, processes.process_group(devices, launch, say) as group:
         console = run_job.Console(begin, say, group)
-        finished = run_job.learn(task_file, run_job.RunOptions(out, seed, seeds, again), console)
+        finished = run_job.learn(task_file, options, console)
     if finished is None:
         return
     done = finished.before
@@ -315,52 +298,11 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 @main.command()
 @click.argument("model_file", metavar="MODEL", type=_PATH)
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
-@click.option("--strategy", type=_PATH, metavar="FILE", help="File of optimal strategies, as JSON.")
-@click.option(
-    "--tolerance",
-    default=1e-6,
-    show_default=True,
-    type=click.FloatRange(0, 1, min_open=True),
-    help="Width of the bounds: absolute for probabilities, else relative.",
-)
-@click.option("--relative", is_flag=True, help="Width relative to the value in any case.")
-@click.option("--exact", is_flag=True, help="Values as fractions, of models of moderate size.")
-@click.option("--fair", is_flag=True, help="Probabilities over the fair strategies of an MDP.")
-@_as_json
-@click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
-@click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
-@click.option(
-    "--method",
-    type=click.Choice(["build", "partial"]),
-    default="build",
-    show_default=True,
-    help="Of a program: build the model, or explore some states until the bounds are narrow.",
-)
-@_certificate
-@click.option(
-    "--checkpoint",
-    type=_PATH,
-    metavar="DIRECTORY",
-    help="With --mesh: directory of checkpoints, from which long solves resume.",
-)
-@over_devices
+@with_options(SolveOptions, "options")
+@with_options(DeviceOptions, "devices")
 @plain_errors
 def solve(
-    model_file: Path,
-    properties: tuple[str, ...],
-    *,
-    strategy: Path | None,
-    tolerance: float,
-    relative: bool,
-    exact: bool,
-    fair: bool,
-    as_json: bool,
-    constants: str | None,
-    max_states: int | None,
-    method: str,
-    certificate: Path | None,
-    checkpoint: Path | None,
-    devices: processes.DeviceOptions,
+    model_file: Path, properties: tuple[str, ...], options: SolveOptions, devices: DeviceOptions
 ) -> None:
     """Solve properties of a model, or of a program in the PRISM language, with certified bounds.
 
@@ -377,25 +319,16 @@ def solve(
     """
     launch = processes.launched(devices)
     say = _begin(f"solving {model_file}", launch.process)
-    options = (
-        ("--strategy", strategy, False),
-        ("--relative", relative or None, False),
-        ("--certificate", certificate, False),
-        ("--exact", exact or None, False),
-        ("--fair", fair or None, False),
-        ("--checkpoint", checkpoint, True),
-    )
-    for option, value, with_mesh in options:
-        if value is not None and (devices.mesh is not None) != with_mesh:
-            raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
+    options.check(devices.mesh)
     if devices.mesh is not None:
         compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
-    program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (
-        not program or strategy or relative or certificate or exact or fair
-    ):
+    program, questions = solving.read_queries(model_file, options.const, properties, devices.mesh)
+    strategy, certificate = options.strategy, options.certificate
+    how = {name: getattr(options, name) for name in ("relative", "exact", "fair")}
+    partial = options.method == "partial"
+    if partial and (not program or strategy or certificate or any(how.values())):
         others = "--strategy, --relative, --exact, --fair and --certificate"
         raise ValueError(f"--method partial is for programs, without {others}.")
     from jaxltl.core.files import atomic_write
@@ -404,21 +337,21 @@ def solve(
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
     double = contextlib.nullcontext if devices.mesh is None else float64
     with written as file, processes.process_group(devices, launch, say) as group, double():
-        if program is not None and method == "partial":
+        if program is not None and partial:
             entry: Record = {"kind": program.kind}
-            answers = solving.solve(program, questions, tolerance, max_states)
+            answers = solving.solve(program, questions, options.tolerance, options.max_states)
         elif group.mesh is None:
             begin = time.perf_counter()
-            model = solving.load(model_file, program, max_states)
+            model = solving.load(model_file, program, options.max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            answers = solving.solve(
-                model, questions, tolerance, relative=relative, exact=exact, fair=fair
-            )
+            answers = solving.solve(model, questions, options.tolerance, **how)
         else:
             from jaxltl.app import solve_on_mesh
 
             sharded, fingerprint, entry = solve_on_mesh.read(model_file, questions, group)
-            solver = solve_on_mesh.MeshSolver(group, sharded, fingerprint, tolerance, checkpoint)
+            solver = solve_on_mesh.MeshSolver(
+                group, sharded, fingerprint, options.tolerance, options.checkpoint
+            )
             solver.agree(list(properties))
             answers = solver.solve(questions)
         if group.is_first and "states" in entry:
@@ -438,7 +371,7 @@ def solve(
             records = write_certificates(certificate.parent, answered, certificate.name)
             click.echo("\n".join(["", *certificate_lines(records, certificate.parent)]))
             proofs = {"certificates": records}
-    if as_json and group.is_first:
+    if options.as_json and group.is_first:
         entries = [solving.result_entry(r) for r in results]
         _print_json({"model": entry, "results": entries, **proofs})
     elif group.is_first and len(results) > 1:
@@ -450,49 +383,10 @@ def solve(
 @main.command()
 @click.argument("log", metavar="LOG|POLICY", type=_PATH)
 @click.argument("formula", required=False)
-@click.option("--confidence", type=float, help="In (0, 1), such as 0.95; required for a log.")
-@click.option("--initial", multiple=True, metavar="STATE", help="Initial state.")
-@click.option("--terminal", multiple=True, metavar="STATE", help="State where episodes end.")
-@click.option("--labels", type=_PATH, help="Table of states and labels.")
-@click.option("--model", type=_PATH, help="Model file with the transition graph.")
-@click.option(
-    "--graph",
-    type=click.Choice(["seen", "complete"]),
-    help="Assumption on possible transitions: those in the log, or all (the default).",
-)
-@click.option("--least-probability", type=float, metavar="P", help="Least chance of a transition.")
-@click.option(
-    "--method",
-    default="anytime",
-    show_default=True,
-    type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]),
-)
-@click.option("--min", "smallest", is_flag=True, help="Minimise the probability.")
-@click.option("--policy", type=_PATH, help="File for the policy, .npz.")
-@click.option(
-    "--curve",
-    type=_PATH,
-    help="Draw the bound over the number of samples (.svg, .png or .pdf).",
-)
-@_certificate
+@with_options(CertifyOptions, "options")
 @_as_json
 @plain_errors
-def certify(
-    log: Path,
-    formula: str | None,
-    *,
-    confidence: float | None,
-    initial: tuple[str, ...],
-    terminal: tuple[str, ...],
-    labels: Path | None,
-    model: Path | None,
-    graph: str | None,
-    least_probability: float | None,
-    method: Method,
-    smallest: bool,
-    as_json: bool,
-    **outputs: Path | None,
-) -> None:
+def certify(log: Path, formula: str | None, options: CertifyOptions, as_json: bool) -> None:
     """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
     LOG is a table with the columns state, action and next; see docs/data.md. POLICY is a policy.npz
@@ -502,23 +396,16 @@ def certify(
     """
     say = _begin(f"certifying {formula or 'the task'} from {log}")
     if log.suffix == ".npz":
-        others = (*outputs.values(), confidence, labels, model, graph, least_probability)
-        if initial or terminal or smallest or any(x is not None for x in others):
+        if replace(options, method="anytime") != CertifyOptions():
             raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
         _certify_policy(log, formula, as_json, say)
         return
-    if formula is None or confidence is None:
+    if formula is None or options.confidence is None:
         missing = "FORMULA" if formula is None else "--confidence, such as 0.95"
         raise ValueError(f"a LOG needs {missing}.")
-    from jaxltl.app import certify as app
+    from jaxltl.app.certify import certify_and_write
 
-    objective: Literal["max", "min"] = "min" if smallest else "max"
-    query = app.CertificateQuery(formula, confidence, method, objective)
-    assumption = app.graph_of_options(graph, least_probability, confidence)
-    source = app.LogSource(
-        labels=labels, model=model, initial=initial, terminal=terminal, graph=assumption
-    )
-    result = app.certify_and_write(log, query, source, app.Outputs(**outputs))
+    result = certify_and_write(log, formula, options)
     if as_json:
         _print_json(result)
     if result["status"] != "CONVERGED":

@@ -152,7 +152,7 @@ def test_learn_prints_evidence(learned):
 
 
 def test_a_minimum_is_left_out_where_all_are_equal(learned):
-    from jaxltl.app.reports.learn import report
+    from jaxltl.app.learn import report
 
     found = json.loads(learned[1].stdout.splitlines()[-1])
 

@@ -60,15 +60,9 @@ def test_names_are_nouns_of_the_field():
     assert not wrong
 
 
-# The learners' protocol has these names in each learner, and task files these tables of each kind.
-SHARED_CLASSES = {"Problem", "Hparams", "State", "Metrics"} | {
-    "DemonstrationsTable",
-    "LearnerTable",
-    "TaskTable",
-    "TestTable",
-    "WorldTable",
-    "Policy",  # the protocol of policies, and a solver's state
-}
+# The learners' protocol has the first four in each learner; the last is the protocol of policies, and
+# a solver's state.
+SHARED_CLASSES = {"Problem", "Hparams", "State", "Metrics", "Policy"}
 
 
 def test_a_class_name_has_one_meaning():

@@ -5,7 +5,6 @@ import inspect
 import itertools
 import tomllib
 from pathlib import Path
-from typing import Annotated as Key
 
 import pytest
 
@@ -13,10 +12,8 @@ from jaxltl.app.files import (
     game,
     schema,
     task,
-    task_environment,
-    task_grounding,
-    task_mlirl,
-    task_todirl,
+    task_irl,
+    task_rl,
     worlds,
 )
 from jaxltl.app.files.schema import Count, TomlTable, table
@@ -39,22 +36,22 @@ TABLES = list(
 )
 # Keys that a file has together with others: names that complete a table, of which one is enough.
 COMPLETIONS = {
-    task_mlirl.WorldTable: (
+    task_irl.ModelTable: (
         "map",
         "model",
         "transitions initial confidence graph",
         "transitions initial confidence least_probability",
     ),
-    task_mlirl.DemonstrationsTable: ("file", "synthetic"),
-    task_mlirl.LearnerTable: ("", "optimizer", "in goal"),
-    task_todirl.WorldTable: ("", "legend"),
-    task_todirl.DemonstrationsTable: ("files", "synthetic", "synthetic discount"),
-    task_todirl.TestTable: ("maps", "generate"),
-    task_grounding.DemonstrationsTable: ("files", "synthetic meaning"),
-    task_environment.WorldTable: ("", "environment", "environment labels propositions"),
-    task_environment.CceTable: ("", "cost limit"),
+    task_irl.FileOrSyntheticTable: ("file", "synthetic"),
+    task_irl.MlirlTable: ("", "optimizer", "in goal"),
+    task_irl.ScenesTable: ("", "legend"),
+    task_irl.ExpertTable: ("files", "synthetic", "synthetic discount"),
+    task_irl.TestScenesTable: ("maps", "generate"),
+    task_irl.DemonstratorTable: ("files", "synthetic meaning"),
+    task_rl.SimulatorTable: ("", "environment", "environment labels propositions"),
+    task_rl.CceTable: ("", "cost limit"),
     game.GameTable: ("map", "model"),
-    game.TaskTable: ("", "formula", "guarantees"),
+    game.ObjectiveTable: ("", "formula", "guarantees"),
 }
 
 
@@ -127,15 +124,15 @@ def test_defaults_in_words_are_those_of_the_code():
         (game.GameTable, "slip", grid_game),
         (game.GameTable, "system_stays", grid_game),
         (game.GameTable, "environment_stays", grid_game),
-        (task_todirl.WorldTable, "margin", World),
-        (task_todirl.TestTable, "min_distance", random_worlds),
-        *((task_todirl.DemonstrationsTable, x, expert_reward) for x in task_todirl.REWARDS),
+        (task_irl.ScenesTable, "margin", World),
+        (task_irl.TestScenesTable, "min_distance", random_worlds),
+        *((task_irl.ExpertTable, x, expert_reward) for x in task_irl.REWARDS),
     ):
         value = default(function, name)
         assert stated(kind, name) in (f"{value:g}" if type(value) is float else str(value).lower())
     length = inspect.getsource(worlds.synthetic_demonstrations)
     assert f"table.length or {stated(task.SyntheticTable, 'length')}\n" in length
-    ending = stated(task_environment.TaskTable, "ending")
+    ending = stated(task_rl.RewardTable, "ending")
     assert ending.partition(",")[0] == default(make_task_tables, "ending")
 
 
@@ -157,7 +154,7 @@ def test_pages_have_every_key_and_an_example_file():
 def test_a_key_without_a_stated_default_is_an_error(text):
     @table
     class Training(TomlTable):
-        steps: Key[Count | None, text] = None
+        steps: Count | None = schema.key(text)
 
     (key,) = site_files.keys_of(Training)
     with pytest.raises(ValueError, match="steps lacks a text, a default or an example"):
@@ -167,8 +164,8 @@ def test_a_key_without_a_stated_default_is_an_error(text):
 def test_the_example_of_a_type():
     @table
     class Training(TomlTable):
-        rate: Key[schema.Confidence, "Rate."]
-        own: Key[Count, "Own.", "7"] = 3
-        nothing: Key[str | None, "Nothing."] = None
+        rate: schema.Confidence = schema.key("Rate.")
+        own: Count = schema.key("Own.", "7", default=3)
+        nothing: str | None = schema.key("Nothing.")
 
     assert [key.example for key in site_files.keys_of(Training)] == ["0.95", "7", ""]

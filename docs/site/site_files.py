@@ -10,11 +10,8 @@ from jaxltl.algos import cce, finite_state_controllers, mlirl, ppo, todirl, trus
 from jaxltl.app.files import (
     game,
     schema,
-    task_controller,
-    task_environment,
-    task_grounding,
-    task_mlirl,
-    task_todirl,
+    task_irl,
+    task_rl,
 )
 from jaxltl.app.files.schema import File, TomlTable
 
@@ -31,7 +28,7 @@ class FilePage(NamedTuple):
 PAGES = {
     "task-file-mlirl": FilePage(
         "Task files: mlirl",
-        task_mlirl.MlirlFile,
+        task_irl.MlirlFile,
         "``jaxltl learn`` reads a world, a formula and demonstrations, and learns a policy by "
         ":doc:`maximum-likelihood inverse reinforcement learning </docs/guides/mlirl>`. The world "
         "is a map, a :doc:`model file </docs/models>` or a :doc:`log </docs/data>`.",
@@ -39,14 +36,14 @@ PAGES = {
     ),
     "task-file-todirl": FilePage(
         "Task files: todirl",
-        task_todirl.TodirlFile,
+        task_irl.TodirlFile,
         "``jaxltl learn`` reads training worlds, a formula and demonstrations, learns a "
         ":doc:`reward that transfers </docs/guides/todirl>`, and evaluates it in test worlds.",
         "in_order.toml",
     ),
     "task-file-grounding": FilePage(
         "Task files: symbols of unknown meaning",
-        task_grounding.GroundingFile,
+        task_irl.GroundingFile,
         "``jaxltl learn`` reads maps, a formula over symbols without a meaning, observations and "
         "demonstrations, learns :doc:`what the symbols mean </docs/guides/grounding>`, and certifies "
         "a policy in each map.",
@@ -54,14 +51,14 @@ PAGES = {
     ),
     "task-file-controller": FilePage(
         "Task files: partial observability",
-        task_controller.ControllerFile,
+        task_rl.ControllerFile,
         "``jaxltl learn`` reads a map, what a robot sees of it, and a formula, learns a finite-state "
         "controller, and bounds :doc:`what any controller attains </docs/partial-observability>`.",
         "two_rooms.toml",
     ),
     "task-file-environment": FilePage(
         "Task files: environments",
-        task_environment.EnvironmentFile,
+        task_rl.EnvironmentFile,
         "``jaxltl learn`` reads an environment, a formula and a method, and evaluates the learned "
         "policy in fresh episodes; see :doc:`task files for environments "
         "</docs/learn-in-environments>`. Hyperparameters are in the table of the method's name.",
@@ -77,12 +74,12 @@ PAGES = {
 }
 # Learners whose defaults hold for keys that a file leaves out.
 HPARAMS: dict[type[TomlTable], Any] = {
-    task_mlirl.LearnerTable: mlirl.Hparams,
-    task_todirl.LearnerTable: todirl.Hparams,
-    task_controller.ControllerTable: finite_state_controllers.Hparams,
-    task_environment.PpoTable: ppo.Hparams,
-    task_environment.CceTable: cce.Hparams,
-    task_environment.CpoTable: trust_region.Hparams,
+    task_irl.MlirlTable: mlirl.Hparams,
+    task_irl.TodirlTable: todirl.Hparams,
+    task_rl.ControllerTable: finite_state_controllers.Hparams,
+    task_rl.PpoTable: ppo.Hparams,
+    task_rl.CceTable: cce.Hparams,
+    task_rl.CpoTable: trust_region.Hparams,
 }
 
 
@@ -112,11 +109,11 @@ def keys_of(kind: type[TomlTable]) -> list[KeyHelp]:
     for field in schema._fields(kind):
         value, default = field.type, field.default
         if default is attrs.NOTHING:
-            default = ...
+            default = ... if schema.is_required(field) else None
         elif hasattr(default, "factory"):
             default = default.factory()
-        texts = [x for x in getattr(value, "__metadata__", ()) if isinstance(x, str)] or [""]
-        about, example = [*texts, _example(value, default)][:2]
+        about, example = field.metadata["texts"]
+        example = example or _example(value, default)
         entries.append(
             KeyHelp(schema.key_name(field), schema.requirement(value), default, about, example)
         )
@@ -142,7 +139,7 @@ def tables(file: type[File]) -> dict[str, tuple[type[TomlTable], bool]]:
     found = {}
     for field in schema._fields(file):
         if kind := schema._table_of(field.type):
-            found[schema.key_name(field)] = (kind, "NOTHING" in repr(field.default))
+            found[schema.key_name(field)] = (kind, schema.is_required(field))
     return found
 
 
@@ -190,7 +187,7 @@ def entry(table: type[TomlTable], key: KeyHelp) -> Entry:
     if not (meaning and default and key.example):
         raise ValueError(
             f"{table.__module__}: {key.name} lacks a text, a default or an example; give "
-            'Key[type, "Meaning; default ...", "example in TOML"].'
+            'key("Meaning; default ...", "example in TOML").'
         )
     return Entry(key.name, key.requirement, default, key.example, f"{meaning}.")
 

@@ -14,7 +14,8 @@ import click
 import numpy as np
 
 from jaxltl.io.padded_models import padded
-from jaxltl.app.files.task_mlirl import WorldTable
+from jaxltl.app.command_options import CertifyOptions
+from jaxltl.app.files.task_irl import ModelTable
 from jaxltl.app.wording import Record
 from jaxltl.core import validation
 from jaxltl.core.models import (
@@ -248,7 +249,7 @@ class Logged:
         return int(self.evidence.counts.sum())
 
 
-def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], Logged]:
+def load_logged(folder: Path, table: ModelTable) -> tuple[MDP, tuple[str, ...], Logged]:
     """The world of a log, with frequencies as probabilities, the names of its actions, and the log."""
     initial, confidence = table.initial or [], table.confidence
     assert table.transitions is not None and confidence is not None
@@ -299,18 +300,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
 # --- the command -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """Files that the command writes, or None."""
-
-    policy: Path | None
-    curve: Path | None
-    certificate: Path | None
-
-
-def certify_and_write(
-    log: Path, query: CertificateQuery, source: LogSource, outputs: Outputs
-) -> Record:
+def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Record:
     """Runs the command, output files opened first, and returns the result."""
     from jaxltl.io.certificate.results import (
         Certifiable,
@@ -322,14 +312,20 @@ def certify_and_write(
     from jaxltl.core.models.construct.lifting import project_policy
     from jaxltl.core.policies.policy_file import save_policy
 
+    assert options.confidence is not None
+    objective: Literal["max", "min"] = "min" if options.smallest else "max"
+    query = CertificateQuery(formula, options.confidence, options.method, objective)
+    graph = graph_of_options(options.graph, options.least_probability, query.confidence)
+    names = ("labels", "model", "initial", "terminal")
+    source = LogSource(**{name: getattr(options, name) for name in names}, graph=graph)
     check_confidence(query.confidence)
-    picture, proof = outputs.curve, outputs.certificate
+    picture, proof = options.curve, options.certificate
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
     with contextlib.ExitStack() as held:
         file, drawing = (
             None if path is None else held.enter_context(atomic_write(path))
-            for path in (outputs.policy, picture)
+            for path in (options.policy, picture)
         )
         evidence = read_evidence(log, source)
         begin = time.perf_counter()

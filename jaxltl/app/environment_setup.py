@@ -17,7 +17,7 @@ from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.algos.common.seeds import Algorithm, make_hparams
-from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentFile
+from jaxltl.app.files.task_rl import CceTable, CpoTable, EnvironmentFile
 from jaxltl.app.wording import Record
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments import Agent, Box, Finite, Timestep, Verdict

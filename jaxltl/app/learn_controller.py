@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,22 +13,20 @@ from jaxltl.algos import finite_state_controllers as fsc
 from jaxltl.algos.common.chunks import ChunkOptions
 from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.app.files.schema import read_map
-from jaxltl.app.files.task_controller import ControllerFile
+from jaxltl.app.files.task_rl import ControllerFile
 from jaxltl.app.files.worlds import grid_options
-from jaxltl.app.wording import about, plain
-from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds
+from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
 from jaxltl.io.certificate.results import Certifiable, formula_question
-from jaxltl.plot.drawing import Picture, drawing
-from jaxltl.plot.explorer import (
-    LONGEST_RUN,
-    Curves,
-    Explorer,
-    MapLayer,
-    ReportTrajectory,
-    curves,
+from jaxltl.plot.drawing import Picture, automaton_picture, drawing
+from jaxltl.plot.explorer import LONGEST_RUN, Explorer, MapLayer, ReportTrajectory
+from jaxltl.app.reports.page import (
+    Report,
+    Section,
+    aligned,
+    certified,
+    learning_curves,
+    probability,
 )
-from jaxltl.app.reports.page import Report, aligned, certified, probability
-from jaxltl.app.wording import Record, Result, counted, enclosure
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import POMDP, belief_filter, rollout
@@ -137,11 +134,6 @@ def learn(setup: ControllerSetup, training: Training) -> ControllerOutcome:
     )
 
 
-def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Greatest value over starts, for the progress bar."""
-    return {"value": f"{metrics['value'].max():.4f}"}
-
-
 def _entry(value: AtInitial | Solution) -> Record:
     return enclosure(*(float(np.asarray(x)) for x in (value.value, value.lower, value.upper)))
 
@@ -216,34 +208,22 @@ def task_pictures(setup: ControllerSetup) -> list[Picture]:
     return pictures
 
 
-def pictures(outcome: ControllerOutcome) -> list[Picture]:
-    """The controller as a machine, and learning curves."""
-    history = outcome.learned.history
-    caption = (
+def sections(outcome: ControllerOutcome) -> list[Section]:
+    """The controller as a machine and on the map, trajectories with beliefs, and learning curves."""
+    setup, history = outcome.setup, outcome.learned.history
+    world, rows = setup.task.world, [(s, t, o, x.tolist()) for s, t, o, x in outcome.transitions]
+    drawn = drawing("controller", rows, actions=ACTIONS)
+    machine = (
         "States are memory. An arrow has a line for each action, with the numbers of the observations "
         "after which it is taken."
     )
-    drawn = drawing("controller", _rows(outcome), actions=ACTIONS)
-    return [
-        Picture("controller.svg", "Controller", drawn, caption, LIVE),
-        learning_picture(history, _CURVES + over_seeds(history["value"].shape[1]), _FIGURES),
-    ]
-
-
-def _rows(outcome: ControllerOutcome) -> list[tuple[int, int, int, list[float]]]:
-    return [(s, t, o, action.tolist()) for s, t, o, action in outcome.transitions]
-
-
-def live(outcome: ControllerOutcome) -> list[Explorer | Curves]:
-    """The controller on the map, simulated trajectories with beliefs, and learning curves."""
-    setup, history = outcome.setup, outcome.learned.history
-    world = setup.task.world
     caption = (
         "Lengths of arrows are the probabilities of actions, colours are satisfaction probabilities. "
         "Cells that are unreachable with a memory state are blank. In a trajectory, the frame is what "
         "the robot sees, and the shading what it believes about its place."
     )
     return [
+        Picture("controller.svg", "Controller", drawn, machine, LIVE),
         Explorer(
             name=LIVE,
             title="Controller",
@@ -256,16 +236,10 @@ def live(outcome: ControllerOutcome) -> list[Explorer | Curves]:
             actions=ACTIONS,
             label="satisfaction probability",
             wall=world.wall or "#",
-            machine=_rows(outcome),
+            machine=rows,
             window=world.observations if isinstance(world.observations, int) else 1,
         ),
-        curves(
-            "learning",
-            "Learning",
-            _CURVES + over_seeds(history["value"].shape[1]),
-            history,
-            _FIGURES,
-        ),
+        *learning_curves(history, _FIGURES, _CURVES, history["value"].shape[1]),
     ]
 
 

@@ -19,13 +19,12 @@ from jaxltl.algos.common.guarantees import check_formula
 from jaxltl.algos.common.seeds import Training, run_seeds
 from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
-from jaxltl.plot.drawing import Picture
+from jaxltl.plot.drawing import Picture, automaton_picture
 from jaxltl.app.environment_setup import LearnerSetup, load_environment, load_world, make_method
 from jaxltl.app.reports.learn_environment import Proof, proof_entry, proof_picture, report as report
-from jaxltl.plot.explorer import Curves, curves
-from jaxltl.app.files.task_environment import EnvironmentFile
-from jaxltl.app.wording import about, plain
-from jaxltl.plot.drawing import automaton_picture, learning_picture, over_seeds
+from jaxltl.app.reports.page import Section, learning_curves
+from jaxltl.app.files.task_rl import EnvironmentFile
+from jaxltl.app.wording import Record, about, counted, plain
 from jaxltl.core.types import Status
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.continuous import Dynamics, certify_policy, counterexample, state_policy
@@ -46,7 +45,6 @@ from jaxltl.core.values.evaluation.evaluation import (
     checked_steps,
     evaluate,
 )
-from jaxltl.app.wording import Record, counted
 from jaxltl.core.policies.policy_file import read_policy_file
 from jaxltl.io.network_policy import save_network
 from jaxltl.core.models.protocols import PyTree
@@ -176,13 +174,6 @@ def describe(setup: EnvironmentSetup) -> str:
         f"total per seed; evaluated by {task.evaluation.episodes:,} fresh episodes of at most "
         f"{counted(setup.num_steps, 'step')}"
     )
-
-
-def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Medians of two metrics over seeds, for the progress bar."""
-    names = ("episode_return", "objective", "reward", "cost")
-    known = [n for n in names if n in metrics and np.isfinite(metrics[n]).any()]
-    return {n: f"{np.nanmedian(metrics[n]):.3g}" for n in known[:2]}
 
 
 def learn(setup: EnvironmentSetup, training: Training) -> EnvironmentOutcome:
@@ -355,25 +346,15 @@ def task_pictures(setup: EnvironmentSetup) -> list[Picture]:
     return [automaton_picture(setup.automaton, "")]
 
 
-def pictures(outcome: EnvironmentOutcome) -> list[Picture]:
-    """Pictures of learning curves and episodes."""
-    drawings = [learning_picture(outcome.history, _caption(outcome), _drawn(outcome))]
-    drawn = _pictured(outcome)
-    drawings = drawings if drawn is None else [drawn, *drawings]
-    dynamics, proof = outcome.setup.dynamics, outcome.proof
-    if dynamics is None or not isinstance(proof, Proof):
-        return drawings
-    return [proof_picture(proof, dynamics, outcome.episodes), *drawings]
-
-
-def live(outcome: EnvironmentOutcome) -> list[Curves]:
-    """Interactive learning curves."""
-    names = _drawn(outcome)
-    return [curves("learning", "Learning", _caption(outcome), outcome.history, names)]
-
-
-def _caption(outcome: EnvironmentOutcome) -> str:
-    return "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
+def sections(outcome: EnvironmentOutcome) -> list[Section]:
+    """The proof, episodes and learning curves."""
+    dynamics, proof, drawn = outcome.setup.dynamics, outcome.proof, _pictured(outcome)
+    parts: list[Section] = []
+    if dynamics is not None and isinstance(proof, Proof):
+        parts.append(proof_picture(proof, dynamics, outcome.episodes))
+    parts += [] if drawn is None else [drawn]
+    caption, count = "Metrics of each step of the learner", len(outcome.evaluations)
+    return parts + learning_curves(outcome.history, _drawn(outcome), caption, count)
 
 
 def _pictured(outcome: EnvironmentOutcome) -> Picture | None:

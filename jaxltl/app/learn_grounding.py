@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,16 +14,20 @@ from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.grounding.problem import require_task
 from jaxltl.io.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_bytes, read_map
-from jaxltl.app.files.task_grounding import GroundingFile
-from jaxltl.app.files.task_todirl import map_file
+from jaxltl.app.files.task_irl import GroundingFile, map_file
 from jaxltl.app.files.worlds import grid_options, MappedModel
-from jaxltl.app.wording import about, plain
-from jaxltl.plot.drawing import automaton_picture
 from jaxltl.io.certificate.results import Certifiable, policy_certificate
-from jaxltl.plot.drawing import drawing, Picture
-from jaxltl.plot.explorer import Explorer
-from jaxltl.app.reports.page import aligned, certified, number, probability, Report, rounded_down
-from jaxltl.app.wording import Record, Result, counted, enclosure
+from jaxltl.plot.drawing import Picture, automaton_picture, drawing
+from jaxltl.app.reports.page import (
+    Report,
+    Section,
+    aligned,
+    certified,
+    number,
+    probability,
+    rounded_down,
+)
+from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
 from jaxltl.core.models import (
     project_policy,
     project_trajectories,
@@ -231,11 +234,6 @@ def _answer(
     )
 
 
-def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """No metrics: there are no steps of learning."""
-    return {}
-
-
 def _mean(answer: GroundingAnswer, solution: Solution) -> Record:
     """A probability from the initial distribution, with its bounds."""
     parts = (solution.value, solution.lower, solution.upper)
@@ -324,11 +322,11 @@ def task_pictures(setup: GroundingSetup) -> list[Picture]:
     return [automaton_picture(automaton, "")]
 
 
-def pictures(outcome: GroundingOutcome) -> list[Picture]:
+def sections(outcome: GroundingOutcome) -> list[Section]:
     """The grounding on each map: for each symbol the posterior probability of its label."""
     setup, posterior = outcome.setup, outcome.posterior
     heavy = np.flatnonzero(posterior.weight > 1e-9).tolist()
-    drawn = []
+    drawn: list[Section] = []
     for w, world in enumerate(setup.worlds):
         weight = sum(posterior.weight[i] * labels_of(setup, posterior, i, w) for i in heavy)
         titles = [f"{row.symbol}: {row.meaning}" for row in outcome.table]
@@ -342,11 +340,6 @@ def pictures(outcome: GroundingOutcome) -> list[Picture]:
             )
         )
     return drawn
-
-
-def live(outcome: GroundingOutcome) -> list[Explorer]:
-    """There are no interactive parts."""
-    return []
 
 
 # --- the report ---------------------------------------------------------------------------

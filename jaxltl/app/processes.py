@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jaxltl.app.command_options import DeviceOptions
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
 LOST = 3  # exit status if another process has ended
-WAIT = 60.0  # seconds
 _TO_THE_END = 7 * 24 * 3600  # seconds that others wait while the first writes its results
 # By launcher: variables of the number of processes and of this process, and those from which JAX
 # derives the coordinator's address.
@@ -39,18 +39,6 @@ _LAUNCHERS = {
         ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_LOCALID"),
     ),
 }
-
-
-@dataclass(frozen=True)
-class DeviceOptions:
-    """Options of devices and processes."""
-
-    mesh: int | None = None  # number of devices; 0 for all of them; None for no mesh
-    coordinator: str | None = None  # HOST:PORT of process 0, or None
-    # process, processes: number of this process, and of processes, or None
-    process: int | None = None
-    processes: int | None = None
-    wait: float = WAIT  # seconds after which a silent process is reported, at the start and later
 
 
 @dataclass(frozen=True)

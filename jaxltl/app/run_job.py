@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
+from jaxltl.app.command_options import RunOptions
 from jaxltl.app.compilation import float64
-from jaxltl.app.wording import Record, Result
+from jaxltl.app.wording import Record, Result, postfix
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,16 +31,15 @@ if TYPE_CHECKING:
     from jaxltl.app.files.task import FormulaFile
     from jaxltl.app.processes import ProcessGroup
     from jaxltl.plot.drawing import Artist, Drawing, Picture
-    from jaxltl.plot.explorer import Curves, Explorer
-    from jaxltl.app.reports.page import Part, Report
+    from jaxltl.app.reports.page import Part, Report, Section
 
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
 _JOBS = {  # the module of each kind of job, and that of its task file
-    "environment": ("learn_environment", "task_environment", "EnvironmentFile"),
-    "grounding": ("learn_grounding", "task_grounding", "GroundingFile"),
-    "controller": ("learn_controller", "task_controller", "ControllerFile"),
-    "todirl": ("learn_todirl", "task_todirl", "TodirlFile"),
-    "mlirl": ("learn", "task_mlirl", "MlirlFile"),
+    "environment": ("learn_environment", "task_rl", "EnvironmentFile"),
+    "grounding": ("learn_grounding", "task_irl", "GroundingFile"),
+    "controller": ("learn_controller", "task_rl", "ControllerFile"),
+    "todirl": ("learn_todirl", "task_irl", "TodirlFile"),
+    "mlirl": ("learn", "task_irl", "MlirlFile"),
 }
 
 Drawn = Callable[[], bytes]  # waits for a picture
@@ -60,25 +60,13 @@ class Job(Protocol[T, S, O]):
     def prepare(self, task: T, seed: int) -> S: ...  # the objects that a task file describes
     def describe(self, setup: S) -> str: ...  # sizes of a setup, in one line
     def learn(self, setup: S, training: Training) -> O: ...  # with several seeds, keeping one
-    def postfix(self, metrics: Mapping[str, np.ndarray]) -> dict[str, str]: ...  # newest metrics
     def summary(self, outcome: O) -> Record: ...  # the contents of ``result.json``
     def save(self, out: Path, outcome: O) -> None: ...  # writes the policy into a directory
     def task_pictures(self, setup: S) -> list[Picture]: ...  # those that need no outcome
-    def pictures(self, outcome: O) -> list[Picture]: ...
-    def live(self, outcome: O) -> Sequence[Explorer | Curves]: ...  # of the report
+    def sections(self, outcome: O) -> list[Section]: ...  # of the report
 
 
 SomeJob: TypeAlias = Job[Any, Any, Any]  # of a kind that a task file decides
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a run of a job."""
-
-    out: Path | None  # directory of results; None for one named after the task
-    seed: int  # seed, num_seeds: the first seed, and the number of seeds
-    num_seeds: int
-    again: bool = False  # whether a result, also of another task, is overwritten
 
 
 @dataclass(frozen=True)
@@ -279,7 +267,7 @@ class _JobRun(Generic[T, S, O]):
             def report(step: int, metrics: Mapping[str, np.ndarray]) -> None:
                 bar.set_description_str("learning", refresh=False)
                 bar.update(step - bar.n)
-                bar.set_postfix(job.postfix(metrics))
+                bar.set_postfix(postfix(metrics))
 
             training = Training(
                 options.seed,
@@ -295,7 +283,6 @@ class _JobRun(Generic[T, S, O]):
             files.remove(self.checkpoint)
             seconds = time.perf_counter() - start
             bar.set_description_str("drawing")
-            pictures += [(p, self._begun(p)) for p in job.pictures(outcome)]
             return self._write(outcome, seconds, pictures)
 
     def _claim(self, task: T, held: ExitStack) -> None:
@@ -314,9 +301,14 @@ class _JobRun(Generic[T, S, O]):
     def _write(self, outcome: O, seconds: float, pictures: list[tuple[Picture, Drawn]]) -> Result:
         from jaxltl.app.wording import took
         from jaxltl.io.certificate.results import write_certificates
+        from jaxltl.plot.drawing import Picture
 
-        job, begin = self.job, self.console.artist
-        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
+        job, begin, live = self.job, self.console.artist, []
+        for x in job.sections(outcome):
+            if isinstance(x, Picture):
+                pictures.append((x, self._begun(x)))
+            else:
+                live.append((x, {k: begin(d) for k, d in x.drawings.items()}))
         result = {**job.summary(outcome), **took(seconds), "fingerprint": self.mark}
         job.save(self.out, outcome)
         # Of jobs whose result is a policy of a finite model.

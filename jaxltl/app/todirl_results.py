@@ -10,7 +10,7 @@ import numpy as np
 from jaxltl.algos.todirl import TransferredReward, WorldDemands, Worlds
 from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app.files.scenes import ObservedScene
-from jaxltl.app.files.task_todirl import TodirlFile
+from jaxltl.app.files.task_irl import TodirlFile
 from jaxltl.app.wording import about, plain
 from jaxltl.app.reports.steps import front_entry
 from jaxltl.app.wording import Record, enclosure

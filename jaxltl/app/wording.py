@@ -72,9 +72,24 @@ def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
+# Reduction over seeds, and format, of metrics of a step.
+_PROGRESS = {
+    "episode_return": ("nanmedian", ".3g"),
+    "objective": ("nanmedian", ".3g"),
+    "reward": ("nanmedian", ".3g"),
+    "cost": ("nanmedian", ".3g"),
+    "loss": ("min", ".4f"),
+    "value": ("max", ".4f"),
+    "gradient_norm": ("max", ".1e"),
+}
+
+
 def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Least loss and greatest gradient norm over seeds, for the progress bar."""
+    """Two metrics of the newest step, for the progress bar."""
+    import numpy as np
+
+    known = [n for n in _PROGRESS if n in metrics and np.isfinite(metrics[n]).any()]
+    figures = ((n, *_PROGRESS[n]) for n in known[:2])
     return {
-        "loss": f"{metrics['loss'].min():.4f}",
-        "gradient": f"{metrics['gradient_norm'].max():.1e}",
+        n.removesuffix("_norm"): f"{getattr(np, f)(metrics[n]):{form}}" for n, f, form in figures
     }

@@ -75,12 +75,6 @@ def learning_picture(history: Mapping[str, Any], caption: str, show: Sequence[st
     return Picture("learning.svg", "Learning", drawn, caption, "learning")
 
 
-def over_seeds(count: int) -> str:
-    """The end of a caption of learning curves."""
-    band = "; the line is the median over seeds, the band their range"
-    return f"{band if count > 1 else ''}."
-
-
 def short_name(text: str, width: int = 44) -> str:
     """A name truncated to `width` characters."""
     return text if len(text) <= width else text[: width - 1] + "…"

@@ -13,7 +13,7 @@ from jaxltl.algos import mlirl
 from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.algos.mlirl import guaranteed
 from jaxltl.app import learn as job
-from jaxltl.app.reports.learn import report
+from jaxltl.app.learn import report
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401

@@ -10,8 +10,8 @@ from jaxltl.algos import mlirl
 from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.mlirl import features, guaranteed
 from jaxltl.app import learn
-from jaxltl.app.files.task_mlirl import MlirlFile
-from jaxltl.app.reports.learn import report
+from jaxltl.app.files.task_irl import MlirlFile
+from jaxltl.app.learn import report
 from tests.app.test_task import write  # noqa: F401
 
 

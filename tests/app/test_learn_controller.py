@@ -8,7 +8,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn_controller as job
-from jaxltl.app.files.task_controller import ControllerFile
+from jaxltl.app.files.task_rl import ControllerFile
 from jaxltl.app.run_job import job_of
 from jaxltl.plot.explorer import Explorer
 
@@ -83,7 +83,7 @@ def test_the_certificate_is_of_the_controller(outcome, tmp_path):
 
 
 def test_trajectories_have_beliefs_that_contain_the_robot(outcome):
-    explorer = next(x for x in job.live(outcome) if isinstance(x, Explorer))
+    explorer = next(x for x in job.sections(outcome) if isinstance(x, Explorer))
     observation = np.asarray(outcome.setup.pomdp.observation)
     edges = {(s, o): t for s, t, o, _ in explorer.machine}
     for run in explorer.runs:
@@ -103,7 +103,7 @@ def test_trajectories_have_beliefs_that_contain_the_robot(outcome):
 
 
 def test_the_report_shows_the_machine_beliefs_and_bounds(outcome):
-    from jaxltl.plot.drawing import draw
+    from jaxltl.plot.drawing import Picture, draw
 
     result = {
         **job.summary(outcome),
@@ -111,12 +111,16 @@ def test_the_report_shows_the_machine_beliefs_and_bounds(outcome):
         "versions": {"jaxltl": "0", "jax": "0"},
         "certificates": [],
     }
-    parts = [(x, {k: draw(d).decode() for k, d in x.drawings.items()}) for x in job.live(outcome)]
+    parts = [
+        (x, {k: draw(d).decode() for k, d in x.drawings.items()})
+        for x in job.sections(outcome)
+        if not isinstance(x, Picture)
+    ]
     page = job.report.page(result, parts, [], TEXT)
     for text in ("Controller (memory of the policy)", 'class="belief"', '"beliefs"', "observation"):
         assert text in page
     assert "optimum with full observation" in job.report.table(result)
-    drawn = {p.name for p in job.task_pictures(outcome.setup) + job.pictures(outcome)}
+    drawn = {p.name for p in job.task_pictures(outcome.setup) + job.sections(outcome)}
     assert {"controller.svg", "observations.svg", "learning.svg"} <= drawn
 
 

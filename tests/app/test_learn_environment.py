@@ -14,7 +14,7 @@ from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_setup import load_environment
 from jaxltl.app.files.task import kind_of
-from jaxltl.app.files.task_environment import EnvironmentFile
+from jaxltl.app.files.task_rl import EnvironmentFile
 from jaxltl.cli import main
 from jaxltl.core.environments.task_environment import task_tables
 from jaxltl.core.values.evaluation.evaluation import evaluate

@@ -9,7 +9,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.algos.common.seeds import Training
 from jaxltl.app import learn_grounding as job
-from jaxltl.app.files.task_grounding import GroundingFile
+from jaxltl.app.files.task_irl import GroundingFile
 from jaxltl.app.run_job import job_of
 from jaxltl.app.wording import took
 
@@ -82,7 +82,7 @@ def test_a_task_file_has_a_table_policies_and_a_report(write, tmp_path):
     assert "goal    b" in text and "symbol  meaning  weight" in text
     page = job.report.page(result | took(1.0), [], [], "text")
     assert "decisive step" in page and "Satisfaction probability" in page
-    assert len(job.pictures(outcome)) == 4 and len(job.task_pictures(outcome.setup)) == 1
+    assert len(job.sections(outcome)) == 4 and len(job.task_pictures(outcome.setup)) == 1
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import jaxltl as jl
 from jaxltl.app import learn_todirl
 from jaxltl.app.files.scenes import cell_observations, load_automata, load_scenes
 from jaxltl.app.files.task import kind_of
-from jaxltl.app.files.task_todirl import TodirlFile
-from jaxltl.app.reports.learn_todirl import report as report_todirl
+from jaxltl.app.files.task_irl import TodirlFile
+from jaxltl.app.learn_todirl import report as report_todirl
 from jaxltl.envs import temporal_gridworld
 from jaxltl.io.colored_world import write_world
 from jaxltl.io.learned_reward import load_reward, plan_in

@@ -8,9 +8,9 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.app.certify import guaranteed
-from jaxltl.app.files.task_mlirl import MlirlFile
+from jaxltl.app.files.task_irl import MlirlFile
 from jaxltl.app.files.worlds import load_demonstrations, load_world
-from jaxltl.app.reports.learn import report
+from jaxltl.app.learn import report
 from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.models.product import product
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee

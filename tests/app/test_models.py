@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxltl.app.files.game import GameFile, load_game
-from jaxltl.app.files.task_mlirl import MlirlFile
+from jaxltl.app.files.task_irl import MlirlFile
 from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.product import product

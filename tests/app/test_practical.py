@@ -12,8 +12,8 @@ from jaxltl.algos.common.guarantees import neg_log_likelihood, step_bound
 from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.mlirl import guaranteed
 from jaxltl.app import learn as job
+from jaxltl.app.learn import report as learn_report
 from jaxltl.app.reports import steps as report
-from jaxltl.app.reports.learn import report as learn_report
 from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.app import learn_environment as job
-from jaxltl.app.files.task_environment import EnvironmentFile
+from jaxltl.app.files.task_rl import EnvironmentFile
 from jaxltl.app.reports import learn_environment as report
 from jaxltl.cli import main
 from jaxltl.core.environments import make_agent

@@ -13,7 +13,7 @@ import pytest
 import jaxltl
 from jaxltl.app import run_job
 from jaxltl.app.files.schema import File
-from jaxltl.app.files.task_mlirl import MlirlFile
+from jaxltl.app.files.task_irl import MlirlFile
 from jaxltl.app.files.worlds import load_demonstrations, load_world, synthetic_demonstrations
 from jaxltl.app.processes import ProcessGroup
 from jaxltl.core.models.product import product
@@ -451,5 +451,5 @@ def test_at_most_eight_files_pass_the_formula_on(write, tmp_path, monkeypatch):
         lambda x: isinstance(x, File) or (isinstance(x, str) and x == formula),
         Translated,
     )
-    read = {"schema", "task", "task_mlirl"}
+    read = {"schema", "task", "task_irl"}
     assert package | {"translate"} == read | {"run_job", "learn", "product", "ltl", "translate"}

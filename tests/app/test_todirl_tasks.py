@@ -12,9 +12,9 @@ from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.todirl.transfer import world_performances
 from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app import learn_todirl as job
-from jaxltl.app.files.task_todirl import TodirlFile
+from jaxltl.app.files.task_irl import TodirlFile
+from jaxltl.app.learn_todirl import report
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.learn_todirl import report
 from jaxltl.app.reports.page import render_text
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
@@ -404,4 +404,4 @@ def test_the_report_has_the_front_of_probability_and_steps(write):
     assert front[0]["steps"]["value"] == pytest.approx(time["quickest"]) and len(front) > 1
     (line,) = steps.trade_off(time)
     assert f"{front[1]['probability']['value']:.4f} in " in line
-    assert "steps.svg" in {picture.name for picture in job.pictures(outcome)}
+    assert "steps.svg" in {section.name for section in job.sections(outcome)}

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
-from typing import Annotated as TomlKey
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from jaxltl.app.files.schema import (
     Unit,
     read_map,
     Meta,
+    key,
     table,
 )
 from jaxltl.app.files.worlds import initial_where
@@ -49,27 +49,17 @@ Formulas = Annotated[list[str], Meta('a list of Boolean formulas, such as ["a", 
 class GameTable(TomlTable):
     """``[game]``: two robots on a map, or a model file."""
 
-    map: TomlKey[Map | None, "Rows of a text map, or the file that has them; default none."] = None
-    legend: TomlKey[
-        Legend | None, "Propositions of each kind of cell; default the kind itself."
-    ] = None
-    wall: TomlKey[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
-    slip: TomlKey[Unit | None, "Probability of slipping to either side; default 0."] = None
-    system_start: TomlKey[Start | None, "Initial cells of the system; default all.", "[1, 4]"] = (
-        None
-    )
-    environment_start: TomlKey[Start | None, "Initial cells of the other; default all.", '"b"'] = (
-        None
-    )
-    system_stays: TomlKey[bool | None, "True if the system may stay; default true.", "false"] = None
-    environment_stays: TomlKey[bool | None, "True if the other may stay; default false."] = None
-    model: TomlKey[Text | None, "Model file of a game; default none.", '"game.umb"'] = None
-    constants: TomlKey[
-        Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
-    ] = None
-    initial: TomlKey[Text | None, "Formula of initial states; default the model's.", '"start"'] = (
-        None
-    )
+    map: Map | None = key("Rows of a text map, or the file that has them; default none.")
+    legend: Legend | None = key("Propositions of each kind of cell; default the kind itself.")
+    wall: Text | None = key("Kind of cell that cannot be entered; default #.", '"x"')
+    slip: Unit | None = key("Probability of slipping to either side; default 0.")
+    system_start: Start | None = key("Initial cells of the system; default all.", "[1, 4]")
+    environment_start: Start | None = key("Initial cells of the other; default all.", '"b"')
+    system_stays: bool | None = key("True if the system may stay; default true.", "false")
+    environment_stays: bool | None = key("True if the other may stay; default false.")
+    model: Text | None = key("Model file of a game; default none.", '"game.umb"')
+    constants: Text | None = key("Constants of a program (.prism); default none.", '"N=64,MAX=4"')
+    initial: Text | None = key("Formula of initial states; default the model's.", '"start"')
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("map", "model"), "a map or a model (a file)")
@@ -84,18 +74,16 @@ class GameTable(TomlTable):
 
 
 @table
-class TaskTable(TomlTable):
+class ObjectiveTable(TomlTable):
     """``[task]``: the objective of the system."""
 
-    formula: TomlKey[Text | None, "Temporal-logic formula; default none.", '"G !collision"'] = None
-    assumptions: TomlKey[Formulas | None, "Assumed infinitely often (GR(1)); default none."] = None
-    guarantees: TomlKey[Formulas | None, "Required infinitely often (GR(1)); default none."] = None
-    safe: TomlKey[Text | None, "Formula that must hold always; default none.", '"!collision"'] = (
-        None
+    formula: Text | None = key("Temporal-logic formula; default none.", '"G !collision"')
+    assumptions: Formulas | None = key("Assumed infinitely often (GR(1)); default none.")
+    guarantees: Formulas | None = key("Required infinitely often (GR(1)); default none.")
+    safe: Text | None = key("Formula that must hold always; default none.", '"!collision"')
+    chance: Literal["random", "adversarial"] = key(
+        "Random moves: by probability, or by the environment.", default="random"
     )
-    chance: TomlKey[
-        Literal["random", "adversarial"], "Random moves: by probability, or by the environment."
-    ] = "random"
 
     def __attrs_post_init__(self) -> None:
         lists = [k for k in ("assumptions", "guarantees", "safe") if getattr(self, k) is not None]
@@ -120,12 +108,10 @@ class TaskTable(TomlTable):
 class StrategyTable(TomlTable):
     """``[strategy]``: how a permissive strategy is computed."""
 
-    method: TomlKey[
-        Literal["auto", "stay", "rank", "counter", "parity"], "Method of permissive strategies."
-    ] = "auto"
-    bound: TomlKey[Count | None, "Bound of counter (required) and parity; default none.", "6"] = (
-        None
+    method: Literal["auto", "stay", "rank", "counter", "parity"] = key(
+        "Method of permissive strategies.", default="auto"
     )
+    bound: Count | None = key("Bound of counter (required) and parity; default none.", "6")
 
 
 @table
@@ -133,9 +119,9 @@ class GameFile(File):
     """A checked game file."""
 
     KIND: ClassVar[str] = "the game file"
-    game: TomlKey[GameTable, "The game."]
-    task: TomlKey[TaskTable, "The objective of the system."]
-    strategy: TomlKey[StrategyTable | None, "Demands a strategy."] = None
+    game: GameTable = key("The game.")
+    task: ObjectiveTable = key("The objective of the system.")
+    strategy: StrategyTable | None = key("Demands a strategy.")
 
 
 @dataclass(frozen=True)
@@ -227,11 +213,11 @@ def load_objective(file: GameFile, world: MappedGame) -> tuple[Game, Parity | GR
         return game, gr1(game, task.assumptions or (), task.guarantees, safe=safe)
 
 
-def task_text(task: TaskTable) -> str:
+def task_text(task: ObjectiveTable) -> str:
     """The objective as one formula.
 
     Example:
-      >>> task_text(TaskTable(assumptions=["a"], guarantees=["b", "c | d"], safe="!e"))
+      >>> task_text(ObjectiveTable(assumptions=["a"], guarantees=["b", "c | d"], safe="!e"))
       'G (!e) & (G F (a) -> G F (b) & G F (c | d))'
     """
     if task.formula is not None:
@@ -272,7 +258,7 @@ def solve_game(file: GameFile, progress: Callable[[str], None] = lambda stage: N
     progress("reading")
     world = load_game(file)
     game, objective = load_objective(file, world)
-    table = file.strategy or StrategyTable()
+    table = file.strategy or StrategyTable(bound=None)
     with errors_in(f"{file.path}: [strategy] "):
         solved = synthesize(
             game,

@@ -10,7 +10,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
-from typing import Annotated as TomlKey
 
 import attrs
 
@@ -112,8 +111,9 @@ def hparams_table(learner: str, *omit: str, base: type[TomlTable] = TomlTable) -
     fields = {}
     for one in declarations(learner):
         if one.name not in omit:
-            kind: Any = TomlKey[_type_of(one) | None, ""]
-            fields[one.name] = attrs.field(default=None, type=kind)
+            fields[one.name] = attrs.field(
+                default=None, type=_type_of(one) | None, metadata={"texts": ("", "")}
+            )
     return attrs.make_class(
         f"{base.__name__}Of{learner}", fields, bases=(base,), frozen=True, kw_only=True, slots=False
     )

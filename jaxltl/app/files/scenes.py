@@ -12,7 +12,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.io.demonstrations import read_demonstrations
 from jaxltl.app.files.schema import read_map
-from jaxltl.app.files.task_todirl import TodirlFile, WorldTable, map_file
+from jaxltl.app.files.task_irl import TodirlFile, ScenesTable, map_file
 from jaxltl.app.files.worlds import MappedModel, grid_options
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.logic.labels import require_known
@@ -85,7 +85,7 @@ def _read_scene(
         return make(name, text, task.world, task.learner.radius)
 
 
-def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> ObservedScene:
+def _colored_scene(name: str, text: str, world: ScenesTable, radius: int) -> ObservedScene:
     colored = read_world(_with_settings(text, world))
     if _gives_kinds(world):
         own = {
@@ -101,7 +101,7 @@ def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> Obse
     return _of_world(name, colored, radius)
 
 
-def _with_settings(text: str, world: WorldTable) -> str:
+def _with_settings(text: str, world: ScenesTable) -> str:
     """The text of a coloured world, followed by the settings of the task file that it lacks."""
     own = {line.partition(":")[0].strip() for line in text.splitlines() if ":" in line}
     values = world.specified()
@@ -113,15 +113,15 @@ def _with_settings(text: str, world: WorldTable) -> str:
     return "\n".join([text, *lines])
 
 
-def _gives_kinds(world: WorldTable) -> bool:
+def _gives_kinds(world: ScenesTable) -> bool:
     return world.objects is not None or world.obstacles is not None
 
 
-def _objects(world: WorldTable) -> Mapping[str, Mapping[str, int]]:
+def _objects(world: ScenesTable) -> Mapping[str, Mapping[str, int]]:
     return temporal_gridworld.OBJECTS if world.objects is None else world.objects
 
 
-def _obstacles(world: WorldTable) -> Mapping[str, Mapping[str, int]]:
+def _obstacles(world: ScenesTable) -> Mapping[str, Mapping[str, int]]:
     return temporal_gridworld.OBSTACLES if world.obstacles is None else world.obstacles
 
 
@@ -135,14 +135,14 @@ def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> Observ
     return ObservedScene(mdp=world.mdp, cells=None, name=name, observation=seen, colored=world)
 
 
-def _plain_scene(name: str, text: str, world: WorldTable, radius: int) -> ObservedScene:
+def _plain_scene(name: str, text: str, world: ScenesTable, radius: int) -> ObservedScene:
     cells = parse_map(text)
     mdp = gridworld(text, **grid_options(world))
     seen = cell_observations(cells, cell_kinds(world), radius)
     return ObservedScene(mdp=mdp, cells=cells, name=name, observation=jnp.asarray(seen, mdp.dtype))
 
 
-def cell_kinds(world: WorldTable) -> list[str]:
+def cell_kinds(world: ScenesTable) -> list[str]:
     """The kinds of cells of maps with a legend, in the order of observations."""
     wall = world.wall or "#"
     return [*(kind for kind in world.legend or () if kind != wall), wall]

@@ -1,8 +1,8 @@
 """Schemas of TOML files, and errors that name the file, table, key, value and fix.
 
-A table is a :class:`TomlTable`: each key has a type with a title that states the requirement on
-values, one line of help and a default. ``None`` stands for a key that a file leaves out; then the
-help ends in "; default" and what holds without the key. A second text is an example, in TOML.
+A table is a :class:`TomlTable`, whose keys are declared by :func:`key`: a type with a title that
+states the requirement on values, one line of help and, where the type has none, an example in TOML.
+A key whose type includes ``None`` may be left out; its help ends in "; default" and what holds then.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from typing import (
     get_origin,
     get_type_hints,
 )
-from typing import Annotated as TomlKey
 
 import attrs
 
@@ -94,18 +93,36 @@ def key_name(field: attrs.Attribute[Any]) -> str:
     return field.name.rstrip("_")
 
 
+def key(text: str = "", example: str = "", **default: Any) -> Any:
+    """A key of a table with its help, an example in TOML, and `default` or `factory`."""
+    return attrs.field(metadata={"texts": (text, example)}, **default)
+
+
 def _fields(schema: Any) -> tuple[attrs.Attribute[Any], ...]:
-    """The keys of a table: its fields of a type ``TomlKey[...]``."""
-    return tuple(field for field in attrs.fields(schema) if get_origin(field.type) is Annotated)
+    """The keys of a table."""
+    return tuple(field for field in attrs.fields(schema) if "texts" in field.metadata)
+
+
+def is_required(field: attrs.Attribute[Any]) -> bool:
+    """True if a file must have a key: one without default, or a table with a required key."""
+    part = _table_of(field.type)
+    missing = field.default is attrs.NOTHING
+    return missing and (part is None or any(map(is_required, _fields(part))))
 
 
 def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attribute[Any]]:
-    """Evaluates annotations, which are strings until then."""
-    hints = get_type_hints(kind, include_extras=True)
-    return [field.evolve(type=hints.get(field.name, field.type)) for field in fields]
+    """Evaluates annotations, which are strings until then; None is a default of its types."""
+    hints, resolved = get_type_hints(kind, include_extras=True), []
+    for field in fields:
+        hint = hints.get(field.name, field.type)
+        default = field.default
+        if default is attrs.NOTHING and get_origin(hint) in (Union, UnionType):
+            default = None if type(None) in get_args(hint) else default
+        resolved.append(field.evolve(type=hint, default=default))
+    return resolved
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(attrs.field,))
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
 def table(kind: type[Any]) -> Any:
     """Class decorator of a :class:`TomlTable`: a frozen attrs class with keyword arguments."""
     return attrs.frozen(kw_only=True, slots=False, field_transformer=_resolve)(kind)
@@ -144,9 +161,9 @@ class File(TomlTable):
     KIND: ClassVar[str] = "the task file"  # begins the error if it cannot be read
     path: Path = Path()
     raw: bytes = b""  # its content
-    name: TomlKey[
-        Name, "Name of the results' folder; default the file's own name.", '"two goals"'
-    ] = attrs.field(default=None)
+    name: Name = key(
+        "Name of the results' folder; default the file's own name.", '"two goals"', default=None
+    )
 
     @classmethod
     def read(cls, path: str | Path, raw: bytes | None = None) -> Self:
@@ -223,12 +240,13 @@ def convert(
                 f"{where} {key} = {value!r}; it must be {requirement(kind)}."
             ) from None
     for key, field in fields.items():
-        if field.default is attrs.NOTHING and key not in data:
+        if is_required(field) and key not in data:
             missing = f"{key}, {requirement(field.type)}" if name else f"the table [{key}]"
             raise ValueError(f"{where} lacks {missing}.")
     for key, field in fields.items():
-        if key in data and (part := _table_of(field.type)):
-            values[field.name] = convert(path, part, data[key], key)
+        part = _table_of(field.type)
+        if part and (key in data or field.default is attrs.NOTHING):
+            values[field.name] = convert(path, part, data.get(key, {}), key)
     if issubclass(schema, File):
         values |= {"path": path, "raw": raw, "name": values.get("name") or path.stem}
     with errors_in(f"{where} "):

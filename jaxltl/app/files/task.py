@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
-from typing import Annotated as TomlKey
 
 from jaxltl.app.files.schema import (
     Count,
@@ -15,6 +14,7 @@ from jaxltl.app.files.schema import (
     TomlTable,
     Text,
     Meta,
+    key,
     Unit,
     table,
     read_toml,
@@ -72,66 +72,59 @@ Optimizer = Annotated[
 class GridTable(TomlTable):
     """Keys of ``[world]`` about text maps."""
 
-    legend: TomlKey[
-        Legend | None, "Propositions of each kind of cell; default the kind itself."
-    ] = None
-    wall: TomlKey[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
-    slip: TomlKey[Unit | None, "Probability of slipping to either side; default 0."] = None
-    absorbing: TomlKey[Propositions | None, "Propositions of absorbing cells; default none."] = None
+    legend: Legend | None = key("Propositions of each kind of cell; default the kind itself.")
+    wall: Text | None = key("Kind of cell that cannot be entered; default #.", '"x"')
+    slip: Unit | None = key("Probability of slipping to either side; default 0.")
+    absorbing: Propositions | None = key("Propositions of absorbing cells; default none.")
+    initial: Text | None = key("Formula of initial cells; default all cells.", '"s"')
 
 
 @table
 class FormulaTable(TomlTable):
     """``[task]``: the formula."""
 
-    formula: TomlKey[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
+    formula: Text = key("Formula of linear temporal logic.", '"!r U (g & F y)"')
 
 
 @table
-class TaskTable(FormulaTable):
+class GuaranteeTable(FormulaTable):
     """``[task]``: the formula, and the guarantee."""
 
-    label_on: TomlKey[
-        Literal["entry", "exit"] | None,
+    label_on: Literal["entry", "exit"] | None = key(
         "Label read by a step: of the state entered (default with mlirl) or left (with todirl); "
-        "default by the method.",
-    ] = None
-    guarantee: TomlKey[
-        GuaranteeKey | None,
+        "default by the method."
+    )
+    guarantee: GuaranteeKey | None = key(
         "Satisfaction probability to certify; default best, and none if the learner does not see "
         "the formula.",
         "0.9",
-    ] = None
-    steps_factor: TomlKey[
-        StepsFactor | None,
+    )
+    steps_factor: StepsFactor | None = key(
         "Bound on the expected steps to satisfaction, as a multiple of the quickest optimal "
-        "policy's; default 2, and none where guarantee has steps or is none.",
-    ] = None
-    over: TomlKey[
-        Literal["mean", "worst"] | None,
-        "Initial states of a given probability: their mean, or the worst; default mean.",
-        '"worst"',
-    ] = None
+        "policy's; default 2, and none where guarantee has steps or is none."
+    )
+    over: Literal["mean", "worst"] | None = key(
+        "Initial states of a given probability: their mean, or the worst; default mean.", '"worst"'
+    )
 
 
 @table
 class SyntheticTable(TomlTable):
     """Keys of ``[demonstrations]`` about simulated demonstrations."""
 
-    synthetic: TomlKey[Count | None, "Number of simulated demonstrations; default none."] = None
-    discount: TomlKey[
-        Discount | None,
-        "Discount of a simulated demonstrator's reward; default the quickest optimal policy.",
-    ] = None
-    length: TomlKey[Count | None, "Longest simulated demonstration; default 200."] = None
+    synthetic: Count | None = key("Number of simulated demonstrations; default none.")
+    discount: Discount | None = key(
+        "Discount of a simulated demonstrator's reward; default the quickest optimal policy."
+    )
+    length: Count | None = key("Longest simulated demonstration; default 200.")
 
 
 @table
 class LearnerTable(TomlTable):
     """``[learner]`` of any method."""
 
-    method: TomlKey[str, "Learning algorithm."]
-    steps: TomlKey[Count, "Steps of the learner."]
+    method: str = key("Learning algorithm.")
+    steps: Count = key("Steps of the learner.")
 
 
 @table
@@ -152,8 +145,8 @@ class OptimizerTable(LearnerTable):
 class FormulaFile(File):
     """A task file of any method."""
 
-    task: TomlKey[FormulaTable, "The formula."]
-    learner: TomlKey[LearnerTable, "The learner."]
+    task: FormulaTable = key("The formula.")
+    learner: LearnerTable = key("The learner.")
 
     @property
     def formula(self) -> str:
@@ -166,8 +159,8 @@ class TaskFile(FormulaFile):
     """A task file of learning from demonstrations."""
 
     LABEL_ON: ClassVar[str] = "entry"  # default of label_on
-    task: TomlKey[TaskTable, "The formula, and the guarantee."]
-    learner: TomlKey[OptimizerTable, "The learner and its hyperparameters."]
+    task: GuaranteeTable = key("The formula, and the guarantee.")
+    learner: OptimizerTable = key("The learner and its hyperparameters.")
 
     @property
     def label_on(self) -> str:

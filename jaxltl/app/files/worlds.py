@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxltl.app.files.task import SyntheticTable
-from jaxltl.app.files.task_mlirl import MlirlFile
+from jaxltl.app.files.task_irl import MlirlFile, ModelTable
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models import Product, Trajectories, make_trajectories, project_trajectories
 from jaxltl.core.types import Solution
@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task import GridTable
-from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import ACTIONS, gridworld
@@ -51,7 +50,7 @@ def grid_options(table: GridTable) -> Record:
     return {name: value for name, value in table.specified().items() if name in names}
 
 
-def load_world(path: Path, table: WorldTable) -> MappedModel:
+def load_world(path: Path, table: ModelTable) -> MappedModel:
     """The model that ``[world]`` of a task file describes."""
     with errors_in(f"{path}: [world] "):
         # Imports here: most tasks have a map, and need no reader of logs or models.

@@ -10,30 +10,24 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import click
 import jinja2
 from markupsafe import Markup
 
 from jaxltl.io.certificate.results import certificate_lines
-from jaxltl.plot.drawing import Picture
-from jaxltl.plot.explorer import (
-    Curves,
-    Explorer,
-    automaton_rows,
-    curve_table,
-    explorer_data,
-    layer_table,
-    machine_rows,
-    number as number,
-    position,
-    probability as probability,
-    run_rows,
-)
+from jaxltl.plot import explorer
+from jaxltl.plot.drawing import Picture, learning_picture
+from jaxltl.plot.explorer import Curves, Explorer, number as number, probability as probability
 from jaxltl.app.wording import Record, Result, counted
 from jaxltl.io.demonstrations import position_text
 from jaxltl.io import templates
 
+if TYPE_CHECKING:
+    import numpy as np
+
+Section = Picture | Explorer | Curves  # of a report
 Part = tuple[Explorer | Curves, Mapping[str, str]]  # with its drawings as SVG
 Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
 
@@ -84,7 +78,7 @@ def render_page(
     explorers = [(x, drawn) for x, drawn in parts if isinstance(x, Explorer) and not x.too_large]
     curves = [(part, drawn) for part, drawn in parts if isinstance(part, Curves)]
     replaced = {x.name for x, _ in explorers} | {x.name for x, _ in curves}
-    data = [explorer_data(part) for part, _ in explorers]
+    data = [explorer.explorer_data(part) for part, _ in explorers]
     known = json.dumps(data, separators=(",", ":"), allow_nan=False)
     values = {
         "title": result["task"],
@@ -118,13 +112,25 @@ def render_text(template: str, **values: object) -> list[str]:
     return [line.rstrip() for line in text.splitlines()]
 
 
+def learning_curves(
+    history: Mapping[str, np.ndarray], names: Sequence[str], caption: str, num_seeds: int
+) -> list[Section]:
+    """Learning curves of some metrics, as a picture and as an interactive part."""
+    band = "; the line is the median over seeds, the band their range" if num_seeds > 1 else ""
+    text = f"{caption}{band}."
+    return [
+        learning_picture(history, text, names),
+        explorer.curves("learning", "Learning", text, history, names),
+    ]
+
+
 @functools.cache
 def _environment() -> jinja2.Environment:
     environment = templates.environment("jaxltl.app.reports")
     formats = (number, probability, certified, mean_deviation, rounded_down, position_text, counted)
     environment.filters |= {function.__name__: function for function in formats}
-    parts = (position, layer_table, run_rows, machine_rows, automaton_rows, curve_table)
-    environment.globals |= {function.__name__: function for function in parts}
+    parts = ("position", "layer_table", "run_rows", "machine_rows", "automaton_rows", "curve_table")
+    environment.globals |= {name: getattr(explorer, name) for name in parts}
     return environment
 
 
