@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxltl.app.solve import read_queries
 from jaxltl.core.logic.bounded import Bounded
 from jaxltl.core.programs.partial import solve_program
+from jaxltl.io.prism.properties import read_queries
 
 CASES = (
     ("zeroconf, N=1000, K=16", "zeroconf/zeroconf", "N=1000,K=16,reset=false", "correct_max"),

@@ -39,8 +39,8 @@ def timed(function: Callable[[], Any]) -> tuple[float, Any]:
 
 def build(folder: Path, instance: dict[str, Any]) -> tuple[Any, Any]:
     """The program of an instance and its model, from the text."""
-    from jaxltl.app.solve import read_queries
     from jaxltl.core.programs.build import build_model
+    from jaxltl.io.prism.properties import read_queries
 
     program, queries = read_queries(
         folder / instance["model"],

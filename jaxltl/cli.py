@@ -169,9 +169,8 @@ def synthesize(
     file = GameFile.read(game_file)
     out = run_job.directory(out, file.name)
     with contextlib.ExitStack() as held:
-        held.enter_context(run_job.locked(out))
         # Before the work, since the directory may not be writable.
-        run_job.claim_directory(out, "game.toml", game_file.read_bytes(), again)
+        held.enter_context(run_job.claimed(out, "game.toml", game_file.read_bytes(), again))
         held.enter_context(float64())
         progress = held.enter_context(_stages(STAGES))
         solved = solve_game(file, progress)
@@ -324,7 +323,9 @@ def solve(
         compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
-    program, questions = solving.read_queries(model_file, options.const, properties, devices.mesh)
+    program, questions = solving.read_queries(model_file, options.const, properties)
+    if program is not None and devices.mesh is not None:
+        raise ValueError(f"--mesh takes built models; {model_file} is a program.")
     strategy, certificate = options.strategy, options.certificate
     how = {name: getattr(options, name) for name in ("relative", "exact", "fair")}
     partial = options.method == "partial"
@@ -398,29 +399,18 @@ def certify(log: Path, formula: str | None, options: CertifyOptions, as_json: bo
     if log.suffix == ".npz":
         if replace(options, method="anytime") != CertifyOptions():
             raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
-        _certify_policy(log, formula, as_json, say)
-        return
-    if formula is None or options.confidence is None:
+        from jaxltl.app.learn_environment import certify_policy_file
+        from jaxltl.app.reports.learn_environment import proof_entry, proof_sentence
+
+        result = proof_entry(certify_policy_file(log, formula, say))
+        click.echo(f"{result['formula']}\n{proof_sentence(result)}")
+    elif formula is None or options.confidence is None:
         missing = "FORMULA" if formula is None else "--confidence, such as 0.95"
         raise ValueError(f"a LOG needs {missing}.")
-    from jaxltl.app.certify import certify_and_write
+    else:
+        from jaxltl.app.certify import certify_and_write
 
-    result = certify_and_write(log, formula, options)
-    if as_json:
-        _print_json(result)
-    if result["status"] != "CONVERGED":
-        raise SystemExit(1)
-
-
-def _certify_policy(
-    policy: Path, formula: str | None, as_json: bool, say: Callable[[str], None]
-) -> None:
-    """Proves a saved policy in its dynamics."""
-    from jaxltl.app.learn_environment import certify_policy_file
-    from jaxltl.app.reports.learn_environment import proof_entry, proof_sentence
-
-    result = proof_entry(certify_policy_file(policy, formula, say))
-    click.echo(f"{result['formula']}\n{proof_sentence(result)}")
+        result = certify_and_write(log, formula, options)
     if as_json:
         _print_json(result)
     if result["status"] != "CONVERGED":

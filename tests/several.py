@@ -169,7 +169,7 @@ def solve(directory: Path, place: Any) -> None:
     import jax
 
     from jaxltl.app import solve_on_mesh
-    from jaxltl.app.solve import parse_queries
+    from jaxltl.io.prism.properties import parse_queries
 
     made: list[int] = []
     save = solve_on_mesh.files.save

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from jaxltl.algos.common.demonstrations import sample_demonstrations
 from jaxltl.app.files import (
     game,
     schema,
     task,
     task_irl,
     task_rl,
-    worlds,
 )
 from jaxltl.app.files.schema import Count, TomlTable, table
 from jaxltl.core.environments.task_environment import make_task_tables
@@ -130,8 +130,7 @@ def test_defaults_in_words_are_those_of_the_code():
     ):
         value = default(function, name)
         assert stated(kind, name) in (f"{value:g}" if type(value) is float else str(value).lower())
-    length = inspect.getsource(worlds.synthetic_demonstrations)
-    assert f"table.length or {stated(task.SyntheticTable, 'length')}\n" in length
+    assert stated(task.SyntheticTable, "length") == str(default(sample_demonstrations, "length"))
     ending = stated(task_rl.RewardTable, "ending")
     assert ending.partition(",")[0] == default(make_task_tables, "ending")
 

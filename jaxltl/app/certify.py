@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 import numpy as np
@@ -18,25 +18,12 @@ from jaxltl.app.command_options import CertifyOptions
 from jaxltl.app.files.task_irl import ModelTable
 from jaxltl.app.wording import Record
 from jaxltl.core import validation
-from jaxltl.core.models import (
-    MDP,
-    Product,
-    SparseMDP,
-    TransitionCounts,
-    align_counts,
-    model_from_counts,
-    product,
-)
+from jaxltl.core import models
 from jaxltl.core.pretty_print import rounded_outward
 from jaxltl.core.statistics.confidence_sets import Graph, LeastProbability, check_confidence
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
-from jaxltl.core.values import (
-    DataGuarantee,
-    guarantee_curve,
-    learn_guarantee,
-    satisfaction_probability,
-)
+from jaxltl.core import values
 from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.io.templates import render
@@ -50,47 +37,39 @@ PICTURES = (".svg", ".png", ".pdf")
 class CountEvidence:
     """A model and its transition counts."""
 
-    model: SparseMDP  # its probabilities are frequencies, or those of a given model
+    model: models.SparseMDP  # its probabilities are frequencies, or those of a given model
     counts: np.ndarray  # int64[T], of the model's entries
     states: tuple[str, ...]  # S names, and the action of each choice
     actions: tuple[str, ...]
     graph: Graph  # assumption on transitions that the log does not contain
 
-
-@dataclass(frozen=True)
-class CertificateQuery:
-    """A question: the formula, and the confidence of the answer."""
-
-    formula: str  # of linear temporal logic
-    confidence: float  # confidence, method: of the confidence sets
-    method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
-    objective: Literal["max", "min"]  # "max" or "min"
+    @property
+    def num_samples(self) -> int:
+        return int(self.counts.sum())
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogSource:
-    """Labels, model and assumptions that accompany a log."""
+def read_evidence(
+    log: Path,
+    option: str = "--{} ",
+    *,
+    labels: Path | None = None,
+    model: Path | None = None,
+    initial: Sequence[str] = (),
+    terminal: Sequence[str] = (),
+    graph: Graph | None = None,
+) -> CountEvidence:
+    """Transition counts of a log, with its table of labels, or of a model file with its graph.
 
-    labels: Path | None = None  # table of labels, or None
-    model: Path | None = None  # model file with the transition graph, or None
-    initial: Sequence[str] = ()  # initial, terminal: names of states
-    terminal: Sequence[str] = ()
-    # assumption on possible transitions; default "complete", or "given" with a model; see
-    # :func:`~jaxltl.core.models.construct.counts.model_from_counts`
-    graph: Graph | None = None
-
-
-def read_evidence(log: Path, source: LogSource, option: str = "--{} ") -> CountEvidence:
-    """Transition counts of a log and their model; `option` formats option names in errors."""
+    `graph` is by default "complete"; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
+    `option` formats names of options in errors.
+    """
     from jaxltl.io.log import read_labels, read_log
 
-    labels, model, initial, terminal = source.labels, source.model, source.initial, source.terminal
-    graph = source.graph
     if model is not None:
         from jaxltl.app.solve import load
 
         source_model = load(model)
-        if not isinstance(source_model, SparseMDP):
+        if not isinstance(source_model, models.SparseMDP):
             raise ValueError(f"{str(model)!r} has intervals already; solve it by `jaxltl solve`.")
         if labels is not None or terminal or initial:
             raise ValueError(
@@ -100,7 +79,7 @@ def read_evidence(log: Path, source: LogSource, option: str = "--{} ") -> CountE
         if graph is not None:
             raise ValueError("a model has its graph; leave --graph and --least-probability out.")
         return _named(
-            source_model, align_counts(source_model, read_log(log, source_model)), "given"
+            source_model, models.align_counts(source_model, read_log(log, source_model)), "given"
         )
     counts = read_log(log)
     if not initial:
@@ -117,7 +96,7 @@ def read_evidence(log: Path, source: LogSource, option: str = "--{} ") -> CountE
             )
     known = None if labels is None else read_labels(labels, counts.states)
     graph = graph or "complete"
-    sparse, count = model_from_counts(
+    sparse, count = models.model_from_counts(
         counts,
         initial=list(initial),
         labels=known,
@@ -141,13 +120,13 @@ def graph_of_options(
     return LeastProbability(least_probability, failure=(1 - confidence) / 10)
 
 
-def _some(counts: TransitionCounts) -> str:
+def _some(counts: models.TransitionCounts) -> str:
     names = ", ".join(counts.states[:8])
     more = len(counts.states) - 8
     return names + (f" and {more} more" if more > 0 else "")
 
 
-def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> CountEvidence:
+def _named(model: models.SparseMDP, counts: np.ndarray, graph: Graph) -> CountEvidence:
     states = model.valuation.get("state")
     names = range(model.num_states) if states is None else states
     rank = np.arange(model.num_rows) - model.host.row_start[model.host.state]
@@ -156,19 +135,9 @@ def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> CountEvidence:
     return CountEvidence(model, counts, tuple(map(str, names)), tuple(actions), graph)
 
 
-def certify(evidence: CountEvidence, query: CertificateQuery) -> DataGuarantee:
-    """Guarantee of a log and a query, see :func:`jaxltl.learn_guarantee`."""
-    return learn_guarantee(evidence.model, evidence.counts, **_options(evidence, query))
-
-
-def _options(evidence: CountEvidence, query: CertificateQuery) -> Record:
-    return {
-        "formula": query.formula,
-        "confidence": query.confidence,
-        "graph": evidence.graph,
-        "method": query.method,
-        "objective": query.objective,
-    }
+def certify(evidence: CountEvidence, query: Record) -> values.DataGuarantee:
+    """Guarantee of a log; the query has further arguments of :func:`jaxltl.learn_guarantee`."""
+    return values.learn_guarantee(evidence.model, evidence.counts, graph=evidence.graph, **query)
 
 
 def text(evidence: CountEvidence, result: Record) -> str:
@@ -184,19 +153,19 @@ def text(evidence: CountEvidence, result: Record) -> str:
 
 
 def entry(
-    evidence: CountEvidence, query: CertificateQuery, guarantee: DataGuarantee, seconds: float
+    evidence: CountEvidence, query: Record, guarantee: values.DataGuarantee, seconds: float
 ) -> Record:
     """Guarantee from a log, as a JSON object."""
     return {
-        "formula": query.formula,
-        "objective": query.objective,
+        "formula": query["formula"],
+        "objective": query["objective"],
         "bound": guarantee.bound,
         "optimistic": guarantee.optimistic,
         "confidence": guarantee.confidence,
         "assumption": guarantee.assumption,
-        "method": query.method,
+        "method": query["method"],
         "status": Status(int(guarantee.satisfaction.status)).name,
-        "samples": int(evidence.counts.sum()),
+        "samples": evidence.num_samples,
         "claims": guarantee.sets.num_claims,
         "states": evidence.model.num_states,
         "choices": evidence.model.num_rows,
@@ -205,7 +174,7 @@ def entry(
     }
 
 
-def sample_next(evidence: CountEvidence, guarantee: DataGuarantee) -> list[Record]:
+def sample_next(evidence: CountEvidence, guarantee: values.DataGuarantee) -> list[Record]:
     """Choices of which more samples improve the guarantee most, in decreasing order."""
     return [
         {
@@ -219,12 +188,12 @@ def sample_next(evidence: CountEvidence, guarantee: DataGuarantee) -> list[Recor
     ]
 
 
-def curve(evidence: CountEvidence, query: CertificateQuery) -> tuple[list[int], list[float]]:
+def curve(evidence: CountEvidence, query: Record) -> tuple[list[int], list[float]]:
     """The guarantee by number of samples, for one random order of the log."""
-    total = int(evidence.counts.sum())
+    total = evidence.num_samples
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
-    options = _options(evidence, query)
-    bound = guarantee_curve(evidence.model, evidence.counts, sizes=sizes.tolist(), **options)
+    options: Record = {"sizes": sizes.tolist(), "graph": evidence.graph, **query}
+    bound = values.guarantee_curve(evidence.model, evidence.counts, **options)
     return sizes.tolist(), bound.tolist()
 
 
@@ -232,42 +201,31 @@ def curve(evidence: CountEvidence, query: CertificateQuery) -> tuple[list[int], 
 
 
 @dataclass(frozen=True)
-class Logged:
+class Logged(CountEvidence):
     """The log from which a world was estimated."""
 
-    evidence: CountEvidence  # the world with its frequencies, and the counts
     column: np.ndarray  # int[R], the action of each choice in the padded world
-    confidence: float  # confidence, method: of the confidence sets
-    method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        return self.evidence.states
-
-    @property
-    def num_samples(self) -> int:
-        return int(self.evidence.counts.sum())
+    query: Record  # confidence and method of the confidence sets
 
 
-def load_logged(folder: Path, table: ModelTable) -> tuple[MDP, tuple[str, ...], Logged]:
+def load_logged(folder: Path, table: ModelTable) -> tuple[models.MDP, tuple[str, ...], Logged]:
     """The world of a log, with frequencies as probabilities, the names of its actions, and the log."""
     initial, confidence = table.initial or [], table.confidence
     assert table.transitions is not None and confidence is not None
     evidence = read_evidence(
         folder / table.transitions,
-        LogSource(
-            labels=None if table.labels is None else folder / table.labels,
-            initial=[initial] if isinstance(initial, str) else initial,
-            terminal=table.terminal or (),
-            graph=graph_of_options(table.graph, table.least_probability, confidence),
-        ),
-        option="{} = ",
+        "{} = ",
+        labels=None if table.labels is None else folder / table.labels,
+        initial=[initial] if isinstance(initial, str) else initial,
+        terminal=table.terminal or (),
+        graph=graph_of_options(table.graph, table.least_probability, confidence),
     )
     mdp, actions, column = padded(evidence.model)
-    return (mdp, actions, Logged(evidence, column, confidence, table.method or "anytime"))
+    query = {"confidence": confidence, "method": table.method or "anytime"}
+    return mdp, actions, Logged(**vars(evidence), column=column, query=query)
 
 
-def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Record:
+def guaranteed(logged: Logged, model: models.Product, formula: str, policy: Any) -> Record:
     """Guaranteed satisfaction probability of a policy, from the log alone.
 
     The policy may depend on the log: with the given confidence all sets hold the true distributions
@@ -275,25 +233,24 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
     a lower bound for the policy, ``best_guaranteed`` the greatest one of any policy, and
     ``optimistic`` an upper bound for all policies.
     """
-    evidence = logged.evidence
-    best = certify(evidence, CertificateQuery(formula, logged.confidence, logged.method, "max"))
-    against = product(best.model, model.automaton, label_on=model.label_on)
-    weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
-    worst = satisfaction_probability(against, weights, nature="adversarial")
-    share = np.asarray(evidence.model.initial)
+    best = certify(logged, {"formula": formula, **logged.query})
+    against = models.product(best.model, model.automaton, label_on=model.label_on)
+    weights: Any = np.asarray(policy)[logged.model.host.state, :, logged.column]
+    worst = values.satisfaction_probability(against, weights, nature="adversarial")
+    share = np.asarray(logged.model.initial)
     lower = from_starts(against, worst.lower)[share > 0]
     codes = int(worst.status), int(best.satisfaction.status)
     status = next((c for c in codes if c != Status.CONVERGED), int(Status.CONVERGED))
     return {
-        "confidence": logged.confidence,
+        "confidence": logged.query["confidence"],
         "guaranteed": safe_mean(share[share > 0], lower, up=False),
         "best_guaranteed": best.bound,
         "optimistic": best.optimistic,
         "assumption": best.assumption,
         "samples": logged.num_samples,
-        "method": logged.method,
+        "method": logged.query["method"],
         "status": Status(status).name,
-        "sample_next": sample_next(evidence, best),
+        "sample_next": sample_next(logged, best),
     }
 
 
@@ -302,23 +259,19 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Rec
 
 def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Record:
     """Runs the command, output files opened first, and returns the result."""
-    from jaxltl.io.certificate.results import (
-        Certifiable,
-        certificate_lines,
-        formula_question,
-        write_certificates,
-    )
+    from jaxltl.io.certificate import results
     from jaxltl.core.files import atomic_write
-    from jaxltl.core.models.construct.lifting import project_policy
     from jaxltl.core.policies.policy_file import save_policy
 
     assert options.confidence is not None
-    objective: Literal["max", "min"] = "min" if options.smallest else "max"
-    query = CertificateQuery(formula, options.confidence, options.method, objective)
-    graph = graph_of_options(options.graph, options.least_probability, query.confidence)
-    names = ("labels", "model", "initial", "terminal")
-    source = LogSource(**{name: getattr(options, name) for name in names}, graph=graph)
-    check_confidence(query.confidence)
+    directions = ("min", "max") if options.smallest else ("max", "min")
+    query: Record = {"formula": formula, "objective": directions[0]}
+    query |= {"confidence": options.confidence, "method": options.method}
+    source: Record = {
+        name: getattr(options, name) for name in ("labels", "model", "initial", "terminal")
+    }
+    source["graph"] = graph_of_options(options.graph, options.least_probability, options.confidence)
+    check_confidence(options.confidence)
     picture, proof = options.curve, options.certificate
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
@@ -327,20 +280,21 @@ def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Recor
             None if path is None else held.enter_context(atomic_write(path))
             for path in (options.policy, picture)
         )
-        evidence = read_evidence(log, source)
+        evidence = read_evidence(log, **source)
         begin = time.perf_counter()
         guarantee = certify(evidence, query)
         result = entry(evidence, query, guarantee, time.perf_counter() - begin)
         click.echo(text(evidence, result))
         if proof is not None:
-            nature = "min" if query.objective == "max" else "max"
-            question = formula_question(query.formula, query.objective, nature)
-            one = Certifiable(guarantee.model, guarantee, question)
-            result["certificates"] = write_certificates(proof.parent, [one], proof.name)
-            click.echo("\n".join(certificate_lines(result["certificates"], proof.parent)))
+            question = results.formula_question(formula, *directions)
+            one = results.Certifiable(guarantee.model, guarantee, question)
+            result["certificates"] = results.write_certificates(proof.parent, [one], proof.name)
+            click.echo("\n".join(results.certificate_lines(result["certificates"], proof.parent)))
         if file is not None:
             about = json.dumps({**result, "seconds": None}, allow_nan=False)
-            learned = project_policy(evidence.model, guarantee.satisfaction, states=evidence.states)
+            learned = models.project_policy(
+                evidence.model, guarantee.satisfaction, states=evidence.states
+            )
             save_policy(file, learned, {"result": about})
         if picture is not None and drawing is not None:
             from jaxltl import plot

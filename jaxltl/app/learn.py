@@ -10,31 +10,12 @@ import jax
 import numpy as np
 
 from jaxltl.algos import mlirl
-from jaxltl.algos.common.guarantees import (
-    Guarantee,
-    StepBound,
-    check_formula,
-    make_guarantee,
-    require_possible,
-    step_bound,
-)
+from jaxltl.algos.common import guarantees
 from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.app.files.task_irl import MlirlFile
-from jaxltl.app.files.worlds import (
-    MappedModel,
-    load_demonstrations,
-    load_world,
-    synthetic_demonstrations,
-)
+from jaxltl.app.files import worlds
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.page import (
-    Report,
-    Section,
-    certified,
-    learning_curves,
-    number,
-    probability,
-)
+from jaxltl.app.reports import page
 from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, Trajectories, product, project_policy, restrict
@@ -55,12 +36,12 @@ DOUBLE, FILE = True, MlirlFile
 @dataclass(frozen=True)
 class MlirlSetup:
     task: MlirlFile
-    world: MappedModel
+    world: worlds.MappedModel
     model: Product
     demonstrations: Trajectories
     dropped: int
-    guarantee: Guarantee
-    bound: StepBound | None = None  # of the expected steps; None for safety formulas
+    guarantee: guarantees.Guarantee
+    bound: guarantees.StepBound | None = None  # of the expected steps; None for safety formulas
     trivial: str | None = None  # remark on a formula that is always true
 
     @functools.cached_property
@@ -114,26 +95,28 @@ class MlirlOutcome:
 
 def prepare(task: MlirlFile, seed: int) -> MlirlSetup:
     """The learning problem of a task file: product, demonstrations, guarantee and features."""
-    world = load_world(task.path, task.world)
+    world = worlds.load_world(task.path, task.world)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
-        trivial = check_formula(model.automaton)
+        trivial = guarantees.check_formula(model.automaton)
     best = optimal_satisfaction(model)
     with errors_in(f"{task.path}: [world] "):
-        require_possible(model, best, world.position_text)
+        guarantees.require_possible(model, best, world.position_text)
     table = task.demonstrations
     if table.file is not None:
-        demonstrations, dropped = load_demonstrations(task, world), 0
+        demonstrations, dropped = worlds.load_demonstrations(task, world), 0
     else:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        demonstrations, dropped = synthetic_demonstrations(key, task.path, table, model, best)
+        demonstrations, dropped = worlds.synthetic_demonstrations(
+            key, task.path, table, model, best
+        )
     with errors_in(f"{task.path}: [task] "):
         place = world.position_text
-        guarantee = make_guarantee(
+        guarantee = guarantees.make_guarantee(
             model, demonstrations, task.guarantee, over=task.over, best=best, place=place
         )
         actions = guarantee.actions or optimal_actions(model, best)
-        bound = step_bound(
+        bound = guarantees.step_bound(
             model,
             actions,
             guarantee.requested,
@@ -274,7 +257,9 @@ def _guarantee_entry(setup: MlirlSetup, kept: mlirl.GuaranteedPolicy) -> Record:
     return record
 
 
-def _evidence(solution: Solution, model: Product, world: MappedModel, starts: np.ndarray) -> Record:
+def _evidence(
+    solution: Solution, model: Product, world: worlds.MappedModel, starts: np.ndarray
+) -> Record:
     parts = solution.value, solution.lower, solution.upper
     value, lower, upper = (from_starts(model, x) for x in parts)
     worst = int(starts[np.argmin(value[starts])])
@@ -334,28 +319,6 @@ _OPTIMAL = 1e-6  # certified loss up to which a policy is reported as optimal
 _NEGLIGIBLE = 0.05  # weight without a reported meaning
 
 
-def _rows_of_evidence(result: Result) -> list[tuple[str, ...]]:
-    """Policy, mean or minimum, probability, certificate, initial state, status of the solver."""
-    return [
-        (
-            title,
-            kind,
-            probability(result[key][kind]["value"]),
-            certified(result[key][kind]),
-            position_text(result[key][kind]) if kind == "minimum" else "",
-            result[key]["status"].lower(),
-        )
-        for title, key in (("learned policy", "satisfaction"), ("optimum", "best_achievable"))
-        for kind in ("mean", "minimum")
-        if kind == "mean" or not _all_equal(result[key])
-    ]
-
-
-def _all_equal(evidence: Result) -> bool:
-    """True if all initial states have the same probability, to four places."""
-    return probability(evidence["mean"]["value"]) == probability(evidence["minimum"]["value"])
-
-
 _MEANINGS = {
     "demonstrated": ("takes demonstrated actions", "avoids demonstrated actions"),
     "goal": ("moves to goal states", "avoids goal states"),
@@ -367,20 +330,19 @@ _MEANINGS = {
 }
 
 
-def _weights(result: Result) -> list[tuple[str, str, str]]:
-    """Feature, weight, and the effect of its sign on the policy unless it is negligible."""
-    return [
-        (
-            name,
-            number(x),
-            "negligible" if x is None or abs(x) < _NEGLIGIBLE else _MEANINGS[name][x < 0],
-        )
-        for name, x in result["weights"].items()
-    ]
-
-
 def _values(result: Result) -> Record:
-    evidence, data, from_log = _rows_of_evidence(result), result.get("data"), ""
+    """Rows of certified probabilities and of the effects of weights."""
+    evidence, weights, data, from_log = [], [], result.get("data"), ""
+    for title, key in (("learned policy", "satisfaction"), ("optimum", "best_achievable")):
+        values = {k: page.probability(result[key][k]["value"]) for k in ("mean", "minimum")}
+        for kind, value in values.items():
+            one, least = result[key][kind], kind == "minimum"
+            if not least or values["mean"] != value:  # else all initial states have the same one
+                where, status = position_text(one) if least else "", result[key]["status"].lower()
+                evidence.append((title, kind, value, page.certified(one), where, status))
+    for name, x in result["weights"].items():
+        tiny = x is None or abs(x) < _NEGLIGIBLE
+        weights.append((name, page.number(x), "negligible" if tiny else _MEANINGS[name][x < 0]))
     if data is not None:
         from_log = (
             f"with confidence {data['confidence']:g}, from "
@@ -391,15 +353,15 @@ def _values(result: Result) -> Record:
     return {
         "evidence": evidence,
         "evidence_rows": [(f"{policy}, {kind}", *rest) for policy, kind, *rest in evidence],
-        "weights": _weights(result),
-        "likelihood": "infinite" if never else number(result["neg_log_likelihood"]),
+        "weights": weights,
+        "likelihood": "infinite" if never else page.number(result["neg_log_likelihood"]),
         "from_log": from_log,
         "optimal": _OPTIMAL,
         "steps": steps,
     }
 
 
-report = Report("mlirl", _values)
+report = page.Report("mlirl", _values)
 
 
 _CURVES = "Loss, satisfaction probability and gradient before each step"
@@ -414,7 +376,7 @@ def task_pictures(setup: MlirlSetup) -> list[Picture]:
 _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 
-def sections(outcome: MlirlOutcome) -> list[Section]:
+def sections(outcome: MlirlOutcome) -> list[page.Section]:
     """The policy on the map, expected steps, and learning curves."""
     setup, model, learned = outcome.setup, outcome.setup.model, outcome.kept.learned
     world, logged, policy = setup.world, setup.world.logged, np.asarray(outcome.kept.policy)
@@ -440,7 +402,7 @@ def sections(outcome: MlirlOutcome) -> list[Section]:
             marked=_left_out(setup),
             marks="Demonstrated steps that lower the maximal satisfaction probability",
         ),
-        *learning_curves(learned.history, _FIGURES, _CURVES, len(learned.loss)),
+        *page.learning_curves(learned.history, _FIGURES, _CURVES, len(learned.loss)),
     ]
 
 
@@ -462,7 +424,8 @@ def _layers(outcome: MlirlOutcome) -> dict[str, MapLayer]:
     value = np.array(outcome.kept.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
     undecided = verdicts(model.automaton) == Verdict.UNDECIDED
-    met = _reached(model)
+    restricted, met = restrict(model), np.zeros(model.state_shape, bool)  # reachable states
+    met[np.asarray(restricted.base_state), np.asarray(restricted.memory)] = True
     memories = np.flatnonzero(undecided & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
     layers = {
@@ -508,14 +471,6 @@ def _maps(outcome: MlirlOutcome, cells: np.ndarray) -> list[Picture]:
             )
         )
     return maps
-
-
-def _reached(model: Product) -> np.ndarray:
-    """``bool[S, Q]``: product states that some policy can reach from an initial one."""
-    restricted = restrict(model)
-    met = np.zeros(model.state_shape, bool)
-    met[np.asarray(restricted.base_state), np.asarray(restricted.memory)] = True
-    return met
 
 
 def _left_out(setup: MlirlSetup) -> list[tuple[int, int, int]]:

@@ -19,14 +19,7 @@ from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
 from jaxltl.io.certificate.results import Certifiable, formula_question
 from jaxltl.plot.drawing import Picture, automaton_picture, drawing
 from jaxltl.plot.explorer import LONGEST_RUN, Explorer, MapLayer, ReportTrajectory
-from jaxltl.app.reports.page import (
-    Report,
-    Section,
-    aligned,
-    certified,
-    learning_curves,
-    probability,
-)
+from jaxltl.app.reports import page
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import POMDP, belief_filter, rollout
@@ -208,7 +201,7 @@ def task_pictures(setup: ControllerSetup) -> list[Picture]:
     return pictures
 
 
-def sections(outcome: ControllerOutcome) -> list[Section]:
+def sections(outcome: ControllerOutcome) -> list[page.Section]:
     """The controller as a machine and on the map, trajectories with beliefs, and learning curves."""
     setup, history = outcome.setup, outcome.learned.history
     world, rows = setup.task.world, [(s, t, o, x.tolist()) for s, t, o, x in outcome.transitions]
@@ -239,7 +232,7 @@ def sections(outcome: ControllerOutcome) -> list[Section]:
             machine=rows,
             window=world.observations if isinstance(world.observations, int) else 1,
         ),
-        *learning_curves(history, _FIGURES, _CURVES, history["value"].shape[1]),
+        *page.learning_curves(history, _FIGURES, _CURVES, history["value"].shape[1]),
     ]
 
 
@@ -294,22 +287,22 @@ def _values(result: Result) -> Record:
     rows = [
         (
             f"controller, {counted(result['num_memory'], 'memory state')}",
-            probability(result["satisfaction"]["lower"]),
-            certified(result["satisfaction"]),
+            page.probability(result["satisfaction"]["lower"]),
+            page.certified(result["satisfaction"]),
         ),
         (
             f"best explored controller, {counted(bounds['num_memory'], 'memory state')}",
-            probability(bounds["lower"]),
+            page.probability(bounds["lower"]),
             "lower bound of the optimum",
         ),
-        ("all controllers", probability(bounds["upper"]), "upper bound of the optimum"),
+        ("all controllers", page.probability(bounds["upper"]), "upper bound of the optimum"),
         (
             "optimum with full observation",
-            probability(result["fully_observable"]["value"]),
-            certified(result["fully_observable"]),
+            page.probability(result["fully_observable"]["value"]),
+            page.certified(result["fully_observable"]),
         ),
     ]
-    return {"header": ("policy", "probability", "certified"), "rows": rows, "aligned": aligned}
+    return {"header": ("policy", "probability", "certified"), "rows": rows, "aligned": page.aligned}
 
 
-report = Report("controller", _values)
+report = page.Report("controller", _values)

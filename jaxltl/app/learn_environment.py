@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import jax
@@ -31,11 +31,7 @@ from jaxltl.core.continuous import Dynamics, certify_policy, counterexample, sta
 from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.environments.task_environment import (
-    task_environment,
-    task_tables,
-    with_task_tables,
-)
+from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.environments.task_reward import is_discounted, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.values.evaluation.evaluation import (
@@ -43,8 +39,8 @@ from jaxltl.core.values.evaluation.evaluation import (
     Estimate,
     Evaluation,
     checked_steps,
-    evaluate,
 )
+from jaxltl.core.values.evaluation.selection import select_agent
 from jaxltl.core.policies.policy_file import read_policy_file
 from jaxltl.io.network_policy import save_network
 from jaxltl.core.models.protocols import PyTree
@@ -87,6 +83,26 @@ class EnvironmentOutcome:
     episodes: list[Episode]  # some of the kept policy, for pictures
     seed: int  # the first seed
     proof: Proof | str | None = None  # or the reason for which there is none
+
+    @cached_property
+    def picture(self) -> Picture | None:
+        """Some episodes, if the world has positions; drawn here, since its code is the user's."""
+        # Deferred: matplotlib.
+        from jaxltl.plot.episodes import draw_episodes
+        from jaxltl.plot.style import to_bytes
+
+        ends = [(int(np.sum(one.valid)), np.asarray(one.world.verdict)) for one in self.episodes]
+        titles = [f"{Verdict(int(v[t])).name.lower()} after {counted(t, 'step')}" for t, v in ends]
+        try:
+            figure = draw_episodes(self.setup.environment, self.episodes, titles=titles)
+        except ValueError:
+            return None
+        return Picture(
+            "episodes.svg",
+            "A few episodes",
+            to_bytes(figure),
+            "The first episodes of the kept policy, without selection; episode.html plays the first.",
+        )
 
 
 def prepare(
@@ -183,39 +199,37 @@ def learn(setup: EnvironmentSetup, training: Training) -> EnvironmentOutcome:
     chunks, history = run_seeds(*parts, training, num_steps=setup.task.learner.steps)
     # A single cost of a search is a curve like others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
-    # Distinct from all keys of the learner.
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2), 3)
+    key = jax.random.fold_in(jax.random.key(seed), 2)  # distinct from all keys of the learner
     states = [jax.tree.map(lambda x, i=i: x[i], chunks.state) for i in range(num_seeds)]
     agents = [_acting(setup, state) for state in states]
-    chosen = 0
-    if num_seeds > 1:
-        training.stage("choosing")
-        chosen = max(
-            range(num_seeds),
-            key=lambda i: _merit(setup, _evaluated(keys[0], agents[i], setup, threshold=False)),
-        )
-    training.stage("evaluating")
-    each = [
-        _evaluated(keys[1], agent, setup, threshold=i == chosen) for i, agent in enumerate(agents)
-    ]
+    table = setup.task.evaluation
+    chosen, each = select_agent(
+        key,
+        agents,
+        setup.environment,
+        setup.automaton,
+        num_episodes=table.episodes,
+        num_steps=setup.num_steps,
+        confidence=table.confidence,
+        threshold=table.threshold,
+        discount=table.discount,
+        report=training.stage,
+    )
     training.stage("drawing")
+    drawing = jax.random.split(key, 3)[2]
     run = partial(jax.jit(run_episode, static_argnames="num_steps"), num_steps=setup.num_steps)
     episodes = [
-        jax.device_get(run(jax.random.fold_in(keys[2], i), setup.environment, agents[chosen]))
+        jax.device_get(run(jax.random.fold_in(drawing, i), setup.environment, agents[chosen]))
         for i in range(_DRAWN)
     ]
-    proof = _proven(setup, states[chosen], training.stage)
+    proof: Proof | str | None = None
+    if setup.dynamics is not None:
+        agent = setup.method.agent(states[chosen], True)  # without random actions
+        try:
+            proof = prove(setup, agent, setup.task.formula, training.stage)
+        except ValueError as reason:  # such as an operation that has no enclosure
+            proof = str(reason)
     return EnvironmentOutcome(setup, chunks.state, history, chosen, each, episodes, seed, proof)
-
-
-def _proven(setup: EnvironmentSetup, state: PyTree, say: Report) -> Proof | str | None:
-    """The proof of the kept policy, without random actions; None in a simulator."""
-    if setup.dynamics is None:
-        return None
-    try:
-        return prove(setup, setup.method.agent(state, True), setup.task.formula, say)
-    except ValueError as reason:  # such as an operation that has no enclosure
-        return str(reason)
 
 
 def prove(setup: EnvironmentSetup, agent: Agent, formula: str, say: Report) -> Proof:
@@ -236,41 +250,6 @@ def _acting(setup: EnvironmentSetup, state: PyTree) -> Agent:
     return setup.method.agent(state, setup.acts == "likeliest")
 
 
-def _evaluated(
-    key: jax.Array, agent: Agent, setup: EnvironmentSetup, *, threshold: bool
-) -> Evaluation:
-    evaluation = setup.task.evaluation
-    return evaluate(
-        key,
-        agent,
-        _unshaped(setup.environment),
-        num_episodes=evaluation.episodes,
-        num_steps=setup.num_steps,
-        confidence=evaluation.confidence,
-        discount=evaluation.discount,
-        threshold=evaluation.threshold if threshold else None,
-    )
-
-
-def _unshaped(environment: Environment) -> Environment:
-    """The environment with the reward of the formula alone."""
-    tables = task_tables(environment)
-    return with_task_tables(
-        environment, replace(tables, potential=np.zeros_like(np.asarray(tables.potential)))
-    )
-
-
-def _merit(setup: EnvironmentSetup, evaluation: Evaluation) -> tuple[float, float, float]:
-    """Lexicographic criterion of seeds: verdicts, then accepting visits or length."""
-    success, violation, visits = evaluation.success, evaluation.violation, evaluation.visits
-    assert success is not None and violation is not None and visits is not None
-    if setup.automaton.is_safety:  # an undecided episode does not violate it
-        return -violation.mean, success.mean, 0.0
-    if setup.automaton.is_cosafe:
-        return success.mean, -violation.mean, -evaluation.length.mean
-    return success.mean - violation.mean, visits.mean, 0.0
-
-
 # --- results ----------------------------------------------------------------------------------
 
 
@@ -284,6 +263,8 @@ def summary(outcome: EnvironmentOutcome) -> Record:
     )
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
     status = history["status"][:, outcome.chosen]
+    # Simulated steps of a seed: the learner's count, or an upper bound.
+    made, upper = history.get("transitions"), task.learner.steps * setup.method.transitions
     return plain(
         {
             **about(task.name, task.formula, task.learner.method),
@@ -303,7 +284,7 @@ def summary(outcome: EnvironmentOutcome) -> Record:
             "evaluation": _as_numbers(evaluation),
             "training": {
                 "steps": task.learner.steps,
-                "transitions": _transitions(outcome),
+                "transitions": upper if made is None else int(made[-1, 0]),
                 "troubled_rows": int((status > Status.COMPLETED).sum()),
                 "last": last,
                 "hyperparameters": task.settings.specified(),
@@ -314,17 +295,10 @@ def summary(outcome: EnvironmentOutcome) -> Record:
                 "kept": outcome.chosen,
                 "evaluations": [_as_numbers(x) for x in outcome.evaluations],
             },
-            "drawn": _pictured(outcome) is not None,
+            "drawn": outcome.picture is not None,
             "proof": None if outcome.proof is None else proof_entry(outcome.proof),
         }
     )
-
-
-def _transitions(outcome: EnvironmentOutcome) -> int:
-    """Simulated steps of a seed: the learner's count, or an upper bound."""
-    counted = outcome.history.get("transitions")
-    upper = outcome.setup.task.learner.steps * outcome.setup.method.transitions
-    return int(counted[-1, 0]) if counted is not None else upper
 
 
 def _as_numbers(evaluation: Evaluation) -> Record:
@@ -348,33 +322,13 @@ def task_pictures(setup: EnvironmentSetup) -> list[Picture]:
 
 def sections(outcome: EnvironmentOutcome) -> list[Section]:
     """The proof, episodes and learning curves."""
-    dynamics, proof, drawn = outcome.setup.dynamics, outcome.proof, _pictured(outcome)
+    dynamics, proof, drawn = outcome.setup.dynamics, outcome.proof, outcome.picture
     parts: list[Section] = []
     if dynamics is not None and isinstance(proof, Proof):
         parts.append(proof_picture(proof, dynamics, outcome.episodes))
     parts += [] if drawn is None else [drawn]
     caption, count = "Metrics of each step of the learner", len(outcome.evaluations)
     return parts + learning_curves(outcome.history, _drawn(outcome), caption, count)
-
-
-def _pictured(outcome: EnvironmentOutcome) -> Picture | None:
-    """Some episodes, if the world has positions; drawn here, since its code is the user's."""
-    # Deferred: matplotlib.
-    from jaxltl.plot.episodes import draw_episodes
-    from jaxltl.plot.style import to_bytes
-
-    ends = [(int(np.sum(one.valid)), np.asarray(one.world.verdict)) for one in outcome.episodes]
-    titles = [f"{Verdict(int(v[t])).name.lower()} after {counted(t, 'step')}" for t, v in ends]
-    try:
-        figure = draw_episodes(outcome.setup.environment, outcome.episodes, titles=titles)
-    except ValueError:
-        return None
-    return Picture(
-        "episodes.svg",
-        "A few episodes",
-        to_bytes(figure),
-        "The first episodes of the kept policy, without selection; episode.html plays the first.",
-    )
 
 
 def save(out: Path, outcome: EnvironmentOutcome) -> None:

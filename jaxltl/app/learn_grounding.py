@@ -18,25 +18,9 @@ from jaxltl.app.files.task_irl import GroundingFile, map_file
 from jaxltl.app.files.worlds import grid_options, MappedModel
 from jaxltl.io.certificate.results import Certifiable, policy_certificate
 from jaxltl.plot.drawing import Picture, automaton_picture, drawing
-from jaxltl.app.reports.page import (
-    Report,
-    Section,
-    aligned,
-    certified,
-    number,
-    probability,
-    rounded_down,
-)
+from jaxltl.app.reports import page
 from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
-from jaxltl.core.models import (
-    project_policy,
-    project_trajectories,
-    with_allowed,
-    Product,
-    product,
-    rollout,
-    Trajectories,
-)
+from jaxltl.core import models
 from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import errors_in
@@ -65,7 +49,7 @@ class GroundingSetup:
 class GroundingAnswer:
     """Policies in a world under the most likely grounding, and the robust one."""
 
-    model: Product
+    model: models.Product
     policy: jax.Array  # float[S, Q, A], the demonstrator's, restricted to optimal actions
     attained: Solution  # its satisfaction probability
     best: Solution
@@ -147,7 +131,7 @@ def _observations(
 
 def _demonstrations(
     task: GroundingFile, worlds: list[MappedModel], seed: int
-) -> list[Trajectories]:
+) -> list[models.Trajectories]:
     """Demonstrations in each world, read or simulated with the hidden meanings."""
     table, trajectories = task.demonstrations, []
     if table.files is not None:
@@ -165,9 +149,9 @@ def _demonstrations(
         columns = [world.mdp.propositions.index(meaning[p]) for p in automaton.propositions]
         labels = np.asarray(world.mdp.label)[:, columns]
         mdp = grounding.with_labels(world.mdp, labels, automaton.propositions)
-        model = product(mdp, automaton)
+        model = models.product(mdp, automaton)
         policy = grounding.demonstrator_policy(model, table.scale, table.discount)
-        runs = rollout(
+        runs = models.rollout(
             model,
             policy,
             jax.random.fold_in(jax.random.key(seed), w),
@@ -175,7 +159,7 @@ def _demonstrations(
             num_steps=table.length or 200,
             stop=model.final if automaton.is_cosafe else None,
         )
-        trajectories.append(project_trajectories(model, runs))
+        trajectories.append(models.project_trajectories(model, runs))
     return trajectories
 
 
@@ -221,10 +205,10 @@ def _answer(
 ) -> GroundingAnswer:
     mdp, automaton = setup.worlds[w].mdp, setup.task.formula
     labels = [labels_of(setup, posterior, i, w) for i in members]
-    model = product(grounding.with_labels(mdp, labels[0], posterior.symbols), automaton)
+    model = models.product(grounding.with_labels(mdp, labels[0], posterior.symbols), automaton)
     inside = optimal_actions(model)
     policy = grounding.demonstrator_policy(
-        with_allowed(model, inside.allowed), posterior.scale[0], setup.hparams.discount
+        models.with_allowed(model, inside.allowed), posterior.scale[0], setup.hparams.discount
     )
     robust = None
     if len(labels) > 1:
@@ -246,9 +230,9 @@ def _steps(setup: GroundingSetup, row: grounding.Row) -> list[Record]:
     records, problem = [], setup.problem
     for n, t, gain in row.steps:
         w = int(problem.world[n])
-        number = n - int(np.argmax(np.asarray(problem.world) == w)) + 1
+        index = n - int(np.argmax(np.asarray(problem.world) == w)) + 1
         where = setup.worlds[w].position(int(problem.state[n, t]))
-        place = {"map": w + 1, "demonstration": number, "step": t + 1, **where}
+        place = {"map": w + 1, "demonstration": index, "step": t + 1, **where}
         records.append({**place, "action": ACTIONS[int(problem.action[n, t])], "gain": gain})
     return records
 
@@ -311,7 +295,7 @@ def save(out: Path, outcome: GroundingOutcome) -> None:
     for path in [*out.glob("policy_*.npz"), *out.glob("map_*.svg")]:
         path.unlink()
     for w, answer in enumerate(outcome.answers):
-        policy = project_policy(answer.model, answer.policy, actions=ACTIONS)
+        policy = models.project_policy(answer.model, answer.policy, actions=ACTIONS)
         bounds = {name: getattr(answer.attained, name) for name in ("lower", "upper")}
         save_policy(out / f"policy_{w + 1}.npz", policy, bounds)
 
@@ -322,11 +306,11 @@ def task_pictures(setup: GroundingSetup) -> list[Picture]:
     return [automaton_picture(automaton, "")]
 
 
-def sections(outcome: GroundingOutcome) -> list[Section]:
+def sections(outcome: GroundingOutcome) -> list[page.Section]:
     """The grounding on each map: for each symbol the posterior probability of its label."""
     setup, posterior = outcome.setup, outcome.posterior
     heavy = np.flatnonzero(posterior.weight > 1e-9).tolist()
-    drawn: list[Section] = []
+    drawn: list[page.Section] = []
     for w, world in enumerate(setup.worlds):
         weight = sum(posterior.weight[i] * labels_of(setup, posterior, i, w) for i in heavy)
         titles = [f"{row.symbol}: {row.meaning}" for row in outcome.table]
@@ -349,44 +333,38 @@ _HEADER = ("symbol", "meaning", "weight", "alternatives", "decisive steps")
 _WORLDS = ("map", "probability", "certified", "maximum", "robust policy, at least")
 
 
-def _rows(result: Result) -> list[tuple[str, ...]]:
-    return [
+def _values(result: Result) -> Record:
+    rows = [
         (
             row["symbol"],
             row["meaning"],
-            probability(row["weight"]),
-            ", ".join(f"{x} {probability(w)}" for x, w in row["alternatives"][:2]) or "none",
+            page.probability(row["weight"]),
+            ", ".join(f"{x} {page.probability(w)}" for x, w in row["alternatives"][:2]) or "none",
             "; ".join(
-                f"map {x['map']} demonstration {x['demonstration']} step {x['step']} (+{number(x['gain'])})"
+                f"map {x['map']} demonstration {x['demonstration']} step {x['step']} (+{page.number(x['gain'])})"
                 for x in row["steps"]
             )
             or "none",
         )
         for row in result["grounding"]
     ]
-
-
-def _worlds(result: Result) -> list[tuple[str, ...]]:
-    return [
+    worlds = [
         (
             str(w),
-            probability(world["attained"]["value"]),
-            certified(world["attained"]),
-            probability(world["best_achievable"]["value"]),
-            "the same" if world["robust"] is None else rounded_down(world["robust"]["worst"]),
+            page.probability(world["attained"]["value"]),
+            page.certified(world["attained"]),
+            page.probability(world["best_achievable"]["value"]),
+            "the same" if world["robust"] is None else page.rounded_down(world["robust"]["worst"]),
         )
         for w, world in enumerate(result["worlds"], start=1)
     ]
-
-
-def _values(result: Result) -> Record:
     return {
         "tables": (
-            ("Grounding", _HEADER, _rows(result)),
-            ("Satisfaction probability", _WORLDS, _worlds(result)),
+            ("Grounding", _HEADER, rows),
+            ("Satisfaction probability", _WORLDS, worlds),
         ),
-        "aligned": aligned,
+        "aligned": page.aligned,
     }
 
 
-report = Report("grounding", _values)
+report = page.Report("grounding", _values)

@@ -7,7 +7,7 @@ are compared there and in test worlds with an expert for the formula and the uni
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.algos import todirl
+from jaxltl.algos.common.demonstrations import require_cosafe
 from jaxltl.algos.common.guarantees import check_formula
 from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.algos.todirl.worlds import part_of
@@ -27,29 +28,14 @@ from jaxltl.app.files.scenes import (
     load_scenes,
 )
 from jaxltl.app.files.task_irl import TodirlFile
-from jaxltl.app.files.worlds import require_cosafe, synthetic_demonstrations
+from jaxltl.app.files.worlds import synthetic_demonstrations
 from jaxltl.app.reports import steps
-from jaxltl.app.reports.page import (
-    Report,
-    Section,
-    certified,
-    learning_curves,
-    number,
-    probability,
-)
+from jaxltl.app.reports import page
 from jaxltl.app.todirl_results import LENGTH, TodirlOutcome, TodirlSetup, summary as summary
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.automata import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models import (
-    Product,
-    Trajectories,
-    lift_memory_policy,
-    make_trajectories,
-    product,
-    project_policy,
-    stack_products,
-)
+from jaxltl.core import models
 from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution
 from jaxltl.core.validation import errors_in
@@ -59,15 +45,7 @@ from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 from jaxltl.plot.drawing import Picture, automaton_picture, drawing, short_name
-from jaxltl.plot.explorer import (
-    LONGEST_RUN,
-    START,
-    Explorer,
-    MapLayer,
-    ReportTrajectory,
-    demonstrated_runs,
-    learned_runs,
-)
+from jaxltl.plot import explorer
 
 DOUBLE, FILE = True, TodirlFile
 
@@ -79,7 +57,9 @@ def prepare(task: TodirlFile, seed: int) -> TodirlSetup:
     """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
     automaton, memory = load_automata(task)
     table = task.demonstrations
-    require_cosafe(task.path, table, automaton)
+    if table.discount is not None:
+        with errors_in(f"{task.path}: [demonstrations] "):
+            require_cosafe(automaton)
     with errors_in(f"{task.path}: [task] "):
         trivial = check_formula(automaton)
     training, others = load_scenes(task, automaton)
@@ -139,10 +119,11 @@ def _experts(
         discount = table.discount
         if discount is None:
             discount = min(task.learner.discount, _EXPERT_DISCOUNT)
-        models = stack_products([s.mdp for s in scenes], automaton, label_on=task.label_on)
-        return np.asarray(_expert(models, discount, table.rewards())), []
+        products = models.stack_products([s.mdp for s in scenes], automaton, label_on=task.label_on)
+        return np.asarray(_expert(products, discount, table.rewards())), []
     bests = [
-        optimal_satisfaction(product(s.mdp, automaton, label_on=task.label_on)) for s in scenes
+        optimal_satisfaction(models.product(s.mdp, automaton, label_on=task.label_on))
+        for s in scenes
     ]
     size = max(scene.mdp.num_states for scene in scenes)
     # Actions in padding states never matter.
@@ -177,12 +158,12 @@ def learn(setup: TodirlSetup, training: Training) -> TodirlOutcome:
 
 
 @jax.jit
-def _expert(models: Product, discount: float, rewards: Mapping[str, float]) -> jax.Array:
-    def one(model: Product) -> jax.Array:
+def _expert(products: models.Product, discount: float, rewards: Mapping[str, float]) -> jax.Array:
+    def one(model: models.Product) -> jax.Array:
         reward = temporal_gridworld.expert_reward(model, **rewards)
         return soft_value(model, reward, discount, method="value_iteration").policy
 
-    return lax.map(one, models, batch_size=_BATCH)
+    return lax.map(one, products, batch_size=_BATCH)
 
 
 def save(out: Path, outcome: TodirlOutcome) -> None:
@@ -204,7 +185,7 @@ def save(out: Path, outcome: TodirlOutcome) -> None:
         value = kept.performance["learned"].value[w, :size]
         save_policy(
             out / f"policy_{w + 1}.npz",
-            project_policy(model, policy, actions=ACTIONS),
+            models.project_policy(model, policy, actions=ACTIONS),
             {"satisfaction": value},
         )
 
@@ -244,36 +225,29 @@ _EXPERT = {
 }
 
 
-def _groups(result: Result) -> list[tuple[str, Result]]:
-    """The training worlds and, if there are any, the test worlds."""
-    return [(kind, result[kind]) for kind in ("training", "test") if result[kind]]
-
-
-def _evidence(result: Result) -> list[tuple[str, ...]]:
-    return [
+def _values(result: Result) -> Record:
+    # The training worlds and, if there are any, the test worlds.
+    groups = [(kind, result[kind]) for kind in ("training", "test") if result[kind]]
+    evidence = [
         (
             f"{kind}, {policy}",
-            probability(one["mean"]["value"]),
-            certified(one["mean"]),
-            number(one["std"]) if about["num_counted"] > 1 else "",
-            f"{probability(one['worst_world']['value'])}, {one['worst_world']['name']}",
-            probability(one["worst_start"]),
+            page.probability(one["mean"]["value"]),
+            page.certified(one["mean"]),
+            page.number(one["std"]) if about["num_counted"] > 1 else "",
+            f"{page.probability(one['worst_world']['value'])}, {one['worst_world']['name']}",
+            page.probability(one["worst_start"]),
         )
-        for kind, about in reversed(_groups(result))
+        for kind, about in reversed(groups)
         for policy in _POLICIES
         for one in [about[policy]]
     ]
-
-
-def _values(result: Result) -> Record:
-    groups = _groups(result)
 
     def mean_value(world: Result) -> float:
         value: float | None = world["mean"]["value"]
         return -1.0 if value is None else value
 
     return {
-        "evidence": _evidence(result),
+        "evidence": evidence,
         "steps": steps,
         "expert": _EXPERT[result["expert"]],
         "groups": groups,
@@ -288,7 +262,7 @@ def _values(result: Result) -> Record:
     }
 
 
-report = Report("todirl", _values)
+report = page.Report("todirl", _values)
 
 
 _PICTURES = 3  # worlds that are drawn, of each kind
@@ -313,7 +287,7 @@ def task_pictures(setup: TodirlSetup) -> list[Picture]:
     return drawings
 
 
-def sections(outcome: TodirlOutcome) -> list[Section]:
+def sections(outcome: TodirlOutcome) -> list[page.Section]:
     """Learning curves, expected steps, and policies in worlds."""
     scores = outcome.kept.learned.held_out
     caption = (
@@ -322,149 +296,108 @@ def sections(outcome: TodirlOutcome) -> list[Section]:
     )
     if not np.isnan(scores).any():
         caption += ". The parameters with the least held-out figure are kept"
-    parts = learning_curves(outcome.kept.learned.history, _FIGURES, caption, len(scores))
-    if time := summary(outcome)["training"].get("expected_steps"):
+    parts = page.learning_curves(outcome.kept.learned.history, _FIGURES, caption, len(scores))
+    if time := outcome.result["training"].get("expected_steps"):
         parts += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
-        parts += [*_draw(outcome, one), _look_into(outcome, one)]
+        parts += _world_sections(outcome, *one)
     return parts
 
 
-@dataclass(frozen=True)
-class _DrawnWorld:
-    """A world that is drawn: its index, file stem, title, and demonstrations."""
-
-    outcome: TodirlOutcome
-    w: int
-    stem: str
-    title: str
-    arrows: bool
-    demonstrations: Trajectories | None
-
-    @property
-    def scene(self) -> ObservedScene:
-        return self.outcome.setup.scenes[self.w]
-
-    @property
-    def live(self) -> str:
-        return self.stem.replace("_", "-")
-
-    @property
-    def caption(self) -> str:
-        return (
-            "One map for each memory state; lengths of arrows are the probabilities of actions"
-            f"{'' if self.policy.ndim == 3 else ' at the first step'}. The title has the mean "
-            "satisfaction probability."
-        )
-
-    @property
-    def moving(self) -> np.ndarray:
-        """``[S, Q, A]``, the policy at the first step."""
-        return self.policy if self.policy.ndim == 3 else self.policy[0]
-
-    @property
-    def policy(self) -> np.ndarray:
-        """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
-        return self.outcome.kept.policy[self.w][..., : self.scene.mdp.num_states, :, :]
-
-    @property
-    def value(self) -> np.ndarray:
-        """``[S]``: the satisfaction probability from an initial state."""
-        value = self.outcome.kept.performance["learned"].value[self.w]
-        return np.asarray(value)[: self.scene.mdp.num_states]
-
-
-def _drawn_worlds(outcome: TodirlOutcome) -> Iterator[_DrawnWorld]:
+def _drawn_worlds(outcome: TodirlOutcome) -> Iterator[tuple[int, str, str, bool]]:
+    """Number, file stem and title of the worlds that are drawn, and whether their policy is."""
     setup, mean = outcome.setup, np.asarray(outcome.kept.performance["learned"].mean)
 
-    def drawn(
-        w: int, kind: str, stem: str, arrows: bool, demonstrations: Trajectories | None
-    ) -> _DrawnWorld:
-        title = f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
-        return _DrawnWorld(outcome, w, stem, title, arrows, demonstrations)
+    def title(kind: str, w: int) -> str:
+        return f"{kind}: {setup.worlds.names[w]} ({mean[w]:.4f})"
 
-    for w, demonstrations in enumerate(setup.demands.demonstrations[:_PICTURES]):
-        yield drawn(w, "Training world", f"training_{w + 1}", True, demonstrations)
+    for w in range(min(_PICTURES, setup.worlds.num_training)):
+        yield w, f"training_{w + 1}", title("Training world", w), True
     # The test worlds of least, median and greatest satisfaction probability, each once.
     counted = setup.counted
     if order := counted[np.argsort(mean[counted], kind="stable")].tolist():
         ranks = {"best": order[-1], "median": order[len(order) // 2], "worst": order[0]}
         named = {w: rank for rank, w in ranks.items()}
         for n, (w, rank) in enumerate(reversed(named.items())):
-            yield drawn(w, f"Test world, {rank}", f"test_{n + 1}", n == 0, None)
+            yield w, f"test_{n + 1}", title(f"Test world, {rank}", w), n == 0
 
 
-def _look_into(outcome: TodirlOutcome, one: _DrawnWorld) -> Explorer:
-    setup, scene = outcome.setup, one.scene
-    names = _memory_names(setup)
-    layers = {str(q): MapLayer(name, None, one.moving[:, q]) for q, name in names.items()}
-    starts = np.asarray(scene.mdp.initial) > 0
-    layers[START] = MapLayer("initial states", np.where(starts, one.value, np.nan), None)
-    model = part_of(setup.worlds.model, one.w)
-    demonstrated = (
-        [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
-    )
+def _world_sections(
+    outcome: TodirlOutcome, w: int, stem: str, title: str, arrows: bool
+) -> list[page.Section]:
+    """A world: its policy, and trajectories of it and of the demonstrations."""
+    setup, scene, worlds = outcome.setup, outcome.setup.scenes[w], outcome.setup.worlds
+    size, live, names = scene.mdp.num_states, stem.replace("_", "-"), _memory_names(setup)
+    # float[S, Q, A], or with a horizon [T, S, Q, A]; the first step is drawn.
+    policy = outcome.kept.policy[w][..., :size, :, :]
+    moving = policy if policy.ndim == 3 else policy[0]
+    value = np.asarray(outcome.kept.performance["learned"].value[w])[:size]
     place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
-    return Explorer(
-        name=one.live,
-        title=one.title,
-        caption=one.caption,
-        size=scene.mdp.num_states,
-        automaton=setup.worlds.memory,
-        layers=layers,
-        runs=[*demonstrated, *_runs(outcome, one)],
-        place=place,
-        actions=ACTIONS,
-        label="satisfaction probability",
-        wall=setup.task.world.wall or "#",
-        goal="the formula"
-        if setup.worlds.memory is setup.worlds.automaton
-        else "the memory's formula",
+    wall, runs = setup.task.world.wall or "#", _runs(outcome, w, policy)
+    layers = {str(q): explorer.MapLayer(name, None, moving[:, q]) for q, name in names.items()}
+    at_start = np.where(np.asarray(scene.mdp.initial) > 0, value, np.nan)
+    layers[explorer.START] = explorer.MapLayer("initial states", at_start, None)
+    demonstrated = []
+    if w < worlds.num_training:
+        trajectories = setup.demands.demonstrations[w]
+        demonstrated = explorer.demonstrated_runs(part_of(worlds.model, w), trajectories)
+    caption = (
+        "One map for each memory state; lengths of arrows are the probabilities of actions"
+        f"{'' if policy.ndim == 3 else ' at the first step'}. The title has the mean "
+        "satisfaction probability."
     )
-
-
-def _draw(outcome: TodirlOutcome, one: _DrawnWorld) -> list[Picture]:
-    """Pictures of a world: its policy, and trajectories."""
-    setup, scene, caption = outcome.setup, one.scene, one.caption
-    names, moving = _memory_names(setup), one.moving
+    same = worlds.memory is worlds.automaton
+    parts: list[page.Section] = [
+        explorer.Explorer(
+            name=live,
+            title=title,
+            caption=caption,
+            size=size,
+            automaton=worlds.memory,
+            layers=layers,
+            runs=[*demonstrated, *runs],
+            place=place,
+            actions=ACTIONS,
+            label="satisfaction probability",
+            wall=wall,
+            goal="the formula" if same else "the memory's formula",
+        )
+    ]
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
     memories, titles = list(names), [short_name(name, width) for name in names.values()]
     if scene.colored is None:
-        assert scene.cells is not None
         drawn = drawing(
             "grid",
-            scene.cells,
-            np.broadcast_to(one.value, (len(memories), one.value.size)),
+            place,
+            np.broadcast_to(value, (len(memories), size)),
             moving.transpose(1, 0, 2)[memories],
             titles=titles,
             label="satisfaction probability",
-            wall=setup.task.world.wall or "#",
+            wall=wall,
         )
         caption += " Colours: the satisfaction probability from there as an initial state."
-        return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
-    drawings: list[Picture] = []
-    if one.arrows:
-        drawn = drawing(
-            "temporal_gridworld", part_of(scene.colored, ...), moving, memory=memories, title=titles
-        )
-        drawings.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
-    pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
-    if one.policy.ndim == 3 and any(pairs):
-        walks = make_trajectories(scene.mdp, [each for each in pairs if each])
-        satisfied = setup.worlds.automaton.is_cosafe  # by a finite prefix
-        end = "satisfied or violated" if satisfied else f"violated, or for {LONGEST_RUN} steps"
-        drawings.append(
+    else:
+        drawn = drawing("temporal_gridworld", place, moving, memory=memories, title=titles)
+    if arrows or scene.colored is None:
+        parts.append(Picture(f"{stem}.svg", title, drawn, caption, live))
+    pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in runs]
+    if scene.colored is not None and policy.ndim == 3 and any(pairs):
+        walks = models.make_trajectories(scene.mdp, [each for each in pairs if each])
+        end = f"violated, or for {explorer.LONGEST_RUN} steps"
+        if worlds.automaton.is_cosafe:  # by a finite prefix
+            end = "satisfied or violated"
+        parts.append(
             Picture(
-                f"{one.stem}_runs.svg",
-                f"Trajectories in {scene.name}" if one.arrows else one.title,
-                drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
+                f"{stem}_runs.svg",
+                f"Trajectories in {scene.name}" if arrows else title,
+                drawing("temporal_gridworld", place, trajectories=walks),
                 f"{len(walks.length)} trajectories of the learned policy from random initial states, "
                 f"each until the formula is {end}.",
-                one.live,
+                live,
             )
         )
-    return drawings
+    return parts
 
 
 def _memory_names(setup: TodirlSetup) -> dict[int, str]:
@@ -475,14 +408,13 @@ def _memory_names(setup: TodirlSetup) -> dict[int, str]:
     return {q: f"memory state {q}: {names[q]}" for q in undecided or [0]}
 
 
-def _runs(outcome: TodirlOutcome, one: _DrawnWorld) -> list[ReportTrajectory]:
+def _runs(outcome: TodirlOutcome, w: int, policy: np.ndarray) -> list[explorer.ReportTrajectory]:
     """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
-    worlds, policy, count = outcome.setup.worlds, one.policy, 1
+    worlds, count = outcome.setup.worlds, 1
     if worlds.memory is not worlds.automaton:
-        policy = np.asarray(lift_memory_policy(jnp.asarray(policy), worlds.automaton))
+        policy = np.asarray(models.lift_memory_policy(jnp.asarray(policy), worlds.automaton))
         count = len(worlds.automaton.delta)  # the formula's automaton state varies fastest
-    rollouts = learned_runs(part_of(worlds.task_model, one.w), policy, outcome.seed)
     return [
-        ReportTrajectory(run.name, [(s, q // count, a) for s, q, a in run.steps])
-        for run in rollouts
+        explorer.ReportTrajectory(run.name, [(s, q // count, a) for s, q, a in run.steps])
+        for run in explorer.learned_runs(part_of(worlds.task_model, w), policy, outcome.seed)
     ]

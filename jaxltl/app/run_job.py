@@ -13,11 +13,11 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, cast
 
 from jaxltl.app.command_options import RunOptions
 from jaxltl.app.compilation import float64
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaxltl.app.files.task import FormulaFile
     from jaxltl.app.processes import ProcessGroup
     from jaxltl.plot.drawing import Artist, Drawing, Picture
-    from jaxltl.app.reports.page import Part, Report, Section
+    from jaxltl.app.reports.page import Report, Section
 
 _LINE_SECONDS = 10.0  # between lines of progress in a pipe
 _JOBS = {  # the module of each kind of job, and that of its task file
@@ -43,6 +43,7 @@ _JOBS = {  # the module of each kind of job, and that of its task file
 }
 
 Drawn = Callable[[], bytes]  # waits for a picture
+Begun: TypeAlias = "tuple[Section, dict[str, Drawn]]"  # with its drawings by name
 T = TypeVar("T", bound="FormulaFile")
 S = TypeVar("S")
 O = TypeVar("O")  # noqa: E741
@@ -132,8 +133,7 @@ def learn(task_file: Path, options: RunOptions, console: Console) -> Finished | 
         )
         result = None if options.again else _finished(out, mark)
         before = group.sees(f"{out}/result.json", result is not None)
-        run = _JobRun(job, out, options, mark, console)
-        result = result or run.interruptible(task)
+        result = result or _run(job, task, options, console, out / f"checkpoint-{mark}.npz", mark)
     if not group.is_first or result is None:
         return None
     return Finished(out, result, job.report.table(result, out), before)
@@ -171,98 +171,75 @@ def _writable(out: Path) -> Iterator[None]:
         ) from None
 
 
-def claim_directory(out: Path, name: str, content: bytes, again: bool) -> None:
-    """Makes a directory of results with a copy of the file that they are of.
-
-    Raises:
-      ValueError: it cannot be written to, or it has a result of another file and `again` is False.
-    """
-    copy = make_directory(out) / name
-    done = (out / "result.json").exists()
-    if done and not again and not (copy.exists() and copy.read_bytes() == content):
-        raise ValueError(
-            f"{str(out)!r} has the result of another file, or of this one before it was changed; "
-            "choose another directory with --out, or overwrite it with --again."
-        )
-    write_files(out, [(name, content)])
-
-
 @contextlib.contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Keeps a directory for one process at a time, also if a process is killed.
+def claimed(out: Path, name: str, content: bytes, again: bool) -> Iterator[None]:
+    """Keeps a directory of results, with a copy of the file that they are of, for one process.
+
+    The lock is released also if the process is killed.
 
     Raises:
-      ValueError: another process writes into it.
+      ValueError: it cannot be written to, another process writes into it, or it has a result of
+        another file and `again` is False.
     """
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system
-        yield
-        return
-    path = make_directory(out) / ".lock"
+    copy, path = make_directory(out) / name, out / ".lock"
     with ExitStack() as held:
-        with _writable(out):
-            file = held.enter_context(path.open("w"))
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            mine = path.stat().st_ino == os.fstat(file.fileno()).st_ino
-        except (BlockingIOError, FileNotFoundError):  # locked, or removed by the process before
-            mine = False
-        if not mine:
+        with contextlib.suppress(ImportError):  # not a POSIX system
+            import fcntl
+
+            with _writable(out):
+                file = held.enter_context(path.open("w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                mine = path.stat().st_ino == os.fstat(file.fileno()).st_ino
+            except (BlockingIOError, FileNotFoundError):  # locked, or removed by the process before
+                mine = False
+            if not mine:
+                raise ValueError(
+                    f"another run writes into {str(out)!r}; wait for its end, or choose another "
+                    "directory with --out."
+                )
+            held.callback(path.unlink, missing_ok=True)
+        done = (out / "result.json").exists()
+        if done and not again and not (copy.exists() and copy.read_bytes() == content):
             raise ValueError(
-                f"another run writes into {str(out)!r}; wait for its end, or choose another "
-                "directory with --out."
+                f"{str(out)!r} has the result of another file, or of this one before it was "
+                "changed; choose another directory with --out, or overwrite it with --again."
             )
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+        write_files(out, [(name, content)])
+        yield
 
 
-@dataclass(frozen=True)
-class _JobRun(Generic[T, S, O]):
-    """A run of a job into a directory of results."""
+def _run(
+    job: Job[T, S, O], task: T, options: RunOptions, console: Console, checkpoint: Path, mark: str
+) -> Result | None:
+    """Runs a job, and returns ``result.json``; None in all processes but the first."""
+    from jaxltl.algos.common import checkpoint as files
+    from jaxltl.algos.common.seeds import Training
+    from jaxltl.app.wording import took
+    from jaxltl.io.certificate.results import write_certificates
 
-    job: Job[T, S, O]
-    out: Path
-    options: RunOptions
-    mark: str  # the job's fingerprint, which the checkpoint must have
-    console: Console
-
-    @property
-    def checkpoint(self) -> Path:
-        """File from which an interrupted job resumes."""
-        return self.out / f"checkpoint-{self.mark}.npz"
-
-    def interruptible(self, task: T) -> Result | None:
-        """The contents of ``result.json``; None in all processes but the first."""
-        try:
-            with ExitStack() as held:
-                return self._result(task, held)
-        except KeyboardInterrupt:
-            hint = "; the same command goes on from the last checkpoint"
-            self.console.say(f"interrupted{hint if self.checkpoint.exists() else ''}")
-            raise SystemExit(130) from None
-
-    def _result(self, task: T, held: ExitStack) -> Result | None:
-        from jaxltl.algos.common import checkpoint as files
-        from jaxltl.algos.common.seeds import Training
-
-        start = time.perf_counter()
-        job, group, say, options = self.job, self.console.group, self.console.say, self.options
-        with group.together():
-            setup = job.prepare(task, options.seed)
-        say(job.describe(setup))
-        if group.mesh is not None:
-            say(seed_distribution(options.num_seeds, group.num_devices))
-        with group.together():
-            self._claim(task, held)
-        if group.sees(str(self.checkpoint), self.checkpoint.exists()):
-            say(f"going on from {self.checkpoint}")
-        group.sees(str(self.out), (self.out / "task.toml").exists())
-        with _progress_bar(task.learner.steps, visible=group.is_first) as bar:
-            early = job.task_pictures(setup) if group.is_first else []
-            pictures = [(p, self._begun(p)) for p in early]
+    start, out = time.perf_counter(), checkpoint.parent
+    group, say = console.group, console.say
+    try:
+        with ExitStack() as held:
+            with group.together():
+                setup = job.prepare(task, options.seed)
+            say(job.describe(setup))
+            if group.mesh is not None:
+                say(seed_distribution(options.num_seeds, group.num_devices))
+            # Before the work, since the directory may not be writable.
+            with group.together():
+                if group.is_first:
+                    held.enter_context(
+                        claimed(out, "task.toml", task.path.read_bytes(), options.again)
+                    )
+            if group.sees(str(checkpoint), checkpoint.exists()):
+                say(f"going on from {checkpoint}")
+            group.sees(str(out), (out / "task.toml").exists())
+            bar = held.enter_context(_progress_bar(task.learner.steps, visible=group.is_first))
+            begun = begin_drawing(
+                job.task_pictures(setup) if group.is_first else [], console.artist
+            )
 
             def report(step: int, metrics: Mapping[str, np.ndarray]) -> None:
                 bar.set_description_str("learning", refresh=False)
@@ -274,60 +251,54 @@ class _JobRun(Generic[T, S, O]):
                 options.num_seeds,
                 report=report,
                 stage=bar.set_description_str,
-                checkpoint=self.checkpoint,
+                checkpoint=checkpoint,
                 mesh=group.mesh,
             )
             outcome = job.learn(setup, training)
             if not group.is_first:
                 return None
-            files.remove(self.checkpoint)
+            files.remove(checkpoint)
             seconds = time.perf_counter() - start
             bar.set_description_str("drawing")
-            return self._write(outcome, seconds, pictures)
-
-    def _claim(self, task: T, held: ExitStack) -> None:
-        """Takes the directory of results; before the work, since it may not be writable."""
-        if self.console.group.is_first:
-            held.enter_context(locked(self.out))
-            claim_directory(self.out, "task.toml", task.path.read_bytes(), self.options.again)
-
-    def _begun(self, picture: Picture) -> Drawn:
-        """Begins a picture, unless it is drawn already."""
-        drawing: Drawing | bytes = picture.drawing or b""
-        if isinstance(drawing, bytes):
-            return lambda: drawing
-        return self.console.artist(drawing)
-
-    def _write(self, outcome: O, seconds: float, pictures: list[tuple[Picture, Drawn]]) -> Result:
-        from jaxltl.app.wording import took
-        from jaxltl.io.certificate.results import write_certificates
-        from jaxltl.plot.drawing import Picture
-
-        job, begin, live = self.job, self.console.artist, []
-        for x in job.sections(outcome):
-            if isinstance(x, Picture):
-                pictures.append((x, self._begun(x)))
-            else:
-                live.append((x, {k: begin(d) for k, d in x.drawings.items()}))
-        result = {**job.summary(outcome), **took(seconds), "fingerprint": self.mark}
-        job.save(self.out, outcome)
-        # Of jobs whose result is a policy of a finite model.
-        certifiable = getattr(job, "certifiable", lambda outcome: "the result is a network")
-        result["certificates"] = write_certificates(self.out, certifiable(outcome))
-        images = [(picture, drawn()) for picture, drawn in pictures]
-        parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-        write_results(self.out / "task.toml", job.report, result, parts, images)
-        return result
+            begun += begin_drawing(job.sections(outcome), console.artist)
+            result = {**job.summary(outcome), **took(seconds), "fingerprint": mark}
+            job.save(out, outcome)
+            # Of jobs whose result is a policy of a finite model.
+            certifiable = getattr(job, "certifiable", lambda outcome: "the result is a network")
+            result["certificates"] = write_certificates(out, certifiable(outcome))
+            write_results(out / "task.toml", job.report, result, begun)
+            return result
+    except KeyboardInterrupt:
+        hint = "; the same command goes on from the last checkpoint"
+        say(f"interrupted{hint if checkpoint.exists() else ''}")
+        raise SystemExit(130) from None
 
 
-def write_results(
-    file: Path,
-    report: Report,
-    result: Result,
-    parts: Sequence[Part],
-    pictures: Sequence[tuple[Picture, bytes]],
-) -> None:
+def begin_drawing(sections: Iterable[Section], artist: Artist) -> list[Begun]:
+    """Begins the drawings of sections; those of pictures may be drawn already."""
+    from jaxltl.plot.drawing import Picture
+
+    def begin(drawing: Drawing | bytes) -> Drawn:
+        return (lambda: drawing) if isinstance(drawing, bytes) else artist(drawing)
+
+    begun: list[Begun] = []
+    for x in sections:
+        drawings = {"": x.drawing or b""} if isinstance(x, Picture) else x.drawings
+        begun.append((x, {key: begin(each) for key, each in drawings.items()}))
+    return begun
+
+
+def write_results(file: Path, report: Report, result: Result, begun: Iterable[Begun]) -> None:
     """Writes pictures, report and result beside the copy of the task or game file."""
+    from jaxltl.plot.drawing import Picture
+
+    drawn = [(x, {key: wait() for key, wait in each.items()}) for x, each in begun]
+    pictures = [(x, svg[""]) for x, svg in drawn if isinstance(x, Picture)]
+    parts = [
+        (x, {key: each.decode() for key, each in svg.items()})
+        for x, svg in drawn
+        if not isinstance(x, Picture)
+    ]
     page = report.page(result, parts, pictures, file.read_text())
     content = json.dumps(result, indent=2, allow_nan=False) + "\n"
     write_files(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,8 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.io.certificate.results import Certifiable
 from jaxltl.app.wording import Record
-from jaxltl.core.automata import Automaton
-from jaxltl.core.language.resolve import constant_value, resolve
 from jaxltl.core.language.syntax import Program
-from jaxltl.core.logic import Definitions, Property, program_definitions
-from jaxltl.core.logic.properties import parse_each
+from jaxltl.core.logic import Property
 from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.types import NotConverged, Status
@@ -35,25 +30,15 @@ from jaxltl.core.values import (
     solve_property,
 )
 from jaxltl.core.values.properties.aims import SourceModel, graph_of_model
+from jaxltl.io.prism.properties import PropertyQuery, read_queries as read_queries
 from jaxltl.io.strategies import strategy_entry
 from jaxltl.io.templates import render
 
 AnyAnswer = Answer | Achievable | ConstrainedOptimum | Pareto
 
-PROPERTY_FILES = (".props", ".prop", ".pctl")
 _PROGRESS_SECONDS = 5.0
-MAX_FILE = 2**24  # bytes of a property file
 
 SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
-
-
-@dataclass(frozen=True)
-class PropertyQuery:
-    """A property of the command or of a file."""
-
-    text: str  # as given
-    parsed: Property | None = None  # the property; None for a malformed one
-    error: str | None = None  # of parsing, or None
 
 
 @dataclass(frozen=True)
@@ -78,93 +63,6 @@ class PropertyResult:
         if self.answer is None:
             return self.fault
         return SOLVED if self.status == "CONVERGED" else NOT_CONVERGED
-
-
-def parse_queries(
-    arguments: Sequence[str], definitions: Definitions | None = None, model: Path | None = None
-) -> list[PropertyQuery]:
-    """Parses arguments: properties, or names of property files; errors are kept by property."""
-    queries = []
-    for argument in arguments:
-        place, text = "", argument
-        known = replace(
-            definitions or Definitions(), automaton=partial(_automaton, argument, model)
-        )
-        if argument.lower().endswith(PROPERTY_FILES):
-            try:
-                place, text = f"{argument}: ", _text_of(Path(argument))
-            except ValueError as error:
-                queries.append(PropertyQuery(argument, error=str(error)))
-                continue
-        for one in parse_each(text, known):
-            if isinstance(one, Property):
-                queries.append(PropertyQuery(one.text, one))
-            else:
-                queries.append(PropertyQuery(one.text, error=f"{place}{one.error}"))
-    return queries
-
-
-def _automaton(argument: str, model: Path | None, name: str) -> Automaton:
-    """The automaton of a HOA file that a property names, beside the file of properties."""
-    from jaxltl.io.hoa.hoa import read_hoa
-
-    beside = Path(argument).parent if argument.lower().endswith(PROPERTY_FILES) else Path()
-    folders = {"$PROPERTY_DIR/": beside, "$MODEL_DIR/": model.parent if model else beside}
-    for start, folder in folders.items():
-        if name.startswith(start):
-            return read_hoa(_text_of(folder / name.removeprefix(start)))
-    return read_hoa(_text_of(beside / name))
-
-
-def _text_of(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_FILE + 1)
-        if len(data) > MAX_FILE:
-            raise ValueError(f"cannot read {str(path)!r}: it has more than {MAX_FILE} bytes.")
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"cannot read {str(path)!r}: byte {error.start} is not UTF-8.") from None
-    except OSError as error:
-        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from None
-
-
-def read_queries(
-    path: Path, constants: str | None, arguments: Sequence[str], mesh: object = None
-) -> tuple[Program | None, list[PropertyQuery]]:
-    """The program, if the model file is one, and the properties; ValueError if none is well-formed."""
-    program, definitions = _read_source(path, constants, arguments)
-    if program is not None and mesh is not None:
-        raise ValueError(f"--mesh takes built models; {path} is a program.")
-    queries = parse_queries(arguments, definitions, path)
-    if all(one.parsed is None for one in queries):
-        raise ValueError("\n".join(str(one.error) for one in queries))
-    return program, queries
-
-
-def _read_source(
-    path: Path, constants: str | None, arguments: Sequence[str]
-) -> tuple[Program | None, Definitions | None]:
-    """The program of a file in the PRISM language, and the names that properties may use.
-
-    Constants that the program does not declare are those of the properties.
-    """
-    from jaxltl.io.prism.program import constants_of, is_program, read_syntax
-
-    if not is_program(path):
-        if constants is not None:
-            raise ValueError(f"--const goes with programs in the PRISM language; {path} is none.")
-        return None, None
-    values, syntax = constants_of(constants), read_syntax(path)
-    declared = {c.name for c in syntax.constants}
-    program = resolve(syntax, {k: v for k, v in values.items() if k in declared})
-    rest = {k: constant_value(k, v) for k, v in values.items() if k not in declared}
-    texts = [_text_of(Path(x)) if x.lower().endswith(PROPERTY_FILES) else x for x in arguments]
-    for name in rest:
-        if not any(re.search(rf"\bconst\b[^;=]*\b{name}\b", text) for text in texts):
-            listed = ", ".join(sorted(declared)) or "none"
-            raise ValueError(f"--const: there is no constant {name}; {path} has {listed}.")
-    return program, program_definitions(program, rest)
 
 
 def load(

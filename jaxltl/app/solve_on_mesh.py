@@ -16,7 +16,8 @@ import jaxltl
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import ProcessGroup, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import PropertyQuery, PropertyResult, answers, load
+from jaxltl.app.solve import PropertyResult, answers, load
+from jaxltl.io.prism.properties import PropertyQuery
 from jaxltl.core.logic import Formula, Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.models import POMDP, Game, IntervalMDP, MultiplayerGame, ShardedMDP, SparseMDP

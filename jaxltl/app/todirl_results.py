@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -11,9 +12,8 @@ from jaxltl.algos.todirl import TransferredReward, WorldDemands, Worlds
 from jaxltl.algos.todirl.worlds import part_of
 from jaxltl.app.files.scenes import ObservedScene
 from jaxltl.app.files.task_irl import TodirlFile
-from jaxltl.app.wording import about, plain
 from jaxltl.app.reports.steps import front_entry
-from jaxltl.app.wording import Record, enclosure
+from jaxltl.app.wording import Record, about, enclosure, plain
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
 
@@ -61,12 +61,18 @@ class TodirlOutcome:
     kept: TransferredReward
     seed: int  # the first seed
 
-
-# --- summary ---------------------------------------------------------------------------------
+    @cached_property
+    def result(self) -> Record:
+        """The result as a JSON object."""
+        return _summary(self)
 
 
 def summary(outcome: TodirlOutcome) -> Record:
-    """The result as a JSON object."""
+    """The results for ``result.json``."""
+    return outcome.result
+
+
+def _summary(outcome: TodirlOutcome) -> Record:
     setup, task, demands = outcome.setup, outcome.setup.task, outcome.setup.demands
     pairs = [int(np.sum(trajectories.length)) for trajectories in demands.demonstrations]
     result = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -35,3 +37,25 @@ def plain_kind(cells: np.ndarray) -> str:
     """The plain cell kind: ``.``, or the most frequent one."""
     names, counts = np.unique(cells, return_counts=True)
     return "." if "." in names else str(names[np.argmax(counts)])
+
+
+def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> np.ndarray:
+    """One-hot kinds of the cells around each cell, ``float[S, (2 radius + 1)^2 (K + 1)]``.
+
+    Observations of a reward network that transfers between maps.
+
+    Args:
+      cells: of :func:`parse_map`.
+      kinds: the K kinds of cells; the last column of a cell is for places off the map.
+      radius: cells around the own one.
+
+    >>> cell_observations(parse_map("a b"), ["a", "b"], 0).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
+    number = np.full(tuple(n + 2 * radius for n in cells.shape), len(kinds))
+    inside = tuple(slice(radius, radius + n) for n in cells.shape)
+    number[inside] = np.searchsorted(sorted(kinds), cells)
+    order = np.append(np.argsort(kinds), len(kinds))  # from sorted kinds to their places
+    width = 2 * radius + 1
+    around = np.lib.stride_tricks.sliding_window_view(order[number], (width, width))
+    return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)

@@ -39,6 +39,11 @@ from .policies import (
     write_c_policy as write_c_policy,
 )
 from .prism.explicit import read_prism as read_prism, write_prism as write_prism
+from .prism.properties import (
+    PropertyQuery as PropertyQuery,
+    parse_queries as parse_queries,
+    read_queries as read_queries,
+)
 from .prism.program import (
     build_model as build_model,
     program_actions as program_actions,

@@ -9,7 +9,7 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,14 @@ def write_world(world: World) -> str:
     return "\n".join([f"margin: {world.margin}", f"slip: {slip:.6g}", *kinds, "", *rows, ""])
 
 
-def read_world(text: str) -> World:
+def read_world(
+    text: str,
+    *,
+    margin: int | None = None,
+    slip: float | None = None,
+    objects: Mapping[str, Mapping[str, int]] | None = None,
+    obstacles: Mapping[str, Mapping[str, int]] | None = None,
+) -> World:
     """Coloured gridworld of the text form of :func:`write_world`.
 
     Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0) and the colours of
@@ -49,14 +56,17 @@ def read_world(text: str) -> World:
 
     Args:
       text: the text form.
+      margin, slip: instead of the settings of the text.
+      objects, obstacles: kinds of cells, of a text without kinds or with the same ones.
 
     Returns:
       A :class:`~jaxltl.envs.temporal_gridworld.World`.
 
     Raises:
-      ValueError: with the line, or the row and column of the map, for malformed text.
+      ValueError: with the line, or the row and column of the map, for malformed text, and for kinds
+        that differ from those of the text.
     """
-    margin, slip = 1, 0.0
+    own_margin, own_slip = 1, 0.0
     kinds: dict[str, dict[str, int]] = {}
     rows = []
     for i, line in enumerate(text.splitlines()):
@@ -64,17 +74,32 @@ def read_world(text: str) -> World:
         if not colon:
             rows += [name] if name else []
         elif name == "margin":
-            margin = int(_number(value, int, i, name))
+            own_margin = int(_number(value, int, i, name))
         elif name == "slip":
-            slip = _number(value, float, i, name)
+            own_slip = _number(value, float, i, name)
         elif name in kinds:
             raise ValueError(f"line {i + 1}: {name} is given twice; remove one of the lines.")
         else:
             kinds[name] = _read_counts(value, i, name)
-    objects, obstacles = (kinds, {}) if kinds else (OBJECTS, OBSTACLES)
+    requested = objects is not None or obstacles is not None
+    objects = OBJECTS if objects is None else objects
+    obstacles = OBSTACLES if obstacles is None else obstacles
+    if kinds and requested and _counts(kinds) != _counts({**objects, **obstacles}):
+        raise ValueError(
+            f"the map says {', '.join(kinds)} by lines of its own, which differ from objects and "
+            "obstacles; remove one of the two."
+        )
     return colored_world(
-        _read_rows(rows), objects=objects, obstacles=obstacles, margin=margin, slip=slip
+        _read_rows(rows),
+        objects=kinds or objects,
+        obstacles={} if kinds else obstacles,
+        margin=own_margin if margin is None else margin,
+        slip=own_slip if slip is None else slip,
     )
+
+
+def _counts(kinds: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
+    return {name: {c: n for c, n in counts.items() if n} for name, counts in kinds.items()}
 
 
 def _number(text: str, kind: type, line: int, name: str) -> float:

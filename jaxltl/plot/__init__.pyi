@@ -18,6 +18,7 @@ from .games import (
     game_moves as game_moves,
     game_region as game_region,
     game_values as game_values,
+    strategy_moves as strategy_moves,
 )
 from .live import (
     live_automaton as live_automaton,

@@ -12,6 +12,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.games.synthesis import Synthesis
 from jaxltl.plot.board import (
     DIRECTIONS,
     LOSES,
@@ -46,6 +47,7 @@ from jaxltl.plot.style import (
     write,
 )
 
+_MAX_PANELS = 6  # of a strategy's memory
 _CELLS = "The cells of a map are those of the system's robot."
 
 
@@ -204,6 +206,80 @@ def game_moves(
     marks = [*_REGION_MARKS, (INK, "allowed", "^")]
     note(figure, marks + ([(PAPER, "not allowed", "^")] if available is not None else []))
     return figure
+
+
+def strategy_moves(
+    synthesis: Synthesis,
+    board: int | str,
+    environment: int | None = None,
+    *,
+    actions: Sequence[str] = tuple(DIRECTIONS),
+    goals: Sequence[str] = (),
+    wall: str = "#",
+) -> Figure:
+    """The moves that the permissive strategy of a synthesis allows on a map, by its memory.
+
+    Args:
+      synthesis: of :func:`~jaxltl.core.games.synthesis.synthesize` for a game of two robots on the map.
+      board, actions, wall: as for :func:`game_values`.
+      environment: number of the environment's place; default: where most moves are forbidden.
+      goals: names of the guarantees, for titles.
+
+    Returns:
+      A panel for each of the automaton and memory states with most cells, at most 6.
+
+    Raises:
+      ValueError: the system has no strategy, or the game does not fit the board.
+
+    Example:
+      >>> from jaxltl.core.games.objective import safety
+      >>> from jaxltl.core.games.synthesis import synthesize
+      >>> from jaxltl.envs.robots import grid_game
+      >>> game = grid_game("...\\n...")
+      >>> len(strategy_moves(synthesize(game, safety(game, "!collision")), "...\\n...").axes)
+      1
+    """
+    nodes, strategy, restricted = synthesis.nodes, synthesis.strategy, synthesis.restricted
+    if strategy is None or restricted is None:
+        raise ValueError("synthesis has no strategy: the system wins from no initial state.")
+    game, count = synthesis.game, len(board_of(board, wall).places)
+    memory, mine = np.asarray(restricted.memory), np.asarray(restricted.model.system)
+    state = nodes.world_state[synthesis.base]
+    automaton = nodes.automaton_state[synthesis.base]
+    can, place = np.asarray(game.available), state // (2 * count)
+    if environment is None:
+        forbids = can[state].sum(-1) - np.asarray(restricted.model.available).sum(-1)
+        environment = int(np.argmax(np.bincount(place[mine], forbids[mine], minlength=count)))
+    here = mine & (place == environment)
+    pairs, size = np.unique(
+        np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True
+    )
+    panels = np.sort(np.argsort(-size, kind="stable")[:_MAX_PANELS])
+    mask = np.asarray(strategy.allowed).reshape(
+        nodes.game.num_states, -1, strategy.allowed.shape[-1]
+    )
+    region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
+    allowed = np.zeros((len(panels), game.num_states, game.num_actions), bool)
+    wins = np.zeros((len(panels), game.num_states), bool)
+    titles = []
+    for panel, (q, m) in enumerate(pairs[panels]):
+        node = np.flatnonzero((nodes.automaton_state == q) & np.asarray(nodes.game.system))
+        allowed[panel, nodes.world_state[node]] = mask[node, m, : game.num_actions]
+        wins[panel, nodes.world_state[node]] = region[node, m]
+        parts = [f"automaton in {q}"] if len(set(pairs[:, 0])) > 1 else []
+        if len(set(pairs[:, 1])) > 1:
+            parts.append(f"towards {goals[m]}" if m < len(goals) else f"memory {m}")
+        titles.append(", ".join(parts))
+    return game_moves(
+        allowed,
+        board,
+        environment,
+        region=wins,
+        available=can,
+        actions=actions,
+        titles=titles,
+        wall=wall,
+    )
 
 
 def _require_place(world: Board, number: int) -> int:

@@ -18,6 +18,7 @@ from jaxltl.app.files.task_rl import EnvironmentFile
 from jaxltl.cli import main
 from jaxltl.core.environments.task_environment import task_tables
 from jaxltl.core.values.evaluation.evaluation import evaluate
+from jaxltl.core.values.evaluation.selection import without_shaping
 from tests.app.test_report import browser  # noqa: F401
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -505,7 +506,7 @@ def test_rewards_are_shaped_where_it_changes_no_optimum(write, task, learner, sh
     np.testing.assert_allclose(np.asarray(tables.discount)[open_], discounts[0], rtol=1e-6)
     expected = discounts[1] if shaped else 1.0  # without shaping it is not used
     np.testing.assert_allclose(tables.learner_discount, expected, rtol=1e-6)
-    assert not np.any(task_tables(job._unshaped(setup.environment)).potential)
+    assert not np.any(task_tables(without_shaping(setup.environment)).potential)
 
 
 def test_rewards_of_whole_episodes_are_not_shaped(write):

@@ -237,7 +237,7 @@ def test_mistakes_in_the_task_file(write, replacement, message):
         ),
         (
             ("[world]", "[world]\nobstacles = { ob = { red = 9 } }"),
-            r"the map says o1, o2, ob by lines of its own, which differ from \[world\] objects",
+            r"the map says o1, o2, ob by lines of its own, which differ from objects",
         ),
         ((KINDS, ""), r"which kinds of cells are objects"),
         (

@@ -15,6 +15,7 @@ from jaxltl.checker import verdict
 from jaxltl.cli import main
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.io.model_files import read_model, write_model
+from jaxltl.io.prism.properties import parse_queries
 
 
 def gambler():
@@ -391,7 +392,7 @@ def test_at_most_six_files_pass_the_tolerance_on(model_file, text):
 
 @pytest.mark.parametrize("low, high", [(0.0, 1.0), (0.0, np.inf), (3.0, np.inf)])
 def test_no_number_is_given_where_the_bounds_exclude_nothing(low, high):
-    query = module.parse_queries(['Pmax=? [ F "a" ]'])[0]
+    query = parse_queries(['Pmax=? [ F "a" ]'])[0]
     bounds = (np.array([x]) for x in (0.25, low, high))
     answer = module.Answer(
         np.zeros(1, int), *bounds, None, jaxltl.Status.PRECISION, "value iteration", None

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from jaxltl.algos.common import checkpoint
 from jaxltl.app import solve_on_mesh
 from jaxltl.app.processes import ProcessGroup
-from jaxltl.app.solve import parse_queries
 from jaxltl.cli import main
 from jaxltl.core.types import Status
 from jaxltl.io.model_files import write_model
+from jaxltl.io.prism.properties import parse_queries
 from tests.several import walk
 
 PROPERTY = 'Pmax=? [ F "win" ]'

@@ -369,9 +369,11 @@ def test_a_picture_for_each_memory_of_a_strategy(tmp_path):
     (tmp_path / "game.toml").write_text(text)
     found = solve_game(GameFile.read(tmp_path / "game.toml"))
     assert found.strategy is not None and not found.strategy.maximal
-    titles = [axes.get_title(loc="left") for axes in report._moves_picture(found, None).axes]
+    goals, text = ("system_a", "system_b"), found.world.text
+    moves = plot.strategy_moves(found, text, actions=found.world.actions, goals=goals)
+    titles = [axes.get_title(loc="left") for axes in moves.axes]
     assert titles == ["towards system_a", "towards system_b"]
-    names = [picture.name for picture, _ in report.pictures(found)]
+    names = [picture.name for picture in report.pictures(found)]
     assert names == ["region.svg", "moves.svg"]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -19,9 +19,8 @@ from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import parse_ltl
 from jaxltl.core.models import Trajectories
 from jaxltl.envs import temporal_gridworld
-from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS, gridworld
-from jaxltl.envs.text_map import parse_map
+from jaxltl.envs.text_map import cell_observations, parse_map
 from jaxltl.io.colored_world import read_world
 
 
@@ -81,48 +80,14 @@ def _read_scene(
             if isinstance(entry, str) and file is None
             else read_map(task.path, {"file": str(file)})
         )
-        make = _colored_scene if task.is_colored else _plain_scene
-        return make(name, text, task.world, task.learner.radius)
-
-
-def _colored_scene(name: str, text: str, world: ScenesTable, radius: int) -> ObservedScene:
-    colored = read_world(_with_settings(text, world))
-    if _gives_kinds(world):
-        own = {
-            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n}
-            for kind, row in colored.kinds
-        }
-        counts = {**_objects(world), **_obstacles(world)}
-        if own != {k: {c: n for c, n in row.items() if n} for k, row in counts.items()}:
-            raise ValueError(
-                f"the map says {', '.join(own)} by lines of its own, which differ from [world] "
-                "objects and obstacles; remove one of the two."
-            )
-    return _of_world(name, colored, radius)
-
-
-def _with_settings(text: str, world: ScenesTable) -> str:
-    """The text of a coloured world, followed by the settings of the task file that it lacks."""
-    own = {line.partition(":")[0].strip() for line in text.splitlines() if ":" in line}
-    values = world.specified()
-    lines = [f"{key}: {values[key]}" for key in ("margin", "slip") if key in values]
-    if _gives_kinds(world) and own <= {"margin", "slip"}:
-        for name, counts in {**_objects(world), **_obstacles(world)}.items():
-            listed = ", ".join(f"{n} {color}" for color, n in counts.items())
-            lines.append(f"{name}: {listed}")
-    return "\n".join([text, *lines])
-
-
-def _gives_kinds(world: ScenesTable) -> bool:
-    return world.objects is not None or world.obstacles is not None
-
-
-def _objects(world: ScenesTable) -> Mapping[str, Mapping[str, int]]:
-    return temporal_gridworld.OBJECTS if world.objects is None else world.objects
-
-
-def _obstacles(world: ScenesTable) -> Mapping[str, Mapping[str, int]]:
-    return temporal_gridworld.OBSTACLES if world.obstacles is None else world.obstacles
+        world, radius = task.world, task.learner.radius
+        if task.is_colored:
+            names = ("margin", "slip", "objects", "obstacles")
+            settings = {k: v for k, v in world.specified().items() if k in names}
+            return _of_world(name, read_world(text, **settings), radius)
+        cells, mdp = parse_map(text), gridworld(text, **grid_options(world))
+        seen = jnp.asarray(cell_observations(cells, cell_kinds(world), radius), mdp.dtype)
+        return ObservedScene(mdp=mdp, cells=cells, name=name, observation=seen)
 
 
 def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> ObservedScene:
@@ -135,28 +100,10 @@ def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> Observ
     return ObservedScene(mdp=world.mdp, cells=None, name=name, observation=seen, colored=world)
 
 
-def _plain_scene(name: str, text: str, world: ScenesTable, radius: int) -> ObservedScene:
-    cells = parse_map(text)
-    mdp = gridworld(text, **grid_options(world))
-    seen = cell_observations(cells, cell_kinds(world), radius)
-    return ObservedScene(mdp=mdp, cells=cells, name=name, observation=jnp.asarray(seen, mdp.dtype))
-
-
 def cell_kinds(world: ScenesTable) -> list[str]:
     """The kinds of cells of maps with a legend, in the order of observations."""
     wall = world.wall or "#"
     return [*(kind for kind in world.legend or () if kind != wall), wall]
-
-
-def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> np.ndarray:
-    """One-hot kinds around each cell, ``[S, (2 radius + 1)^2 (K + 1)]``; the last is off the map."""
-    number = np.full(tuple(n + 2 * radius for n in cells.shape), len(kinds))
-    inside = tuple(slice(radius, radius + n) for n in cells.shape)
-    number[inside] = np.searchsorted(sorted(kinds), cells)
-    order = np.append(np.argsort(kinds), len(kinds))  # from sorted kinds to their places
-    width = 2 * radius + 1
-    around = np.lib.stride_tricks.sliding_window_view(order[number], (width, width))
-    return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)
 
 
 def _generate(
@@ -164,7 +111,9 @@ def _generate(
 ) -> list[ObservedScene]:
     table, colored = task.test, first.colored
     assert table is not None and colored is not None
-    objects, obstacles = _objects(task.world), _obstacles(task.world)
+    world = task.world
+    objects = temporal_gridworld.OBJECTS if world.objects is None else world.objects
+    obstacles = temporal_gridworld.OBSTACLES if world.obstacles is None else world.obstacles
     kinds = [name for name, _ in colored.kinds]
     if kinds != [*objects, *obstacles]:
         raise ValueError(

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import SolvedGame, task_text
 from jaxltl.app.wording import plain, took
-from jaxltl.app.run_job import write_results
+from jaxltl.app.run_job import begin_drawing, write_results
 from jaxltl.io.certificate.results import Certifiable, formula_question, write_certificates
 from jaxltl.plot.drawing import Picture, draw
 from jaxltl.plot.explorer import Explorer, ReportTrajectory
-from jaxltl.app.reports.page import Report, aligned, number
+from jaxltl.app.reports.page import Report, Section, aligned, number
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.games import GR1, Permissive, Winning
-from jaxltl.core.games.synthesis import EnvironmentPlay
+from jaxltl.core.games.synthesis import EnvironmentPlay, strategy_play
 from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
 from jaxltl.core.models.game import Game, is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.policies.policy_file import save_policy, write_policy_file
 from jaxltl.envs.text_map import parse_map
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 # --- results --------------------------------------------------------------------------------
@@ -39,7 +36,22 @@ def summary(synthesis: SolvedGame, seconds: float) -> Record:
     wins, starts = synthesis.wins, synthesis.starts
     won = int(wins[starts].sum())
     outcome = "realizable" if won == starts.size else "partly realizable" if won else "unrealizable"
-    automaton = synthesis.nodes.automaton
+    automaton, about = synthesis.nodes.automaton, None
+    strategy, verdict = synthesis.strategy, synthesis.strategy_verdict
+    if strategy is not None and synthesis.restricted is not None and verdict is not None:
+        game, memory = synthesis.restricted.model, strategy.game.state_shape
+        system, available = np.asarray(game.system), np.asarray(game.available)
+        about = {
+            "maximal": strategy.maximal,
+            "reason": strategy.reason,
+            "num_memory": memory[1] if len(memory) > 1 else 1,
+            "num_states": game.num_states,
+            "num_system_states": int(system.sum()),
+            "num_moves": int(available.sum()),
+            "num_system_moves": int(available[system].sum()),
+            "confirmed": verdict.system,
+            "refuted_by": verdict.reason,
+        }
     result = {
         "game": file.name,
         "task": task_text(file.task),
@@ -55,7 +67,7 @@ def summary(synthesis: SolvedGame, seconds: float) -> Record:
             "lost_initial_states": [world.position(s) for s in synthesis.lost_starts[:100]],
         },
         "verdict": synthesis.verdict._asdict(),
-        "strategy": _about_strategy(synthesis),
+        "strategy": about,
         "expected_moves": synthesis.moves
         and dict(zip(("drawn", "any"), synthesis.moves, strict=True)),
         "play": synthesis.play
@@ -73,29 +85,6 @@ def summary(synthesis: SolvedGame, seconds: float) -> Record:
         **took(seconds),
     }
     return dict(plain(result))
-
-
-def _about_strategy(synthesis: SolvedGame) -> Record | None:
-    if (
-        synthesis.strategy is None
-        or synthesis.restricted is None
-        or synthesis.strategy_verdict is None
-    ):
-        return None
-    game = synthesis.restricted.model
-    system, available = np.asarray(game.system), np.asarray(game.available)
-    memory = synthesis.strategy.game.state_shape
-    return {
-        "maximal": synthesis.strategy.maximal,
-        "reason": synthesis.strategy.reason,
-        "num_memory": memory[1] if len(memory) > 1 else 1,
-        "num_states": game.num_states,
-        "num_system_states": int(system.sum()),
-        "num_moves": int(available.sum()),
-        "num_system_moves": int(available[system].sum()),
-        "confirmed": synthesis.strategy_verdict.system,
-        "refuted_by": synthesis.strategy_verdict.reason,
-    }
 
 
 def is_confirmed(result: Result) -> bool:
@@ -153,26 +142,21 @@ def describe_play(synthesis: SolvedGame) -> list[str]:
 
 
 def _ending(play: EnvironmentPlay, synthesis: SolvedGame) -> str:
-    last = len(play.steps) - 1
+    last, objective = len(play.steps) - 1, synthesis.winning.objective
     if play.failed:
         chance = ", after random moves against the system" if play.by_chance else ""
         return f"the objective is violated in step {last}{chance}"
     round_ = f"steps {play.repeats_from} to {last} repeat"
     if play.by_chance:
         return f"{round_} as long as random moves are against the system"
-    return f"{round_} for ever, and {_missed(play, synthesis) or 'violate the objective'}"
-
-
-def _missed(play: EnvironmentPlay, synthesis: SolvedGame) -> str:
-    """The guarantees that a repeated part of a play never satisfies."""
-    objective = synthesis.winning.objective
-    guarantees = synthesis.file.task.guarantees or ()
-    if not isinstance(objective, GR1):
-        return ""
-    loop = [step.node for step in play.steps[play.repeats_from :]]
-    met = [bool(np.asarray(row)[loop].any()) for row in objective.guarantees]
-    never = [g for g, m in zip(guarantees, met, strict=True) if not m]
-    return f"never satisfy {' nor '.join(never)}" if never else ""
+    never = []
+    if isinstance(objective, GR1):
+        loop = [step.node for step in play.steps[play.repeats_from :]]
+        met = [bool(np.asarray(row)[loop].any()) for row in objective.guarantees]
+        guarantees = synthesis.file.task.guarantees or ()
+        never = [g for g, m in zip(guarantees, met, strict=True) if not m]
+    missed = f"never satisfy {' nor '.join(never)}" if never else "violate the objective"
+    return f"{round_} for ever, and {missed}"
 
 
 # --- files ----------------------------------------------------------------------------------
@@ -257,10 +241,9 @@ FILES = (
     "report.html",
 )
 MAX_MAPS = 36  # of the environment's places
-MAX_PANELS = 6  # of a strategy's memory
 
 
-def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[tuple[Picture, bytes]]:
+def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[Picture]:
     """Pictures: the automaton, and maps if the game has one."""
     # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
@@ -286,8 +269,16 @@ def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[tupl
                 "any choice among them."
             )
             picture = Picture("moves.svg", "Permissive strategy", None, caption)
-            figures.append((picture, _moves_picture(synthesis, environment)))
-    return [(picture, plot.to_bytes(figure)) for picture, figure in figures]
+            moves = plot.strategy_moves(
+                synthesis,
+                world.text,
+                environment,
+                actions=world.actions,
+                goals=synthesis.file.task.guarantees or (),
+                wall=world.wall,
+            )
+            figures.append((picture, moves))
+    return [replace(picture, drawing=plot.to_bytes(figure)) for picture, figure in figures]
 
 
 def place_of(synthesis: SolvedGame, cell: tuple[int, int] | None) -> int | None:
@@ -307,59 +298,6 @@ def place_of(synthesis: SolvedGame, cell: tuple[int, int] | None) -> int | None:
     return int(here[0])
 
 
-def _moves_picture(synthesis: SolvedGame, environment: int | None) -> Figure:
-    from jaxltl import plot
-
-    world, nodes = synthesis.world, synthesis.nodes
-    strategy, restricted = synthesis.strategy, synthesis.restricted
-    assert strategy is not None and restricted is not None and world.places is not None
-    count, memory = len(world.places), np.asarray(restricted.memory)
-    state, automaton = nodes.world_state[synthesis.base], nodes.automaton_state[synthesis.base]
-    mine = np.asarray(restricted.model.system)
-    can = np.asarray(world.game.available)
-    place = state // (2 * count)
-    if environment is None:
-        forbids = can[state].sum(-1) - np.asarray(restricted.model.available).sum(-1)
-        environment = int(np.argmax(np.bincount(place[mine], forbids[mine], minlength=count)))
-    here = mine & (place == environment)
-    pairs, size = np.unique(
-        np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True
-    )
-    panels = np.sort(np.argsort(-size, kind="stable")[:MAX_PANELS])
-    size_a = world.game.num_actions
-    mask = np.asarray(strategy.allowed).reshape(
-        nodes.game.num_states, -1, strategy.allowed.shape[-1]
-    )
-    region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
-    allowed = np.zeros((len(panels), world.game.num_states, size_a), bool)
-    wins = np.zeros((len(panels), world.game.num_states), bool)
-    for panel, (q, m) in enumerate(pairs[panels]):
-        node = np.flatnonzero((nodes.automaton_state == q) & np.asarray(nodes.game.system))
-        allowed[panel, nodes.world_state[node]] = mask[node, m, :size_a]
-        wins[panel, nodes.world_state[node]] = region[node, m]
-    return plot.game_moves(
-        allowed,
-        world.text or "",
-        environment,
-        region=wins,
-        available=can,
-        actions=world.actions,
-        titles=[_title(synthesis, int(q), int(m), pairs) for q, m in pairs[panels]],
-        wall=world.wall,
-    )
-
-
-def _title(synthesis: SolvedGame, q: int, m: int, pairs: np.ndarray) -> str:
-    """Title of a panel: its automaton state and memory state."""
-    parts = []
-    if len(set(pairs[:, 0])) > 1:
-        parts.append(f"automaton in {q}")
-    if len(set(pairs[:, 1])) > 1:
-        goals = synthesis.file.task.guarantees or ()
-        parts.append(f"towards {goals[m]}" if m < len(goals) else f"memory {m}")
-    return ", ".join(parts)
-
-
 # --- the page --------------------------------------------------------------------------------
 
 
@@ -372,14 +310,13 @@ def write(synthesis: SolvedGame, out: Path, place: int | None, seconds: float) -
     for stale in ("result.json", *FILES):
         (out / stale).unlink(missing_ok=True)
     save(out, synthesis)
-    drawings = pictures(synthesis, place)
-    part = play_explorer(synthesis)
-    parts = [(part, {key: draw(each).decode() for key, each in part.drawings.items()})]
+    sections: list[Section] = [*pictures(synthesis, place), play_explorer(synthesis)]
     result = {
         **summary(synthesis, seconds),
         "certificates": write_certificates(out, _certifiable(synthesis)),
     }
-    write_results(out / "game.toml", report_of(synthesis), result, parts, drawings)
+    begun = begin_drawing(sections, lambda drawing: lambda: draw(drawing))
+    write_results(out / "game.toml", report_of(synthesis), result, begun)
     return result
 
 
@@ -395,14 +332,29 @@ def _certifiable(synthesis: SolvedGame) -> list[Certifiable] | str:
 
 def play_explorer(synthesis: SolvedGame) -> Explorer:
     """Plays on the map: one of the strategy, and one that the environment wins."""
-    world, nodes = synthesis.world, synthesis.nodes
-    runs = []
+    world, nodes, runs = synthesis.world, synthesis.nodes, []
+
+    def steps_of(
+        met: Iterable[int], moves: Iterable[int | None]
+    ) -> list[tuple[int, int, int | None]]:
+        return [
+            (int(nodes.world_state[node]), int(nodes.automaton_state[node]), move)
+            for node, move in zip(met, moves, strict=True)
+        ]
+
     if synthesis.strategy is not None and synthesis.restricted is not None:
-        runs.append(ReportTrajectory("the system follows its strategy", _strategy_play(synthesis)))
+        met, drawn = zip(*strategy_play(synthesis, _PLAY_STEPS), strict=True)
+        runs.append(ReportTrajectory("the system follows its strategy", steps_of(met, drawn)))
     if synthesis.play is not None:
-        runs.append(
-            ReportTrajectory("the environment wins", _counter_play(synthesis, synthesis.play))
-        )
+        every = synthesis.play.steps
+        moves = [
+            None  # of chance
+            if step.mover == "chance"
+            else _PLAYERS.index(step.mover) * len(world.actions) + world.actions.index(step.action)
+            for step in every[1:]
+        ]
+        steps = steps_of((step.node for step in every), [*moves, None])
+        runs.append(ReportTrajectory("the environment wins", steps))
     visited = {state for run in runs for state, _, _ in run.steps}
     place, cells, caption = None, {}, "Step by step."
     if world.text is not None and world.places is not None:
@@ -427,40 +379,3 @@ def play_explorer(synthesis: SolvedGame) -> Explorer:
         cells=cells,
         places={state: world.describe(state) for state in visited},
     )
-
-
-def _counter_play(
-    synthesis: SolvedGame, play: EnvironmentPlay
-) -> list[tuple[int, int, int | None]]:
-    """The play that the environment wins; chance has no action."""
-    nodes, actions = synthesis.nodes, synthesis.world.actions
-    moves: list[int | None] = [
-        None
-        if step.mover == "chance"
-        else _PLAYERS.index(step.mover) * len(actions) + actions.index(step.action)
-        for step in play.steps[1:]
-    ]
-    return [
-        (int(nodes.world_state[step.node]), int(nodes.automaton_state[step.node]), move)
-        for step, move in zip(play.steps, [*moves, None], strict=True)
-    ]
-
-
-def _strategy_play(synthesis: SolvedGame) -> list[tuple[int, int, int | None]]:
-    """A play with random moves among those that the strategy allows."""
-    assert synthesis.restricted is not None
-    game, nodes, rng = synthesis.restricted.model, synthesis.nodes, np.random.default_rng(0)
-    base, count = synthesis.base, len(synthesis.world.actions)
-    successor, chance = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability, float)
-    allowed, system = np.asarray(game.available), np.asarray(game.system)
-    initial = np.asarray(game.initial, float)
-    here = int(rng.choice(len(initial), p=initial / initial.sum()))
-    steps: list[tuple[int, int, int | None]] = []
-    for _ in range(_PLAY_STEPS):
-        action = int(rng.choice(np.flatnonzero(allowed[here])))
-        move = None if action >= count else action + count * (not system[here])
-        node = base[here]
-        steps.append((int(nodes.world_state[node]), int(nodes.automaton_state[node]), move))
-        likely = chance[here, action]
-        here = int(rng.choice(successor[here, action], p=likely / likely.sum()))
-    return steps

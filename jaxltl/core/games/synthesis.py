@@ -280,3 +280,34 @@ def lost_play(
     return EnvironmentPlay(
         steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
     )
+
+
+def strategy_play(
+    synthesis: Synthesis, num_steps: int, seed: int = 0
+) -> list[tuple[int, int | None]]:
+    """Play with random moves among those that the permissive strategy of the system allows.
+
+    Args:
+      synthesis: of :func:`synthesize`, with a strategy.
+      num_steps: number of moves.
+      seed: of the random moves.
+
+    Returns:
+      Nodes and moves; those of the environment have the numbers of its actions plus the number of
+      actions, and random moves are None.
+    """
+    assert synthesis.restricted is not None
+    game, rng, base = synthesis.restricted.model, np.random.default_rng(seed), synthesis.base
+    count = synthesis.game.num_actions
+    successor, chance = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability, float)
+    allowed, system = np.asarray(game.available), np.asarray(game.system)
+    initial = np.asarray(game.initial, float)
+    here = int(rng.choice(len(initial), p=initial / initial.sum()))
+    steps: list[tuple[int, int | None]] = []
+    for _ in range(num_steps):
+        action = int(rng.choice(np.flatnonzero(allowed[here])))
+        move = None if action >= count else action + count * (not system[here])
+        steps.append((int(base[here]), move))
+        likely = chance[here, action]
+        here = int(rng.choice(successor[here, action], p=likely / likely.sum()))
+    return steps

@@ -28,6 +28,7 @@ from .evaluation.optimality_gap import (
     optimality_gap as optimality_gap,
     tabulate_policy as tabulate_policy,
 )
+from .evaluation.selection import select_agent as select_agent
 from .interval.robust import robust_expectation as robust_expectation
 from .interval.sensitivity import (
     Sensitivity as Sensitivity,

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.app.solve import load, parse_queries, read_queries
+from jaxltl.app.solve import load
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.comparisons import Definitions, program_definitions
 from jaxltl.core.logic.properties import parse_properties
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.io.hoa.hoa import read_hoa, write_hoa
+from jaxltl.io.prism.properties import parse_queries, read_queries
 
 SOURCES = {
     "trap": """mdp module m s : [0..2]; [a] s=0 -> (s'=1); [b] s=0 -> 0.5:(s'=1) + 0.5:(s'=2);
