@@ -125,7 +125,10 @@ if "xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
 
 @pytest.hookimpl(tryfirst=True)  # before markers choose
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """All cases after the first n of ``few(n)`` are slow; of those that are exhaustive, none is."""
+    """After the first n cases of ``few(n, m)``, m are slow and the rest exhaustive; all, without m.
+
+    Of cases that are exhaustive, none is slow.
+    """
     seen: collections.Counter[str] = collections.Counter()
     for item in items:
         if item.get_closest_marker("exhaustive"):
@@ -133,7 +136,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         elif few := item.get_closest_marker("few"):
             function = item.nodeid.partition("[")[0]
             seen[function] += 1
-            if seen[function] > few.args[0]:
+            if seen[function] > sum(few.args) and len(few.args) > 1:
+                item.own_markers = [mark for mark in item.own_markers if mark.name != "slow"]
+                item.add_marker(pytest.mark.exhaustive)
+            elif seen[function] > few.args[0]:
                 item.add_marker(pytest.mark.slow)
 
 

@@ -21,9 +21,11 @@ from tests import reference
 REPRESENTATIONS = ("sparse", "dense", "product")
 
 
-def counts(few: int, many: int) -> pytest.MarkDecorator:
+def counts(few: int, many: int, *, slow: int | None = None) -> pytest.MarkDecorator:
     """A law of random cases, given as ``count``: few by default, many with the exhaustive ones."""
-    return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.exhaustive)])
+    some = [] if slow is None else [pytest.param(slow, marks=pytest.mark.slow)]
+    whole = pytest.param(many, marks=pytest.mark.exhaustive)
+    return pytest.mark.parametrize("count", [few, *some, whole])
 
 
 def seeds(few: int, slow: int, many: int) -> list[Any]:

@@ -234,9 +234,10 @@ def test_certificates_of_random_models(kind, tmp_path):
     assert written >= 7 and refused > 5, reasons
 
 
-@pytest.mark.slow
+@pytest.mark.few(0, len(KINDS))
+@pytest.mark.parametrize("count", [100, 500])
 @pytest.mark.parametrize("kind", KINDS)
-def test_certificates_of_many_random_models(kind, tmp_path):
-    written, accepted, refused, reasons = run(kind, 1, 500, 1, tmp_path)
+def test_certificates_of_many_random_models(kind, count, tmp_path):
+    written, accepted, refused, reasons = run(kind, 1, count, 1, tmp_path)
     print(kind, written, accepted, refused, reasons[:9])
-    assert written >= 490 and refused > 100, reasons
+    assert written >= 0.98 * count and refused > 0.2 * count, reasons

@@ -167,7 +167,7 @@ GAINS = {
 @pytest.mark.parametrize(
     ("name", "noise"),
     [
-        pytest.param(name, noise, marks=[] if i % 2 == j and i < 5 else pytest.mark.slow)
+        pytest.param(name, noise, marks=[] if i % 2 == j and i < 3 else pytest.mark.slow)
         for i, name in enumerate(GAINS)
         for j, noise in enumerate((uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)))
     ],
@@ -397,16 +397,21 @@ def leaving_cases():
 RARE = (pytest.mark.slow, pytest.mark.exhaustive, pytest.mark.exhaustive)
 
 
+FEW = (7, 12, 14)  # by default a third of the tasks each
+
+
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case, marks=[] if i in (7, 12, 14) else RARE[i % 3])
+        pytest.param(case, marks=[] if i in FEW else RARE[i % 3])
         for i, case in enumerate(leaving_cases())
     ],
     ids=str,
 )
 def test_leaving_the_domain_means_what_outside_says(case):
-    assert check_leaving(case, TASKS) > 0.4
+    number = list(leaving_cases()).index(case)
+    tasks = TASKS[FEW.index(number) :: len(FEW)] if number in FEW else TASKS
+    assert check_leaving(case, tasks) > 0.4
 
 
 @pytest.mark.parametrize("seed", seeds(0, 3, 24))

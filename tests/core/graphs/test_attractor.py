@@ -9,7 +9,7 @@ from jaxltl.core.sparse.graph import attractor as host_attract
 from tests import reference
 from tests.support import as_mdp, random_representation
 
-NUM_MODELS = 1000
+NUM_MODELS = 300
 
 
 def random_case(rng):

@@ -136,7 +136,7 @@ def with_garbage(model, rng, *, wild):
     return jax.tree.map(jax.device_put, world if lazy is None else model.replace(mdp=world))
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(1, 1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_host_and_the_traced_sweeps_are_one(kind):
     """On every question, and whatever unavailable actions and padding hold."""

@@ -92,6 +92,7 @@ def test_what_no_numbers_make_right_is_raised_at_once(model, ask, match):
         jax.jit(ask)(model)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("text", ["a & !b", "a xor init"])
 def test_formulas_of_labels_are_read_inside_jit(text):
     world = WORLD.replace(label=jnp.array([[0, 1], [1, 0], [1, 1]], bool), propositions=("a", "b"))

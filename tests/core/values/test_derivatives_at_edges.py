@@ -322,7 +322,7 @@ OTHERS = ["dense", "max", "min", "sweeps", "reward_max", "reward_min"]
     ("kind", "count"),
     [
         ("policy", 30),
-        *(pytest.param(kind, 30, marks=pytest.mark.slow) for kind in ("reward", *OTHERS)),
+        *(pytest.param(kind, 30, marks=pytest.mark.slow) for kind in ("reward", *OTHERS[1:3])),
         *(pytest.param(kind, 100, marks=pytest.mark.exhaustive) for kind in OTHERS),
         *(pytest.param(kind, 400, marks=pytest.mark.exhaustive) for kind in ("policy", "reward")),
     ],
@@ -332,9 +332,14 @@ def test_derivatives_are_those_of_the_exact_value(kind, count):
     check(kind, count, seed=len(kind))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("acceptance", ["cosafe", "safety"])
-@pytest.mark.parametrize("kind", ["policy", "optimum", "blocks"])
+@pytest.mark.few(0, 3)
+@pytest.mark.parametrize(
+    ("kind", "acceptance"),
+    [
+        *(("policy", "cosafe"), ("optimum", "safety"), ("blocks", "cosafe")),
+        *(("policy", "safety"), ("optimum", "cosafe"), ("blocks", "safety")),
+    ],
+)
 def test_derivatives_of_satisfaction_probabilities(kind, acceptance):
     def solve(model, x, target):
         if kind == "optimum":
@@ -373,7 +378,7 @@ def test_derivatives_of_satisfaction_probabilities(kind, acceptance):
         done += 1
 
 
-@pytest.mark.slow
+@pytest.mark.few(0, 1)
 @pytest.mark.parametrize("earns", [False, True])
 def test_derivatives_of_prepared_policies(earns):
     """One graph and many policies, which leave out choices."""

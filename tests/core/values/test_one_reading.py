@@ -199,6 +199,7 @@ ALSO = [
 ]
 
 
+@pytest.mark.few(12, 4)
 @pytest.mark.parametrize("question", QUESTIONS)
 @pytest.mark.parametrize(
     ("case", "seed", "stay"),

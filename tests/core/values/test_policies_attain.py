@@ -17,7 +17,7 @@ ASKS = {
 }
 
 
-@pytest.mark.parametrize("seed", seeds(1, 4, 20))
+@pytest.mark.parametrize("seed", seeds(1, 2, 20))
 @pytest.mark.parametrize("kind", HOST, ids=lambda kind: "-".join(map(str, kind)))
 def test_policies_attain_the_optimum(kind, seed):
     rng = np.random.default_rng([seed, KINDS.index(kind)])

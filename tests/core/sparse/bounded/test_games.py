@@ -104,7 +104,7 @@ def test_choices_of_all_steps_attain_the_value_of_a_game(seed):
         assert best(image[host.state == s]) == pytest.approx(found.value[s], abs=1e-14)
 
 
-@pytest.mark.few(8)
+@pytest.mark.few(4, 6)
 @pytest.mark.parametrize("base", ["sparse", "rows"])
 @pytest.mark.parametrize("seed", range(12))
 def test_bounds_of_remaining_steps_enclose_all_backups(seed, base, monkeypatch):

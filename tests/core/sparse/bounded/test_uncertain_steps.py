@@ -164,7 +164,7 @@ def test_many_steps_are_as_few_that_changed_something():
     assert ((found.error >= 0) & (found.error <= 1)).all()
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(1, 1)
 @pytest.mark.parametrize("maximize, helpful", [(0, 0), (1, 1), (0, 1), (1, 0)])
 def test_a_huge_number_of_steps_is_answered_by_the_limit(maximize, helpful):
     # State 0 leaves with probability 2e-7 at most, to a coin between the target and a sink.
@@ -198,7 +198,7 @@ def test_average_growth_bounds_a_huge_reward():
         assert (found.error <= 1e-2 * found.value).all() and found.num_steps < 10**5
 
 
-@pytest.mark.few(8)
+@pytest.mark.few(5, 5)
 @pytest.mark.parametrize("seed", range(24))
 def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
     rng = np.random.default_rng(seed)

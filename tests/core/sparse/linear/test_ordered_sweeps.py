@@ -147,7 +147,7 @@ def test_bounds_are_narrow_without_any_one_method(disabled, monkeypatch):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
-    "size, battery", [(12, 24), (10, 35), pytest.param(20, 60, marks=pytest.mark.slow)]
+    "size, battery", [(12, 24), (10, 35), pytest.param(20, 60, marks=pytest.mark.exhaustive)]
 )
 def test_a_battery_that_is_charged_again_and_again(size, battery):
     """A policy that waits near the charger lasts for 1e15 steps and more."""

@@ -83,7 +83,7 @@ def check(model, target, objective, monkeypatch, tolerance):
     return True
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1, 1)
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("objective", ["max", "min"])
 @pytest.mark.parametrize("count", [20, pytest.param(5000, marks=pytest.mark.exhaustive)])

@@ -201,21 +201,21 @@ def attained(found, values, *, maximize):
 @pytest.mark.parametrize("maximize", [True, False])
 def test_probabilities(maximize):
     hard = 0
-    for _, host, target, stay in cases(36):
+    for _, host, target, stay in cases(18):
         found = reachability(host, target, maximize=maximize, stay=stay)
         best = best_of(probabilities(host, target, stay), maximize=maximize)
         encloses(found, best, maximize=maximize)
         assert worst_width(found, relative=False) <= 1e-6
         attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
         hard += any(0 < x < 1 for x in best)
-    assert hard >= 5
+    assert hard >= 3
 
 
 @pytest.mark.parametrize("maximize", [True, False])
 def test_small_probabilities_to_a_relative_width(way, maximize):
     """Among them episodes that are all but endless; products from 1e-300 to 1."""
     small = 0
-    for rng, host, target, stay in cases(50, seed=2, most_choices=2):
+    for rng, host, target, stay in cases(20, seed=3, most_choices=2):
         stay[rng.integers(host.num_states, size=2)] = False
         scale = rng.choice([0, 8, 40, 80, 250], host.num_transitions, p=[0.3, 0.2, 0.2, 0.2, 0.1])
         weight, first = np.ldexp(host.probability, -scale), host.entry_start[:-1]
@@ -242,7 +242,7 @@ def test_small_probabilities_to_a_relative_width(way, maximize):
 @pytest.mark.parametrize("maximize", [True, False])
 def test_total_rewards(maximize):
     hard = 0
-    for rng, host, target, _ in cases(30, seed=1):
+    for rng, host, target, _ in cases(15, seed=1):
         target[-1] = True  # so that more of it is finite
         cost = rng.integers(0, 4, host.num_rows) * (rng.random(host.num_rows) < 0.7) / 4
         found = total_reward(host, cost, target, maximize=maximize)
@@ -277,6 +277,7 @@ def tug(length, chance):
     return make_sparse(row_start, entry_start, successor, probability).host
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("length", [4, 20, 40, 120])
 def test_runs_that_hardly_ever_end(length):
     """The probability is the chance, whatever the length; runs take 2^length steps."""

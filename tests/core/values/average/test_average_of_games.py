@@ -129,7 +129,7 @@ def test_bounds_enclose_the_value_of_random_games(seed):
         ask(rng, int(rng.integers(1, 4)), has_ball=seed % 2 == 1)
 
 
-@pytest.mark.slow
+@pytest.mark.few(0, 6)
 @pytest.mark.parametrize("seed", range(20))
 def test_bounds_enclose_the_value_of_many_random_games(seed):
     rng = np.random.default_rng([1, seed])

@@ -16,7 +16,7 @@ from jaxltl.envs import temporal_gridworld as grid
 from tests import reference
 from tests.support import as_mdp, assert_encloses, mass_preserving, stack
 
-NUM_MODELS = 400
+NUM_MODELS = 150
 SHAPE = (5, 3, 2)  # states, actions, successors
 # Dyadic, so that float32 and float64 hold them exactly.
 DISCOUNTS = (0.0, 0.5, 0.875, 0.96875, 0.9921875)

@@ -33,7 +33,7 @@ def exact(game, allowed, probability, gain, discount):
     return np.asarray(minimax_value(game, gain, discount, tolerance=1e-10).value)[:-1]
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(1, 2)
 @pytest.mark.parametrize("shape", [SHAPE, (6, 2, 1), (8, 2, 20)])
 @pytest.mark.parametrize("enough", [1e-2, 1e-9])
 def test_the_error_holds_what_it_says(shape, enough):

@@ -271,7 +271,7 @@ def test_intervals_where_the_simulation_stops_cover(chance, threshold):
     assert covered >= confidence and wrong <= 1 - confidence
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(1, 3)
 @pytest.mark.parametrize("number", [200, pytest.param(10_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("chance", CHANCES)
 @pytest.mark.parametrize("threshold", [None, 0.9])

@@ -180,7 +180,7 @@ def check_case(rng, kind, label_on, objective):
     return (best * (1 - best) > 1e-9).any(), left_out.any(), several, (left_out & conserving).any()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(2, 3)
 @pytest.mark.parametrize(("kind", "label_on", "objective"), CASES)
 @pytest.mark.parametrize("count", [18, pytest.param(313, marks=pytest.mark.exhaustive)])
 def test_every_policy_on_the_whole_mask_is_optimal_and_no_best_action_is_missing(

@@ -32,7 +32,7 @@ def solve(model, target, objective):
     return jl.reachability_probability(model, target, objective=objective)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1, 2)
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
 @pytest.mark.parametrize(("double", "rare"), [(False, 1e-20), (True, 1e-200)])
 def test_no_upper_bound_of_a_positive_probability_is_zero(objective, double, rare):
@@ -72,8 +72,8 @@ def walk(size):
         ("policy", 200),
         pytest.param("max", 60, marks=pytest.mark.slow),
         pytest.param("reward", 200, marks=pytest.mark.slow),
-        pytest.param("policy", 3000, marks=pytest.mark.slow),
-        pytest.param("reward", 3000, marks=pytest.mark.slow),
+        pytest.param("policy", 3000, marks=pytest.mark.exhaustive),
+        pytest.param("reward", 3000, marks=pytest.mark.exhaustive),
     ],
 )
 def test_derivatives_of_long_walks(kind, size):

@@ -92,11 +92,14 @@ def test_quickest_policies_take_the_least_steps_of_optimal_ones(double):
             require_quickest(random_world(seed), FORMULAS[seed % len(FORMULAS)])
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "last",
+    [pytest.param(45, marks=pytest.mark.slow), pytest.param(160, marks=pytest.mark.exhaustive)],
+)
 @pytest.mark.parametrize("double", [False, True])
-def test_quickest_policies_of_more_worlds(double):
+def test_quickest_policies_of_more_worlds(double, last):
     with jax.enable_x64(double):
-        for seed in range(15, 160):
+        for seed in range(15, last):
             require_quickest(random_world(seed, 3 + seed % 2), FORMULAS[seed % len(FORMULAS)])
 
 

@@ -82,7 +82,7 @@ def check_case(rng, kind, label_on, objective):
         assert agrees.all(1).any()  # it is one of them where it matters
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(2, 4)
 @pytest.mark.parametrize("count", [1, pytest.param(20, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("kind", "label_on", "objective"), CASES)
 def test_no_best_policy_is_quicker(kind, label_on, objective, count):

@@ -14,6 +14,7 @@ from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.core.values.undiscounted.satisfaction_steps import quickest_policy, satisfaction_steps
 from tests.core.values.undiscounted.test_optimal_actions import A, N, Q, S, random_case
+from tests.support import counts
 
 KINDS = ("cosafe", "buchi", "parity")
 
@@ -115,7 +116,7 @@ def cases(kind, count, seed=0):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [3, pytest.param(60, marks=pytest.mark.slow)])
+@counts(3, 60, slow=15)
 def test_steps_of_policies_agree_with_linear_algebra(kind, count):
     finite = 0
     for rng, model, facts in cases(kind, count):
@@ -132,7 +133,7 @@ def test_steps_of_policies_agree_with_linear_algebra(kind, count):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [2, pytest.param(40, marks=pytest.mark.slow)])
+@counts(2, 40, slow=10)
 def test_the_quickest_optimal_policy_is_the_quickest_of_all_memoryless_ones(kind, count):
     tight = 0
     for _, model, facts in cases(kind, count, seed=1):

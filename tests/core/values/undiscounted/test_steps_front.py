@@ -11,6 +11,7 @@ from jaxltl.core.values.undiscounted.satisfaction_steps import (
     quickest_policy,
     steps_front,
 )
+from tests.support import counts
 
 S, A, GOAL, TRAP = 7, 3, 5, 6
 
@@ -41,7 +42,7 @@ def largest(moves, initial, steps):
     return -found.fun
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.slow)])
+@counts(2, 20, slow=6)
 def test_fronts_and_required_points_agree_with_linear_programs(count):
     several = met = refused = 0
     rng = np.random.default_rng(0)
