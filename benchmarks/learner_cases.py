@@ -16,6 +16,7 @@ from jaxltl.algos import (
     cce,
     expected_sarsa,
     feasible,
+    finite_state_controllers,
     interval_learning,
     many_tasks,
     maximin_q,
@@ -188,6 +189,19 @@ def _sarsa() -> Case:
     )
 
 
+def _controllers(size: int, num_memory: int, formula: str | None, num_steps: int) -> Case:
+    """A robot on a square map that sees the cells around it, and not the goal nor the trap."""
+    cells = np.full((size, size), ".")
+    cells[1::3, 1::2], cells[2::4, 2::3] = "#", "#"
+    cells[0, 0], cells[-1, -1], cells[size // 2, -1] = "a", "g", "x"
+    text = "\n".join(map(" ".join, cells))
+    world = jl.envs.partial_gridworld(text, 3, hidden=["g", "x"], slip=0.1, initial="a")
+    question = {"target": "g", "stay": "!x"} if formula is None else {"formula": formula}
+    problem = finite_state_controllers.make_problem(world, **question)
+    hparams = finite_state_controllers.Hparams(num_memory=num_memory)
+    return Case(finite_state_controllers, problem, hparams, num_steps)
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "mlirl": partial(_mlirl, None),
     "mlirl, soft policy": partial(_mlirl, None, policy="soft"),
@@ -206,4 +220,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "interval_learning": _intervals,
     "feasible": _feasible,
     "expected_sarsa": _sarsa,
+    "controllers, 25 cells": partial(_controllers, 5, 1, None, 100),
+    "controllers, 100 cells": partial(_controllers, 10, 2, None, 100),
+    "controllers, formula": partial(_controllers, 10, 2, "G F g & G F a & G !x", 10),
+    "controllers, 400 cells": partial(_controllers, 20, 2, None, 10),
 }

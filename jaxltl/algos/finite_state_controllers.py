@@ -40,7 +40,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax import lax
 
 from jaxltl.algos.common import learner, optimizers
 from jaxltl.algos.common.chunks import ChunkOptions, run_in_chunks
@@ -55,8 +54,11 @@ from jaxltl.core.types import AtInitial, Solution
 from jaxltl.core.validation import Range, choice, require_in_range
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.linear import solve_linear
 from jaxltl.core.values.partial_observability.chains import controlled_chain
+from jaxltl.core.values.partial_observability.controller_chain import (
+    ControllerChain,
+    controller_solver,
+)
 from jaxltl.core.values.partial_observability.long_run import (
     LEAK,
     satisfaction_problem,
@@ -285,16 +287,10 @@ def controller_value(problem: Problem, parameters: ControllerLogits) -> jax.Arra
     keep = jax.nn.softmax(parameters.update)[:, seen]
     earned = jnp.sum(act * problem.gain, -1)
 
-    def operator(value: jax.Array) -> jax.Array:
-        entering = jnp.einsum("mnk,kn->mn", keep, value)
-        after = jnp.sum(problem.probability * entering[:, problem.successor], -1)
-        return earned + discount * jnp.sum(act * after, -1)
-
-    def residual(x: jax.Array) -> jax.Array:
-        return x - (operator(x) - earned)
-
-    solved = lax.stop_gradient(solve_linear(residual, earned))
-    value = implicit(operator, solved)
+    chain = ControllerChain(problem.successor, problem.probability, act, keep, discount)
+    solver = controller_solver(chain)
+    solved = solver.solve(earned)
+    value = implicit(lambda x: earned + chain.onward(x), solved, solver)
     return problem.initial_gain + jnp.sum(problem.initial * jnp.sum(keep[0].T * value, 0))
 
 
