@@ -14,7 +14,7 @@ PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
     "functions with more than 6 positional parameters": 0,
     "functions with more than 12 keyword-only parameters": 0,
-    "Any in annotations": 198,
+    "Any in annotations": 205,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }
