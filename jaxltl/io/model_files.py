@@ -45,7 +45,7 @@ FORMATS = (
         (SparseMDP, IntervalMDP),
     ),
     Format("DRN", (".drn",), read_drn, write_drn, (SparseMDP, IntervalMDP, POMDP)),
-    Format("numpy", (".npz",), read_npz, write_npz, (SparseMDP, IntervalMDP, Game)),
+    Format("numpy", (".npz",), read_npz, write_npz, (SparseMDP, IntervalMDP, Game, POMDP)),
     Format("Cassandra's POMDP format", (".pomdp",), _read_cassandra, write_cassandra, (POMDP,)),
 )
 

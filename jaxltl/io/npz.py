@@ -18,6 +18,7 @@ from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
+from jaxltl.core.models.pomdp import POMDP, make_pomdp
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Annotations, Rewards, SparseMDP, make_sparse
 from jaxltl.core.sparse.rows import offsets_from_counts
@@ -40,14 +41,16 @@ _SHARED = {
     "propositions": _TEXTS,
     "actions": _TEXTS,
     "system": _TRUTH,
+    "observation": _WHOLE,
 }
+_EXTRA = ("system", "observation")  # of games and of POMDPs
 _ENDS = {"lower": _NUMBERS, "upper": _NUMBERS}  # of interval models
 _BALL = {"center": _NUMBERS, "radius": _NUMBERS}  # of those with a ball besides
 _OF_INTERVALS = {**_ENDS, **_BALL}
 _PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED, **_OF_INTERVALS}
 _SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED, **_OF_INTERVALS}
 _VALUES = ("biufUS", "truth values, numbers and texts")
-_REWARD, _VARIABLE = "reward:", "variable:"
+_REWARD, _VARIABLE, _OBSERVABLE = "reward:", "variable:", "observable:"
 _PARTS = ("state", "choice", "transition")
 
 
@@ -60,13 +63,15 @@ def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, A
         raise ValueError(f"{name!r} is not an .npz of plain arrays: {error}") from None
     sparse = _is_sparse(arrays)
     kinds = {
-        k: v for k, v in (_SPARSE if sparse else _PADDED).items() if k != "system" or k in more
+        k: v for k, v in (_SPARSE if sparse else _PADDED).items() if k not in _EXTRA or k in more
     }
     for key, array in arrays.items():
         kind = kinds.get(key)
         if sparse and key.startswith(_REWARD):
             kind = _NUMBERS
-        elif sparse and key.startswith(_VARIABLE):
+        elif (sparse and key.startswith(_VARIABLE)) or (
+            "observation" in more and key.startswith(_OBSERVABLE)
+        ):
             kind = _VALUES
         elif kind is None and key in more:
             continue
@@ -244,27 +249,43 @@ def _with_initial(model: SparseT, arrays: Arrays) -> SparseT:
     return replace(model, initial=initial)
 
 
-def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
+def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game | POMDP:
     """Model of an ``.npz`` file, in double precision.
 
     A padded file has ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
     ``[S, A, K]``; a sparse one (:func:`write_npz`) the fields of a SparseMDP. The array ``system``
-    makes it a game; ``lower`` and ``upper`` replace ``probability`` in interval models, with
+    makes it a game, ``observation`` a POMDP; ``lower`` and ``upper`` replace ``probability`` in interval models, with
     ``center`` and ``radius`` for an L1 ball.
 
     Args:
       path: the file.
 
     Returns:
-      A SparseMDP, a Game over one, or an IntervalMDP.
+      A SparseMDP, a Game or a POMDP over one, or an IntervalMDP.
 
     Raises:
       ValueError: with file and array, for unknown, missing or invalid arrays.
     """
     name = str(path)
     try:
-        arrays = parse_arrays(raw_bytes(path), name, ("system",))
+        arrays = parse_arrays(raw_bytes(path), name, _EXTRA)
         with errors_in(f"{name!r}: "):
+            observables = {
+                key.removeprefix(_OBSERVABLE): array
+                for key, array in arrays.items()
+                if key.startswith(_OBSERVABLE)
+            }
+            if observables and "observation" not in arrays:
+                raise ValueError(
+                    f"it has {_OBSERVABLE}{min(observables)} and no array observation, the number of "
+                    "each state's observation."
+                )
+            others = {"system", *_OF_INTERVALS} & set(arrays)
+            if "observation" in arrays and others:
+                raise ValueError(
+                    f"it has observation and {min(others)}; games and interval models have no "
+                    "observations."
+                )
             if set(arrays) & set(_OF_INTERVALS) and "system" in arrays:
                 raise ValueError(
                     "the probabilities of this game are intervals; chains and "
@@ -282,19 +303,21 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
                 mdp, sparse = _padded_model(arrays)
                 names = _action_names(arrays, mdp.num_actions) or ()
                 model = replace(sparse, action_names=names)
+            if "observation" in arrays:
+                return make_pomdp(model, arrays["observation"], observables=observables)
             return make_game(model, arrays["system"]) if "system" in arrays else model
     except MemoryError:
         raise ValueError(f"{name!r}: the model does not fit into the memory.") from None
 
 
-def write_npz(path: str | os.PathLike[str], model: Model) -> None:
+def write_npz(path: str | os.PathLike[str], model: Model | POMDP) -> None:
     """Writes a model as a sparse ``.npz``, atomically.
 
     :func:`read_npz` restores it bit for bit; an empty reward becomes zeros on states.
 
     Args:
       path: the file.
-      model: a model that ``to_sparse`` takes, a game or an interval model.
+      model: a model that ``to_sparse`` takes, a game, a POMDP or an interval model.
 
     Raises:
       ValueError: for variables of an unsupported type, or the file cannot be written.
@@ -310,6 +333,11 @@ def write_npz(path: str | os.PathLike[str], model: Model) -> None:
     if isinstance(model, Game):
         arrays["system"] = np.asarray(model.system, np.bool_).ravel()
         model = model.mdp
+    if isinstance(model, POMDP):
+        arrays["observation"] = np.asarray(model.observation)
+        for name, values in model.observables.items():
+            arrays[f"{_OBSERVABLE}{name}"] = _storable(values, name, path)
+        model = model.fully_observable
     keys = ["row_start", "entry_start", "successor", "probability", "initial", "label"]
     if isinstance(model, IntervalMDP):
         keys.remove("probability")
@@ -324,14 +352,18 @@ def write_npz(path: str | os.PathLike[str], model: Model) -> None:
         for part, values in (parts or {"state": np.zeros(sparse.num_states)}).items():
             arrays[f"{_REWARD}{name}:{part}"] = np.asarray(values, np.float64)
     for name, values in sparse.valuation.items():
-        values = np.asarray(values)
-        if values.dtype.kind == "O" and all(isinstance(x, str) for x in values):
-            values = values.astype(str)
-        if values.dtype.kind not in _VALUES[0]:
-            raise ValueError(
-                f"{str(path)!r}: the variable {name!r} holds {values.dtype}; a file "
-                f"holds {_VALUES[1]}."
-            )
-        arrays[f"{_VARIABLE}{name}"] = values
+        arrays[f"{_VARIABLE}{name}"] = _storable(values, name, path)
     with atomic_write(path) as file:
         np.savez(file, **arrays)
+
+
+def _storable(values: Array, name: str, path: str | os.PathLike[str]) -> Array:
+    """The values of a variable; raises ValueError for those of an unsupported type."""
+    values = np.asarray(values)
+    if values.dtype.kind == "O" and all(isinstance(x, str) for x in values):
+        values = values.astype(str)
+    if values.dtype.kind not in _VALUES[0]:
+        raise ValueError(
+            f"{str(path)!r}: the variable {name!r} holds {values.dtype}; a file holds {_VALUES[1]}."
+        )
+    return values

@@ -48,7 +48,7 @@ def test_games_and_other_models(tmp_path, suffix):
     assert found.successor.tolist() == [0, 1, 0, 1] and found.propositions == ("a",)
 
 
-@pytest.mark.parametrize("suffix", [".umb", ".umb.xz", ".drn", ".drn.gz"])
+@pytest.mark.parametrize("suffix", [".umb", ".umb.xz", ".npz", ".drn", ".drn.gz"])
 def test_formats_with_observations_keep_a_pomdp(tmp_path, suffix):
     for seed in range(4):
         pomdp = random_pomdp(np.random.default_rng(seed))
@@ -57,10 +57,28 @@ def test_formats_with_observations_keep_a_pomdp(tmp_path, suffix):
             world = replace(world, rewards={"cost": world.rewards["cost"]})
             pomdp = replace(pomdp, fully_observable=world)
         write_model(tmp_path / f"m{suffix}", pomdp)
-        assert_same_pomdp(read_model(tmp_path / f"m{suffix}"), pomdp, whole="umb" in suffix)
-    for other in (".tra", ".npz"):
-        with pytest.raises(ValueError, match=r"holds no POMDPs; write UMB \(\.umb\) or DRN"):
-            write_model(tmp_path / f"m{other}", pomdp)
+        assert_same_pomdp(read_model(tmp_path / f"m{suffix}"), pomdp, whole="drn" not in suffix)
+    with pytest.raises(ValueError, match=r"holds no POMDPs; write UMB \(\.umb\) or DRN"):
+        write_model(tmp_path / "m.tra", pomdp)
+
+
+def test_observations_in_npz_files(tmp_path):
+    path, table = tmp_path / "m.npz", [[[0, 0.5, 0.5]], [[1.0, 0, 0]], [[1.0, 0, 0]]]
+    np.savez(path, transition=table, observation=[0, 1, 1], **{"observable:x": [3, 4]})
+    pomdp = read_npz(path)
+    assert pomdp.observation.tolist() == [0, 1, 1]
+    assert pomdp.observation_names == ("x=3", "x=4")
+    wrong = {
+        "observation": {"observable:x": [3, 4]},
+        "system": {"observation": [0, 1, 1], "system": [True] * 3},
+        r"observation is int64\[2\]": {"observation": [0, 1]},
+        "observation holds float64": {"observation": [0.0, 1.0, 1.0]},
+        "observables": {"observation": [0, 1, 1], "observable:x": [3]},
+    }
+    for words, arrays in wrong.items():
+        np.savez(path, transition=table, **arrays)
+        with pytest.raises(ValueError, match=words):
+            read_npz(path)
 
 
 def test_a_file_is_known_by_how_it_begins(tmp_path):
