@@ -119,8 +119,57 @@ def _share_contexts(most: int = 100) -> None:
     lowering.make_ir_context = shared
 
 
+def _cache_programs_with_callbacks() -> None:
+    """Has the cache keep programs that call the host, which JAX compiles anew in each process.
+
+    A program names its callbacks by their numbers, so one that is read is given those of this process.
+    """
+    compiler = importlib.import_module("jax._src.compiler")
+    cache = importlib.import_module("jax._src.compilation_cache")
+    client = importlib.import_module("jax._src.lib")._jax.Client
+    if "host_callbacks: collections.abc.Sequence[collections.abc.Callable]" not in str(
+        client.deserialize_executable.__doc__
+    ):
+        return
+    compile_or_read, read, write = (
+        compiler.compile_or_get_cached,
+        cache.get_executable_and_time,
+        compiler._cache_write,
+    )
+    mine = threading.local()
+
+    class Backend:
+        """A client of which programs that are read have the callbacks of this process."""
+
+        def __init__(self, backend, callbacks):
+            self.backend, self.callbacks = backend, callbacks
+
+        def __getattr__(self, name):
+            return getattr(self.backend, name)
+
+        def deserialize_executable(self, *arguments):
+            return self.backend.deserialize_executable(*arguments, self.callbacks)
+
+    def with_callbacks(backend, module, devices, options, callbacks, *rest, **more):
+        mine.callbacks = callbacks
+        try:
+            return compile_or_read(backend, module, devices, options, callbacks, *rest, **more)
+        finally:
+            mine.callbacks = ()
+
+    def read_with_callbacks(key, options, backend, devices):
+        if callbacks := getattr(mine, "callbacks", ()):
+            backend = Backend(backend, callbacks)
+        return read(key, options, backend, devices)
+
+    compiler.compile_or_get_cached = with_callbacks
+    cache.get_executable_and_time = read_with_callbacks
+    compiler._cache_write = lambda *arguments: write(*arguments[:-1], ())
+
+
 if "xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
     _share_contexts()
+    _cache_programs_with_callbacks()
 
 
 @pytest.hookimpl(tryfirst=True)  # before markers choose
