@@ -18,7 +18,17 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).parent.parent
-ADAPTERS = ("brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "playground", "xminigrid")
+ADAPTERS = (
+    "brax",
+    "craftax",
+    "gymnax",
+    "jaxmarl",
+    "jumanji",
+    "navix",
+    "pgx",
+    "playground",
+    "xminigrid",
+)
 # The package, which is also the name of the extra, and the tests that compare the steps.
 TESTS = {name: f"tests/envs/adapters/test_{name}.py" for name in ADAPTERS}
 TESTS["gymnasium"] = "tests/envs/test_gymnasium_vector.py"

@@ -294,6 +294,11 @@ ADAPTERS = {
         lambda: {"env": imported("mujoco_playground._src.registry", "load", "CartpoleBalance")},
         {},
     ),
+    "jaxmarl": (
+        "jaxmarl",
+        lambda: {"env": imported("jaxmarl", "make", "MPE_simple_v3")},
+        {"others": None, "agent": "agent_0"},
+    ),
     "pgx": (
         "pgx",
         lambda: {"env": imported("pgx", "make", "tic_tac_toe")},

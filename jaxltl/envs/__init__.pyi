@@ -12,6 +12,7 @@ from .adapters.brax import from_brax as from_brax
 from .adapters.brax import from_playground as from_playground
 from .adapters.gymnax import from_craftax as from_craftax
 from .adapters.gymnax import from_gymnax as from_gymnax
+from .adapters.jaxmarl import from_jaxmarl as from_jaxmarl
 from .adapters.jumanji import from_jumanji as from_jumanji
 from .adapters.minigrid import from_navix as from_navix
 from .adapters.pgx import from_pgx as from_pgx

@@ -8,7 +8,8 @@ import jaxltl
 
 
 @pytest.mark.parametrize(
-    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "playground", "xminigrid"]
+    "name",
+    ["brax", "craftax", "gymnax", "jaxmarl", "jumanji", "navix", "pgx", "playground", "xminigrid"],
 )
 def test_a_missing_package_is_named(name, monkeypatch):
     root = "mujoco_playground" if name == "playground" else name
