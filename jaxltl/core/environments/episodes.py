@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, cast
@@ -62,10 +63,14 @@ class Agent:
 
 
 def make_agent(function: Callable[..., PyTree]) -> Agent:
-    """A memoryless :class:`Agent` from a function; masks of actions are ignored.
+    """A memoryless :class:`Agent` from a function; masks of actions apply to what it returns.
+
+    Where its action is not available, the agent takes the first available one, as a shield that corrects
+    actions after a learner has chosen them does (Alshiekh et al. 2018).
 
     Args:
-      function: ``(observation, key) -> action``.
+      function: ``(observation, key) -> action``. One that chooses among the available actions itself has
+        a parameter with the name ``allowed``, ``bool[A]`` or None: ``(observation, key, allowed)``.
 
     Returns:
       :class:`Agent`.
@@ -73,15 +78,36 @@ def make_agent(function: Callable[..., PyTree]) -> Agent:
     >>> still = make_agent(lambda observation, key: 0)
     >>> still.act((), None, None, None)
     (0, ())
+    >>> int(still.act((), None, jnp.array([False, True]), None)[0])
+    1
     """
-    return Agent(Partial(_without_memory, as_partial(function)))
+    called = function.func if isinstance(function, Partial) else function
+    try:
+        reads_mask = "allowed" in inspect.signature(called).parameters
+    except (TypeError, ValueError):  # not a function, or one without a signature
+        reads_mask = False
+    return Agent(Partial(_without_memory, struct.Static(reads_mask), as_partial(function)))
 
 
 def _without_memory(
-    function: Callable[..., PyTree], memory: PyTree, observation: PyTree, allowed: object, key: Key
+    reads_mask: struct.Static,
+    function: Callable[..., PyTree],
+    memory: PyTree,
+    observation: PyTree,
+    allowed: jax.Array | None,
+    key: Key,
 ) -> tuple[PyTree, PyTree]:
-    del allowed
-    return function(observation, key), memory
+    if reads_mask.value:
+        action = function(observation, key, allowed=allowed)
+    else:
+        action = function(observation, key)
+    is_number = jnp.shape(action) == () and jnp.issubdtype(jnp.result_type(action), jnp.integer)
+    if allowed is None or not is_number:  # the environment checks actions
+        return action, memory
+    mask, number = jnp.asarray(allowed), jnp.asarray(action)
+    wrong = ~mask[jnp.clip(number, 0, mask.size - 1)] & (number >= 0) & (number < mask.size)
+    first = jnp.argmax(mask).astype(number.dtype)
+    return jnp.where(wrong & mask.any(), first, number), memory
 
 
 @brief

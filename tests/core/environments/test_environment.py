@@ -347,3 +347,22 @@ def test_a_time_limit_truncates():
         world = found.world
         terminated |= bool(found.terminated)
     assert terminated, "both may hold"
+
+
+def test_agents_of_functions_obey_masks():
+    """Actions that are not available become the first available one; or the function reads the mask."""
+    mask = jnp.array([False, True, True])
+
+    def reads(seen, key, allowed=None):
+        return 0 if allowed is None else jnp.argmin(allowed) + 2
+
+    cases = [(lambda seen, key: 0, 1), (lambda seen, key: jnp.int32(2), 2), (reads, 2)]
+    for function, chosen in cases:
+        agent = make_agent(function)
+        action, _ = jax.jit(agent.act)((), jnp.zeros(2), mask, jax.random.key(0))
+        assert int(action) == chosen
+    assert make_agent(reads).act((), None, None, None)[0] == 0
+    never = jnp.zeros(3, bool)
+    assert int(make_agent(lambda seen, key: 2).act((), None, never, None)[0]) == 2
+    outside = make_agent(lambda seen, key: 7)  # which the environment reports
+    assert int(outside.act((), None, mask, None)[0]) == 7
