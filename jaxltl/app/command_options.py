@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 WAIT = 60.0  # seconds
+_CERTIFICATE = (
+    "File for a certificate, which `jaxltl verify` checks; numbered if there are several."
+)
 
 
 class Failure(click.ClickException):
@@ -194,10 +197,7 @@ class SolveOptions:
         default="build",
         type=click.Choice(["build", "partial"]),
     )
-    certificate: Path | None = option(
-        "File for a certificate, which `jaxltl verify` checks; numbered if there are several.",
-        metavar="FILE",
-    )
+    certificate: Path | None = option(_CERTIFICATE, metavar="FILE")
     checkpoint: Path | None = option(
         "With --mesh: directory of checkpoints, from which long solves resume.",
         metavar="DIRECTORY",
@@ -236,7 +236,4 @@ class CertifyOptions:
     smallest: bool = option("Minimise the probability.", "--min", is_flag=True)
     policy: Path | None = option("File for the policy, .npz.")
     curve: Path | None = option("Draw the bound over the number of samples (.svg, .png or .pdf).")
-    certificate: Path | None = option(
-        "File for a certificate, which `jaxltl verify` checks; numbered if there are several.",
-        metavar="FILE",
-    )
+    certificate: Path | None = option(_CERTIFICATE, metavar="FILE")
