@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from jaxltl.core import validation
 from jaxltl.core.array_types import Key, PyTree
 from jaxltl.core.environments.environment import (
     Box,
@@ -70,8 +71,7 @@ def from_jaxmarl(
     require_environment("jaxmarl", env, module.MultiAgentEnv, "jaxmarl.make(name)")
     names = list(env.agents)
     agent = names[0] if agent is None else agent
-    if agent not in names:
-        raise ValueError(f"from_jaxmarl: agent={agent!r}; choose one of {', '.join(names)}.")
+    validation.choice("agent", agent, names)
     if (others is None) != (len(names) == 1):
         raise ValueError(
             f"from_jaxmarl: the environment has {len(names)} agents; give others, (observations, key) "
