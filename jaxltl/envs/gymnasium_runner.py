@@ -37,7 +37,8 @@ def run_policy(
     Args:
       env: the environment, with a limit of steps: of its specification, or of the wrapper TimeLimit;
         or a ``gymnasium.vector.VectorEnv`` of such, each lane of which has its share of the episodes.
-      policy: a finite-memory policy, a network of ``load_policy``, or a function of the observation.
+      policy: a finite-memory policy, a network of ``load_policy``, or a function of the observation. A
+        network learned with masks of actions reads ``info["action_mask"]`` or ``info["allowed"]``.
       num_episodes, seed, confidence: number of episodes, seed of all draws, and of each interval.
       observe: ``(observation, info) -> (state, label)``, the state or observation that the policy
         reads, and the propositions that hold, or None for those of the policy's map. Default: the
@@ -143,12 +144,18 @@ class _Lane:
     def start(self, seen: PyTree, info: PyTree) -> None:
         state, label = self._observe(seen, info)
         self._player.start(state, label)
+        self._read_mask(info)
         self._total, self._length = 0.0, 0
         self.row: PyTree = None
         self._verdict = self._judge(self._player, label, info, False)
 
     def act(self) -> PyTree:
-        return self._player.act()
+        return self._player.act(**self._mask)
+
+    def _read_mask(self, info: PyTree) -> None:
+        reads = getattr(getattr(self._player, "policy", None), "reads_mask", False)
+        names = [x for x in ("action_mask", "allowed") if reads and x in info]
+        self._mask = {"allowed": info[names[0]]} if names else {}
 
     def read(self, seen: PyTree, reward: PyTree, ended: bool, cut: bool, info: PyTree) -> None:
         if self.row is not None:  # decided before the environment's own end
@@ -156,6 +163,7 @@ class _Lane:
         state, label = self._observe(seen, info)
         label = self._judge.terminal(state, label) if ended else label
         self._player.update(state, label)
+        self._read_mask(info)
         verdict = self._judge(self._player, label, info, ended)
         self._total, self._length = self._total + float(reward), self._length + 1
         decided = verdict not in (None, Verdict.UNDECIDED)
@@ -190,7 +198,8 @@ class _Function:
 
     update = start
 
-    def act(self) -> PyTree:
+    def act(self, *, allowed: PyTree = None) -> PyTree:
+        assert allowed is None  # a function reads the observation alone
         return self.function(self.seen)
 
 

@@ -51,24 +51,46 @@ class NetworkPolicy:
         initial = 0 if self.automaton is None else self.automaton.initial
         return self.update(Progress((), np.asarray(initial), np.asarray(-1)), state, label)
 
+    @property
+    def reads_mask(self) -> bool:
+        """True if the network was learned with masks of available actions, which ``act`` needs then."""
+        _, _, _, allowed = self._inputs
+        return allowed is not None
+
+    @property
+    def _inputs(self) -> tuple[PyTree, ...]:
+        """Shapes of key, memory, observation and mask."""
+        arguments, _ = jax.tree.unflatten(self.exported.in_tree, self.exported.in_avals)
+        return tuple(arguments)
+
     def act(self, key: Key, at: Progress, allowed: Array | None = None) -> Array:
-        """An action; `allowed` is a mask of actions, where the environment has one."""
+        """An action; `allowed` is the mask ``bool[A]`` of available actions, where the network reads one.
+
+        Raises:
+          ValueError: an observation of other shapes, or a mask that is missing or is not read.
+        """
         if isinstance(key, np.random.Generator):
             data = key.integers(2**32, size=2, dtype=np.uint32)
         else:
             data = np.asarray(jax.random.key_data(jax.random.key(0) if key is None else key))
-        kinds, structure = self.exported.in_avals, self.exported.in_tree
-        inputs = [data, at.memory, *jax.tree.leaves(at.state)]
-        if len(inputs) < len(kinds):
-            inputs.append(np.ones(kinds[-1].shape, bool) if allowed is None else allowed)
-        shapes, expected = ([np.shape(x) for x in y] for y in (inputs, kinds))
+        _, _, *kinds = jax.tree.leaves(self._inputs)
+        if self.reads_mask != (allowed is not None):
+            raise ValueError(
+                "allowed is None, and the network chooses among the available actions; give their mask, "
+                f"bool{list(kinds[-1].shape)}, as in controller.act(allowed=mask)."
+                if self.reads_mask
+                else "allowed is given, and the network was saved of an environment without masks, so that "
+                "it cannot obey one; leave it out, or learn in the masked environment."
+            )
+        leaves = [*jax.tree.leaves(at.state), *([] if allowed is None else [allowed])]
+        shapes, expected = ([np.shape(x) for x in y] for y in (leaves, kinds))
         if shapes != expected:
             raise ValueError(
-                f"the observation has arrays of the shapes {shapes[2:]}; the network reads "
-                f"{expected[2:]}."
+                f"the observation has arrays of the shapes {shapes}; the network reads {expected}."
             )
-        leaves = [jax.numpy.asarray(x, y.dtype) for x, y in zip(inputs, kinds, strict=True)]
-        arguments, _ = jax.tree.unflatten(structure, leaves)
+        inputs = zip([data, at.memory, *leaves], self.exported.in_avals, strict=True)
+        arrays = [jax.numpy.asarray(x, y.dtype) for x, y in inputs]
+        arguments, _ = jax.tree.unflatten(self.exported.in_tree, arrays)
         action: Array = self.exported.call(*arguments)
         return action
 
@@ -106,7 +128,8 @@ def save_network(
 ) -> None:
     """Writes the policy of an agent without memory, such as ``ppo.policy(...)``, as a program.
 
-    The program is exported by ``jax.export`` for CPU, CUDA and TPU.
+    The program is exported by ``jax.export`` for CPU, CUDA and TPU. Of an environment with masks of
+    actions, such as one inside a shield, it reads the mask: ``controller.act(allowed=mask)``.
 
     Args:
       path: the file, ``.npz``.
@@ -146,6 +169,9 @@ def _program(agent: Agent, environment: Environment, automaton: Automaton | None
         return environment.observe(world), allowed_in(environment, world)
 
     observation, allowed = jax.eval_shape(seen, jax.random.key(0))
+    tables = jax.tree.leaves(environment.allowed)
+    if tables and all(x.dtype == bool and np.all(x) for x in map(np.asarray, tables)):
+        allowed = None  # rows of a table, as of a model all of whose actions are available
     rows = None
     if isinstance(observation, TaskObservation):
         tables = task_tables(environment)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -167,6 +169,30 @@ def test_ppo_learns_the_same_with_the_same_network_of_either_kind(tmp_path):
         states.append(sorted(jax.tree.leaves(whole.parameters), key=lambda x: x.shape))
     for one, other in zip(*states, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_a_deployed_network_obeys_the_mask_or_asks_for_it(tmp_path):
+    path = tmp_path / "policy.npz"
+    agent = jl.environments.make_agent(lambda seen, key: 0)
+    world = jl.environments.model_environment(jl.gridworld("a .", initial="a"))
+    jl.io.save_network(path, agent, world)  # all actions are available
+    robot = jl.io.load_policy(path).controller()
+    robot.start(world.observe(world.reset(KEY)))
+    assert robot.act() == 0
+    with pytest.raises(ValueError, match="allowed is given"):
+        robot.act(allowed=np.array([False, True, True, True]))
+    masked = dataclasses.replace(world, allowed=Partial(lambda world: jnp.arange(4) > 1))
+    jl.io.save_network(path, agent, masked)
+    policy = jl.io.load_policy(path)
+    robot = policy.controller()
+    robot.start(world.observe(world.reset(KEY)))
+    assert policy.reads_mask and robot.act(allowed=np.array([False, True, True, True])) == 1
+    with pytest.raises(ValueError, match=r"allowed is None.*bool\[4\]"):
+        robot.act()
+    table = jl.FiniteMemoryPolicy(np.array([[0]]), np.array([0]), np.array([[0]])).controller()
+    table.start(0)
+    with pytest.raises(ValueError, match="the policy is a table"):
+        table.act(allowed=np.array([True]))
 
 
 @pytest.mark.parametrize(

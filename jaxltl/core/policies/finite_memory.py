@@ -253,10 +253,19 @@ class Controller:
         """Begins an episode in a state, or with an observation."""
         self.at = self.policy.start(state, label)
 
-    def act(self, key: Key = None) -> PyTree:
-        """The next action; the controller's own generator is the default key."""
+    def act(self, key: Key = None, *, allowed: PyTree = None) -> PyTree:
+        """The next action; the controller's own generator is the default key.
+
+        `allowed` is the mask of available actions, for a network that reads one; a table is refused.
+        """
         self._require_start()
-        action = self.policy.act(self._generator if key is None else key, self.at)
+        if allowed is not None and isinstance(self.policy, FiniteMemoryPolicy):
+            raise ValueError(
+                "allowed is given, and the policy is a table; leave it out, and make the policy from the "
+                "masked model or by shield_policy."
+            )
+        masks = () if allowed is None else (allowed,)
+        action = self.policy.act(self._generator if key is None else key, self.at, *masks)
         return int(action) if np.ndim(action) == 0 else np.asarray(action)
 
     def update(self, state: PyTree, label: Collection[str] | None = None) -> None:
