@@ -169,8 +169,8 @@ def _program(agent: Agent, environment: Environment, automaton: Automaton | None
         return environment.observe(world), allowed_in(environment, world)
 
     observation, allowed = jax.eval_shape(seen, jax.random.key(0))
-    tables = jax.tree.leaves(environment.allowed)
-    if tables and all(x.dtype == bool and np.all(x) for x in map(np.asarray, tables)):
+    masks = [np.asarray(x) for x in jax.tree.leaves(environment.allowed)]
+    if masks and all(x.dtype == bool and x.all() for x in masks):
         allowed = None  # rows of a table, as of a model all of whose actions are available
     rows = None
     if isinstance(observation, TaskObservation):
