@@ -13,6 +13,7 @@ import gc
 import getpass
 import hashlib
 import importlib
+import inspect
 import os
 import platform
 import sys
@@ -127,10 +128,10 @@ def _cache_programs_with_callbacks() -> None:
     compiler = importlib.import_module("jax._src.compiler")
     cache = importlib.import_module("jax._src.compilation_cache")
     client = importlib.import_module("jax._src.lib")._jax.Client
-    if "host_callbacks: collections.abc.Sequence[collections.abc.Callable]" not in str(
-        client.deserialize_executable.__doc__
-    ):
-        return
+    takes = "host_callbacks: collections.abc.Sequence[collections.abc.Callable]"
+    parts = [*inspect.signature(compiler.compile_or_get_cached).parameters][:5]
+    if takes not in str(client.deserialize_executable.__doc__) or parts[-1:] != ["host_callbacks"]:
+        return  # another version's
     compile_or_read, read, write = (
         compiler.compile_or_get_cached,
         cache.get_executable_and_time,

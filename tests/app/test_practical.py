@@ -18,6 +18,7 @@ from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.core.values.undiscounted.satisfaction_steps import satisfaction_steps
+from tests.support import counts
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 HARBOUR = """
@@ -291,7 +292,7 @@ def check_random_maps(folder, count, solve):
     return mixed
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(50, marks=pytest.mark.slow)])
+@counts(3, 50, slow=12)
 def test_random_maps(tmp_path, count):
     rng = np.random.default_rng(1)
     mixed = check_random_maps(tmp_path, count, lambda path: drawn(path, rng, 3.0))

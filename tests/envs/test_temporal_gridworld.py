@@ -178,7 +178,7 @@ def test_random_worlds_are_drawn_until_a_task_without_end_can_be_done():
         tg.random_world(0, "G F (o1 & ob)", max_tries=5, **options)
 
 
-@support.counts(150, 1000)
+@support.counts(60, 1000)
 def test_hundreds_of_random_worlds(count):
     for world in tg.random_worlds(range(count)):
         check_random(world, KINDS, 5, 3)

@@ -118,7 +118,7 @@ def test_lasso_needs_several_laps():
     assert not accepts_lasso(automaton, [{"a"}] * 5, [set()])
 
 
-@counts(80, 300)
+@counts(40, 300)
 def test_minimize_keeps_the_language_and_is_minimal(count):
     rng = random.Random(30)
     shrunk = 0

@@ -97,7 +97,7 @@ def test_final_is_decided_as_early_as_possible():
             assert undecided[automaton.delta[q]].any()
 
 
-@counts(150, 500)
+@counts(75, 500)
 def test_negation_is_complement(count):
     rng = random.Random(22)
     both = 0
@@ -136,7 +136,7 @@ def test_states_are_the_residuals_of_the_language(letters, stem, tail, largest, 
     assert set(seen) == set(range(3, largest + 1))
 
 
-@counts(50, 150)
+@counts(25, 150)
 def test_states_are_named_by_what_is_left(count):
     rng = random.Random(24)
     for _ in range(count):
@@ -484,7 +484,7 @@ def test_no_deterministic_buchi_automaton(text):
     assert automaton.acceptance == "parity" and automaton.priority.max() >= 2
 
 
-@counts(120, 400)
+@counts(60, 400)
 def test_finite_verdicts_are_early(count):
     """Final is decided: co-safe iff universal from there, safety iff something is left."""
     rng = random.Random(30)
@@ -653,7 +653,7 @@ def test_formulas_are_compared_by_their_words(count):
     assert different > 2 * count / 3
 
 
-@counts(50, 150)
+@counts(25, 150)
 def test_a_refused_dfa_shows_words_that_no_prefix_decides(count):
     rng = random.Random(78)
     refused = 0

@@ -167,7 +167,11 @@ GAINS = {
 @pytest.mark.parametrize(
     ("name", "noise"),
     [
-        pytest.param(name, noise, marks=[] if i % 2 == j and i < 3 else pytest.mark.slow)
+        pytest.param(
+            name,
+            noise,
+            marks=pytest.mark.exhaustive if i % 2 != j else pytest.mark.slow if i > 2 else (),
+        )
         for i, name in enumerate(GAINS)
         for j, noise in enumerate((uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)))
     ],

@@ -98,13 +98,13 @@ PARITY_LIKE = ("safety", "reach", "buchi", "cobuchi", "parity")
 
 
 @pytest.mark.few(3)
-@counts(60, 200)
+@counts(30, 200)
 @pytest.mark.parametrize("kind", PARITY_LIKE)
 def test_regions_equal_all_pairs_of_strategies(kind, count):
     check_batch(0, kind, (7, 2, 2), count)
 
 
-@counts(40, 80)
+@counts(20, 80)
 @pytest.mark.parametrize("kind", ["gr1", "generalized"])
 def test_regions_with_memory_equal_parity_written_out(kind, count):
     check_batch(1, kind, (3, 2, 2), count)

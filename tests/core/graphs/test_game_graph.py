@@ -47,7 +47,7 @@ def check_moves(model, case, found, chance):
 @pytest.mark.parametrize("chance", CHANCE)
 def test_rules_by_state_equal_naive_sweeps(chance):
     rng = np.random.default_rng(0)
-    models = [reference.random_model(rng, 6, 2, 2) for _ in range(600)]
+    models = [reference.random_model(rng, 6, 2, 2) for _ in range(250)]
     cases = [random_case(rng, model) for model in models]
     sizes = set()
     for model, case in zip(models, cases, strict=True):

@@ -102,7 +102,7 @@ def test_parse_by_hand(text):
         assert tree(parse_ltl(text)) == EXPANSIONS[text]
 
 
-@counts(800, 3000)
+@counts(400, 3000)
 def test_printer_round_trip(count):
     rng = random.Random(1)
     odd = ["a", "U", "Foo", "F1", 'q"\\', "two words", "true", "é", "1st", ".x", "line\nbreak"]

@@ -59,7 +59,7 @@ def questions(model, region, value, reward, policy, *, compiled=True):
     }
 
 
-@pytest.mark.few(0, 2)
+@pytest.mark.few(0, 1)
 @pytest.mark.parametrize(
     "kind",
     [*sorted(REPRESENTATIONS), pytest.param("product on exit", marks=pytest.mark.exhaustive)],

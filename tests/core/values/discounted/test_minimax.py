@@ -492,7 +492,7 @@ def assert_solved(successor, available, system, reward):
         np.testing.assert_array_equal(brute.mean_payoff(successor, fixed, system, reward), exact)
 
 
-@counts(100, 300)
+@counts(40, 300)
 def test_mean_payoffs_are_those_of_all_strategy_pairs(count):
     """Small whole rewards make ties, and so games in which improvements do not show in gains."""
     rng = np.random.default_rng(9)
