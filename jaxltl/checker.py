@@ -312,12 +312,24 @@ def recurring(graph: dict, marks: Sequence[set]) -> dict:
     return kept
 
 
-def accepting(graph: dict, priority: dict, parity: int, marks: Sequence[set]) -> set:
-    """Where marked sets and the least recurring priority, of a parity, can recur almost surely."""
+def accepting(graph: dict, priority: dict, parity: int, marks: Sequence[set], ends: bool) -> set:
+    """Where marked sets and the least recurring priority, of a parity, can recur almost surely.
+
+    With `ends` without nodes that only lead to these: each follows one of the least priority.
+    """
     union: set = set()
     for least in {p for p in priority.values() if p % 2 == parity}:
         part = {v: options for v, options in graph.items() if priority[v] >= least}
-        union |= recurring(part, [{v for v in part if priority[v] == least}, *marks]).keys()
+        sets = [{v for v in part if priority[v] == least}, *marks]
+        kept, size = recurring(part, sets), -1
+        while ends and len(kept) != size:
+            size = len(kept)
+            start = {
+                t for v in sets[0] & kept.keys() for o in kept[v] for t in compress(o[0], o[1])
+            }
+            after = explore(start, kept.__getitem__, lambda o: compress(o[0], o[1]))
+            kept = recurring({v: kept[v] for v in after}, sets)
+        union |= kept.keys()
     return union
 
 
@@ -463,7 +475,7 @@ class HoaAutomaton:
         untils = [i for i in range(len(tableau.nodes)) if postponed >> i & 1]
         marks = [{v for v in graph if not v[3] >> i & 1} for i in untils]
         edges = {v: [((w,), (1,), 1, None, (), ()) for w in out] for v, out in graph.items()}
-        return bool(accepting(edges, {v: v[2] for v in graph}, parity, marks))
+        return bool(accepting(edges, {v: v[2] for v in graph}, parity, marks, False))
 
 
 # --- counts ---------------------------------------------------------------------------------------
@@ -920,7 +932,7 @@ class ClaimChecker:
         means = [Fraction(x, sum(start.values()) * self.one) for x, start in zip(bounds, starts)]
         return [1 - x if self.is_negated else x if self.is_upper else -x for x in means]
 
-    def explored(self) -> tuple[dict, dict, list[int]]:
+    def explored(self, is_hidden: bool) -> tuple[dict, dict, list[int]]:
         """The options of all nodes, the values y of those where the question ends, the initial ones."""
         path, width = self.file.path, self.width
         target = self.file.states(path.get("target", ["false"]))
@@ -937,7 +949,7 @@ class ClaimChecker:
         if automaton:
             edges = [automaton.edges[i] for i in automaton.letter_of]
             priority = {v: edges[v // width][v % width // self.memory][1] for v in graph}
-            accepted = accepting(graph, priority, self.is_negated, [])
+            accepted = accepting(graph, priority, self.is_negated, [], is_hidden)
         final = [v for v, options in graph.items() if not options or v in accepted]
         is_one = (v in accepted or ("reward" not in path and target[v // width]) for v in final)
         one = self.one if self.is_upper else -self.one
@@ -946,7 +958,7 @@ class ClaimChecker:
     def check(self) -> tuple[int, str]:
         """Checks the claim; returns the number of nodes, and what the claim says."""
         path, kind, width, y = self.file.path, self.file.kind, self.width, self.y
-        graph, ends, initial = self.explored()
+        graph, ends, initial = self.explored(self.beliefs is not None)
         # The inequality is needed below `top`, and values are not below `floor`.
         top = self.infinity if "reward" in path else self.one
         top, floor = (top, 0) if self.is_upper else (0, -self.infinity)

@@ -19,7 +19,7 @@ LIMITS = {
     "names at the top level": 80,
 }
 MODULE_LINES, BODY_LINES = 600, 120
-ONE_FILE = {"checker.py": 1045}  # runs alone, without the package
+ONE_FILE = {"checker.py": 1060}  # runs alone, without the package
 
 
 @cache

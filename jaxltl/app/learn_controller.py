@@ -163,11 +163,11 @@ def summary(outcome: ControllerOutcome) -> Record:
 
 
 def certifiable(outcome: ControllerOutcome) -> list[Certifiable] | str:
-    """The satisfaction probability of the controller."""
-    pomdp, policy = outcome.setup.pomdp, outcome.learned.policy
-    question = formula_question(outcome.setup.task.formula)
+    """The satisfaction probability of the controller, and the bound of all controllers."""
+    task, pomdp, policy = outcome.setup.task, outcome.setup.pomdp, outcome.learned.policy
     size = pomdp.num_states * policy.next_memory.shape[1] * len(outcome.setup.automaton.delta)
-    return [Certifiable(pomdp, None, question, {"policy": policy}, size)]
+    options = {"max_beliefs": task.bounds.beliefs}
+    return [Certifiable(pomdp, policy, formula_question(task.formula), options, size)]
 
 
 def save(out: Path, outcome: ControllerOutcome) -> None:

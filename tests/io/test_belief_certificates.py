@@ -22,6 +22,7 @@ QUESTIONS = {
     "Pmin": 'Pmin=? [ F "goal" ]',
     "Rmax": 'R{"cost"}max=? [ F "goal" ]',
     "Rmin": 'R{"cost"}min=? [ F "goal" ]',
+    "P of a formula, max": 'Pmax=? [ (F "goal") | (X (F "goal")) ]',
 }
 
 
@@ -33,14 +34,14 @@ def in_double_precision():
 
 def written(path, kind, seed, max_beliefs=30):
     """Writes the certificate of a random POMDP; its members, the answer, and the bound of all policies."""
-    pomdp, _, cost = question(seed, kind)
+    pomdp, _, cost = question(seed, kind[0] + kind[-3:])
     reward = None
     if cost is not None:
         world = pomdp.fully_observable.replace(
             rewards={"cost": jl.models.Rewards(choice=cost.ravel())}
         )
         pomdp, reward = jl.models.make_pomdp(world, pomdp.observation), "cost"
-    objective = kind[1:]
+    objective = kind[-3:]
     options = {"tolerance": 1e-4, "max_beliefs": max_beliefs, "objective": objective}
     answer = jl.values.belief_bounds(pomdp, "goal", reward=reward, **options)
     write_certificate(path, pomdp, answer, QUESTIONS[kind], max_beliefs=max_beliefs)
@@ -371,3 +372,35 @@ def test_the_coin_is_accepted(tmp_path):
         checker.verdict(str(write(path, coin(vectors=(), covers=(0,), values=(), bound="1"))))[0]
         == 0
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "sides"),
+    [
+        ('Pmax=? [ (! "trap") U "goal" ]', ("lower", "upper")),
+        ('Pmin=? [ F "trap" ]', ("upper", "lower")),
+        ('Pmax=? [ G (! "trap") ]', ("lower", "upper")),
+        ('Pmax=? [ F (G "goal") ]', ("lower", "upper")),
+        ('Pmin=? [ (X (X (F "trap"))) | (F "trap") ]', ("upper", "lower")),
+    ],
+)
+def test_both_sides_of_formulas_are_those_of_the_coin(text, sides, tmp_path):
+    """Policies that see the states satisfy each of them with probability 1, or the minima with 0."""
+    path, rows = tmp_path / "file.umb", [row for state in COIN for row in state]
+    entries = [entry for row in rows for entry in row]
+    starts = [np.cumsum([0, *map(len, parts)]) for parts in (COIN, rows)]
+    begin, labels = [0.5, 0.5, 0, 0, 0, 0], {"goal": [4], "trap": [5]}
+    targets, chances = zip(*entries, strict=True)
+    world = jl.make_sparse(*starts, targets, chances, initial=begin, label=labels)
+    pomdp = jl.models.make_pomdp(world, [0, 0, 1, 1, 2, 3])
+    guess = jl.FiniteMemoryPolicy(np.zeros((4, 1), int), np.zeros(4, int), np.zeros((4, 1), int))
+    write_certificate(path, pomdp, guess, text)
+    assert checker.verdict(str(path))[0] == 0
+    index = json.loads(checker.read_archive(str(path), 2**20)["certificate/index.json"])
+    assert [claim["side"] for claim in index["claims"]] == [*sides]
+    assert "beliefs" in index["claims"][1]
+    for claim in index["claims"]:
+        assert float(Fraction(claim["bound"])) == pytest.approx(0.5, abs=1e-9)
+    write_certificate(path, pomdp, guess, text, max_beliefs=0)
+    index = json.loads(checker.read_archive(str(path), 2**20)["certificate/index.json"])
+    assert index["claims"][1]["bound"] in ("0", "1") and "beliefs" not in index["claims"][1]

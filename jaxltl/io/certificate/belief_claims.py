@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple, cast
@@ -31,7 +31,7 @@ _SWEEPS = 2000  # of value iteration over beliefs, most
 _RISING = 1000  # sweeps after which values that still rise become the informed bound
 _STILL = 1e-10  # relative change of a sweep at which iterations end
 _SCALE = 2**48  # denominator of rounded beliefs
-_DENOMINATOR, _CLOSE = 10**6, 1e-14  # of fractions as which weights are read; chance is below 1e-2
+_WIDEST, _DEEPEST = 12, 60  # states and steps of a belief up to which it is exact
 LARGEST_COVER = 64  # terms, the checker's limit
 
 Improvement = Callable[
@@ -95,7 +95,7 @@ class BeliefSearch:
             return None
         known, limit = [self.controller], self.max_beliefs
         bounds = explore(
-            question, known, tolerance=self.tolerance, max_beliefs=limit, max_seconds=np.inf
+            question, known, tolerance=self.tolerance, max_beliefs=limit, improves=False
         )
         return bounds.exploration
 
@@ -107,7 +107,7 @@ class _CheckedNodes:
         self, problem: Certified, claim: checker.ClaimChecker, observation: Integers
     ) -> None:
         self.problem, self.claim = problem, claim
-        graph, self.ends, self.initial = claim.explored()
+        graph, self.ends, self.initial = claim.explored(True)
         node = problem.node.tolist()
         self.seen = observation[problem.node // claim.width]
         self.end: Floats = np.array([self.ends.get(v, 0) / claim.one for v in node])
@@ -223,16 +223,29 @@ class _StoredBeliefs:
         self.place[self.node] = np.arange(self.node.size)
         self._store([], [], np.zeros(0))
         self.check = checker.ClaimChecker(file, claim)
-        self.check.graph, self.check.ends, _ = self.check.explored()  # over its denominator
+        self.check.graph, self.check.ends, _ = self.check.explored(True)  # over its denominator
         some = some.take(self.node)
         checked = nodes.problem.node[number[some.state]].tolist()
         ranges = zip(some.start[:-1].tolist(), some.start[1:].tolist(), strict=True)
         self.beliefs: list[Measure] = [
-            dict(zip(checked[a:b], _integers(some.weight[a:b]), strict=True)) for a, b in ranges
+            dict(zip(checked[a:b], _integers(some.weight[a:b], self._exact(v)), strict=True))
+            for v, (a, b) in zip(self.node.tolist(), ranges, strict=True)
         ]
         self.check.beliefs = self.beliefs
         self.rows = [*self._rows()]
         self.values: Floats = np.zeros(self.node.size)
+
+    def _exact(self, node: int) -> list[Fraction]:
+        """The exact belief of a node, in the order of its states; empty if it is far or large."""
+        graph = self.explored.graph
+        first, last = graph.measures().start[node : node + 2]
+        parent, depth, at = graph.parent.array(), 0, node
+        while at >= 0 and depth <= _DEEPEST:
+            at, depth = int(parent[at]), depth + 1
+        if last - first > _WIDEST or depth > _DEEPEST:
+            return []
+        belief = graph.exact.belief(node)
+        return [belief[s] for s in graph.measures().state[first:last].tolist()]
 
     def _store(self, beliefs: list[Measure], covers: list[list[list[int]]], values: Floats) -> None:
         """Stores arrays in the file: lists of numbers after their lengths."""
@@ -363,7 +376,7 @@ class _StoredBeliefs:
         value, covered = backup(y)
         loose = nodes.outwards(constant + summed(informed))
         is_loose = (loose <= y[owner]) & (owner >= 0) if size else owner >= 0
-        self._keep(y, is_loose[row_of] | (covered >= informed))
+        self._keep(y, is_loose[row_of] | ((covered >= informed) & ~is_closed[row_of]))
         return float(value[owner < 0].max())
 
     def _keep(self, y: Floats, is_informed: Booleans) -> None:
@@ -395,14 +408,13 @@ def _remove(file: checker.CertificateFile, *names: str) -> None:
         file.contents.pop(f"certificate/{name}.bin", None)
 
 
-def _integers(weight: Floats) -> list[int]:
-    """Positive integers in the proportions of a belief: exact for small fractions, else rounded."""
-    share = (weight / weight.sum()).tolist()
-    fractions, common = [], 1
-    for x in share:
-        fraction = Fraction(x).limit_denominator(_DENOMINATOR)
-        common = math.lcm(common, fraction.denominator)
-        if abs(float(fraction) - x) > _CLOSE * x or common > _SCALE:
-            return [max(1, round(x * _SCALE)) for x in share]
-        fractions.append(fraction)
-    return [int(x * common) for x in fractions]
+def _integers(weight: Floats, exact: Sequence[Fraction] = ()) -> list[int]:
+    """Positive integers in the proportions of a belief: exact if they are small, else rounded."""
+    if exact:
+        common = math.lcm(*[x.denominator for x in exact])
+        numbers = [int(x * common) for x in exact]
+        divisor = math.gcd(*numbers)
+        if max(numbers) // divisor < 2**63:
+            return [n // divisor for n in numbers]
+    largest = weight.max()
+    return [max(1, round(x / largest * _SCALE)) for x in weight.tolist()]

@@ -181,7 +181,8 @@ def store(
 def _rationals(values: list[Fraction]) -> tuple[int, bytes]:
     """Numerators and denominators, and the bits of both."""
     ratios = [x.as_integer_ratio() for x in values]
-    words = max(max(n.bit_length() + 1, d.bit_length()) for n, d in ratios) // 64 + 1
+    bits = [max(n.bit_length() + 1, d.bit_length()) for n, d in ratios]
+    words = max(bits, default=0) // 64 + 1
     size = 8 * words
     pairs = (
         n.to_bytes(size, "little", signed=True) + d.to_bytes(size, "little") for n, d in ratios

@@ -282,10 +282,14 @@ def explore(
     *,
     tolerance: float,
     max_beliefs: int,
-    max_seconds: float,
+    max_seconds: float = np.inf,
     report: Report | None = None,
+    improves: bool = True,
 ) -> BeliefBounds:
-    """Expands beliefs that matter most until the bounds are within the tolerance, or a limit is met."""
+    """Expands beliefs that matter most until the bounds are within the tolerance, or a limit is met.
+
+    Without `improves` for the bound of all controllers alone: that of the known ones stays as it is.
+    """
     begin = time.monotonic()
     library = Library(problem, list(controllers))
     graph = BeliefGraph(problem)
@@ -325,7 +329,7 @@ def explore(
             # An improvement, the last one too, takes longer than the one before.
             late = now + _GROWTH * state.latest > state.end
             early = not late and state.seconds <= _IMPROVED * (now - begin)
-            if (early and expanded >= 1.25 * checked + 20) or not leaves:
+            if improves and ((early and expanded >= 1.25 * checked + 20) or not leaves):
                 checked = expanded
                 state.improve(rows)
             rounds += 1
@@ -339,7 +343,8 @@ def explore(
             late = room <= 0 or time.monotonic() + _GROWTH * state.latest > state.end
             depth = _DEEP if rounds & (rounds - 1) == 0 else _DEPTH
             if late or not _grow(state, mass, room, depth):
-                state.improve(rows)
+                if improves:
+                    state.improve(rows)
                 complete = state.gap <= tolerance
                 break
     except KeyboardInterrupt:
