@@ -37,8 +37,10 @@ RUN = ("python", "sh", "pycon", "console")
 # Of a page that says nothing of how it is tested: what is slow in it, by a text.
 SLOW = {"README.md": ("ppo.train(", "jaxltl learn", "mlirl.train(")}
 ALL_SLOW = (
+    "docs/answers.md",
     "docs/continuous-proofs.md",
     "docs/data.md",
+    "docs/deployment.md",
     "docs/devices.md",
     "docs/gallery.md",
     "docs/guides/",
@@ -47,6 +49,7 @@ ALL_SLOW = (
     "docs/prepared.md",
     "docs/tasks-in-environments.md",
     "docs/training-loops.md",
+    "docs/training-runs.md",
     "docs/worlds-of-the-literature.md",
 )
 INSTALLED = re.compile(r"(pip install|pytest|python -m build|git clone|cd )\b")
