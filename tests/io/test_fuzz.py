@@ -8,4 +8,4 @@ from tests.io.fuzz import READERS, try_damaged
 @pytest.mark.few(4)
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files(name, tmp_path):
-    assert try_damaged(name, 300, 0, tmp_path) < 300
+    assert try_damaged(name, 150, 0, tmp_path) < 150

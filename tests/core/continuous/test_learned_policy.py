@@ -74,7 +74,7 @@ def learned(name, environment):
     return module.greedy(*run)
 
 
-@pytest.mark.few(1, 3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["ppo", "trust_region", "cce"])
 @pytest.mark.parametrize("task", [False, True])
 def test_the_function_of_a_learned_policy_has_its_actions_and_a_certificate(name, task):

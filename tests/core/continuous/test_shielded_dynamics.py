@@ -54,6 +54,7 @@ def violations(keys, task, num_steps):
     return (run(keys).world.verdict[:, -1] == Verdict.VIOLATED).mean()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("actions", [CHOICES, ([-1.0], [1.0])], ids=["grid", "box"])
 def test_random_actions_inside_violate_nothing_under_the_worst_gusts(actions):
     keys = jax.random.split(jax.random.key(0), 200)

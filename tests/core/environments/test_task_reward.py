@@ -233,7 +233,7 @@ def check_optimal(name, count):
     assert undone > count / 8, "most problems are decided anyway"
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", EXACT)
 def test_what_is_best_by_the_reward_is_best_by_the_formula(name):
     check_optimal(name, 60)
@@ -277,6 +277,7 @@ def check_shaping(name, count):
             )
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", SHAPED)
 def test_shaping_changes_no_best_policy(name):
     check_shaping(name, 40)

@@ -213,6 +213,7 @@ def test_a_box_of_actions_has_no_mask():
         shield_environment(world, np.ones((1, 2), bool))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("timed", [True, False])
 @pytest.mark.parametrize("tasked", [True, False])
 def test_a_world_below_a_clock_or_a_task_is_shielded(timed, tasked):

@@ -57,7 +57,7 @@ def equal(one, other):
 
 @pytest.mark.parametrize("name", SETS)
 def test_masks_of_zeros_and_ones_are_masks(name):
-    for model, mask, part, _ in models():
+    for model, mask, part, _ in models(2):
         expected = SETS[name](model, mask, part)
         for convert in (np.int64, np.uint8, np.float64, np.ndarray.tolist, jnp.int32):
             equal(SETS[name](model, convert(mask), convert(part)), expected)

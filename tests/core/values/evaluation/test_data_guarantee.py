@@ -243,6 +243,7 @@ def test_a_transition_that_was_not_observed_is_not_taken_for_impossible():
     assert wrong["seen"] > 0.3 * num_logs and wrong["too large"] > 0.3 * num_logs
 
 
+@pytest.mark.few(2, 2)
 @pytest.mark.parametrize("seed", range(4))
 def test_an_assumption_never_guarantees_less_than_none(seed):
     """A least probability only shrinks the confidence sets of the complete graph."""

@@ -209,6 +209,7 @@ def require_verdicts(model, rows, cost, parse, relations):
 SEEDS = seeds(1, 3, 40)
 
 
+@pytest.mark.few(1, 3)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", ["dtmc", "mdp"])
 def test_thresholds_of_programs_are_those_of_their_rationals(kind, seed):

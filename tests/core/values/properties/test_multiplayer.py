@@ -257,6 +257,7 @@ def test_a_game_of_modules(text, value):
     check(game(RELAY), text, value)
 
 
+@pytest.mark.few(6, 6)
 @pytest.mark.parametrize(
     ("text", "value"),
     [

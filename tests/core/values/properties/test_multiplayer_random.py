@@ -82,6 +82,7 @@ def check_game(seed: int, most: int = 8) -> int:
     return count
 
 
+@pytest.mark.few(1, 1)
 @pytest.mark.parametrize("seed", range(2))
 def test_every_form_for_every_coalition(seed):
     assert check_game(seed, most=6) == 200

@@ -199,6 +199,7 @@ def require_relative_widths(model):
     return many, good
 
 
+@pytest.mark.few(1, 3)
 @pytest.mark.parametrize("seed", range(2))
 def test_converged_bounds_are_as_narrow_as_a_share_of_the_value(seed):
     for chain in (False, True):
