@@ -11,6 +11,7 @@ satisfaction probability of a fixed controller.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -45,7 +46,10 @@ _LEAST = 1e-4  # of the greatest one; chains have about 1 / _LEAST steps
 _STARTS = ((1, 0.0, 0.3), (2, 0.5, 0.2), (2, 1.0, 0.3), (3, 0.5, 0.2), (3, 1.0, 0.3), (4, 1.0, 0.3))
 _STEPS = 150  # of a start
 _PATIENCE, _STILL = 25, 1e-4  # steps without a change, after which a start ends
-_LARGE = 6000  # pairs of product states and memory states beyond which a start is left out
+_LARGE = 6000  # pairs of product states and memory states beyond which a start has a limit of time
+_SECONDS = (
+    30.0  # of such starts but the first, with the certificates of their controllers, all together
+)
 _CUTS = (1e-7, 1e-2, 0.1, 0.3)  # probabilities up to which actions are left out of a result
 _DONE = 1e-9  # distance to the upper bound at which the search ends
 _WIDTH = 1e-9  # of the bounds of a controller's value
@@ -161,16 +165,20 @@ def learned_satisfaction(
 
 def _candidates(problem: BeliefProblem) -> Iterator[FiniteMemoryPolicy]:
     """Controllers by gradient ascent, each with its less likely actions and without them."""
+    end = np.inf
     for seed, (num_memory, scale, rate) in enumerate(_STARTS):
         if seed and num_memory * problem.num_states > _LARGE:
-            continue
+            end = min(end, time.monotonic() + _SECONDS)
+        if time.monotonic() >= end:
+            break
         ascent = SoftmaxAscent.random(problem, num_memory, scale, seed)
         ascent.rate = rate
         values: list[float] = []
         for _ in range(_STEPS):
             values.append(ascent.step())
             still = len(values) > _PATIENCE and abs(values[-1] - values[-1 - _PATIENCE]) < _STILL
-            if still or not np.isfinite(values[-1]):
+            late = time.monotonic() >= end
+            if still or late or not np.isfinite(values[-1]):
                 break
         policy = ascent.policies()[0]
         yield policy

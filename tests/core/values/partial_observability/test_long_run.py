@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.values.partial_observability import controller_gradient
+from jaxltl.core.values.partial_observability import controller_gradient, long_run
 from jaxltl.core.values.partial_observability.controller_gradient import SoftmaxAscent
 from jaxltl.core.values.partial_observability.long_run import (
     controller_satisfaction,
@@ -61,6 +61,17 @@ def test_one_memory_state_fails_and_two_succeed():
     low, high = controller_satisfaction(pomdp, memoryless(0.5), once)
     assert low <= 0.25 <= high and high - low < 1e-9
     assert float(jl.optimal_satisfaction(pomdp, once).lower) > 1 - 1e-9
+
+
+def test_large_products_have_several_starts_within_a_limit_of_time(monkeypatch):
+    monkeypatch.setattr(long_run, "_LARGE", 0)
+    assert float(jl.optimal_satisfaction(fork(), ALTERNATE).lower) == 1
+    monkeypatch.setattr(
+        long_run, "_SECONDS", 0.0
+    )  # then the first start alone, of one memory state
+    alone = jl.optimal_satisfaction(fork(), ALTERNATE)
+    assert (float(alone.lower), float(alone.upper)) == (0.0, 1.0)
+    assert alone.status == jl.Status.MAX_STEPS
 
 
 def test_the_other_bound_is_of_policies_that_see_the_states_or_of_beliefs_that_have_lost():
