@@ -265,11 +265,11 @@ def _wins_somewhere(game: Game, region: np.ndarray) -> bool:
 
 def _require_start(game: Game, region: np.ndarray) -> None:
     if not _wins_somewhere(game, region):
-        state = np.argwhere(np.asarray(game.initial) > 0)[0].tolist()
-        name = state[0] if len(state) == 1 else tuple(state)
+        state, *memory = np.argwhere(np.asarray(game.initial) > 0)[0].tolist()
+        name = f"{state}, with memory state {memory[0]}" if memory else state
         raise ValueError(
             "the specification is unrealizable: the environment wins from every initial state, "
-            f"for example {name}. winning_region(...).counter_action shows how; weaken the "
+            f"for example state {name}. winning_region(...).counter_action shows how; weaken the "
             "task, or assume something of the environment."
         )
 
