@@ -21,7 +21,8 @@ import numpy as np
 from jaxltl import checker
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.pomdp import POMDP
-from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
+from jaxltl.core.values.partial_observability.bounds import BeliefRows
+from jaxltl.core.values.partial_observability.controller_gradient import SoftmaxAscent
 from jaxltl.core.values.partial_observability.exploration import Exploration, explore
 from jaxltl.core.values.partial_observability.problem import EPS, reach_problem, reward_problem
 from jaxltl.io.certificate.inductive_bounds import Certified, as_text, store
@@ -29,9 +30,11 @@ from jaxltl.io.certificate.inductive_bounds import Certified, as_text, store
 _INFORMED_SWEEPS = 300  # of the fast informed bound, most
 _SWEEPS = 2000  # of value iteration over beliefs, most
 _RISING = 1000  # sweeps after which values that still rise become the informed bound
+_REACHED = 1e-9  # relative distance to the goal of the exploration at which it ends
+_LOOSE = 1e-8  # relative difference of a belief's bound and what follows from its successors
 _STILL = 1e-10  # relative change of a sweep at which iterations end
 _SCALE = 2**48  # denominator of rounded beliefs
-_WIDEST, _DEEPEST = 12, 60  # states and steps of a belief up to which it is exact
+_WIDEST, _DEEPEST = 40, 100  # states and steps of a belief up to which it is exact
 LARGEST_COVER = 64  # terms, the checker's limit
 
 Improvement = Callable[
@@ -45,8 +48,8 @@ class BeliefSearch:
     """The exploration from which beliefs are stored."""
 
     pomdp: POMDP
-    controller: FiniteMemoryPolicy
-    tolerance: float
+    goal: float  # the bound at which it ends
+    tolerance: float  # of value iteration
     max_beliefs: int
 
     def improve(
@@ -93,10 +96,11 @@ class BeliefSearch:
             question = reach_problem(pomdp, target & nodes.is_end, ~lost, maximize=maximize)
         if not (question.initial > 0).any():
             return None
-        known, limit = [self.controller], self.max_beliefs
-        bounds = explore(
-            question, known, tolerance=self.tolerance, max_beliefs=limit, improves=False
-        )
+        known = SoftmaxAscent.random(question, 1, 0.0, 0).policies()
+        goal, limit = self.goal, self.max_beliefs
+        goal = 1 - goal if nodes.claim.is_negated else goal
+        goal += (1 if maximize else -1) * _REACHED * max(1.0, abs(goal))
+        bounds = explore(question, known, tolerance=self.tolerance, max_beliefs=limit, goal=goal)
         return bounds.exploration
 
 
@@ -261,10 +265,23 @@ class _StoredBeliefs:
     def _terms(self) -> dict[int, list[int]]:
         """The stored beliefs of which each node of the exploration is made, by decreasing use."""
         terms = {v: [j] for j, v in enumerate(self.node.tolist())}
-        leaf, matrix = self.explored.interpolation.leaves()
-        for i, node in enumerate(leaf.tolist()):
-            to = self.place[matrix.indices[matrix.indptr[i] : matrix.indptr[i + 1]]]
-            terms[node] = to[to >= 0].tolist()[:LARGEST_COVER]
+        outer, rows = (
+            self.explored.outer,
+            BeliefRows(self.explored.graph, self.explored.graph.rows()),
+        )
+        table, sign = rows.table, 1 if self.nodes.claim.is_upper else -1
+        backup = np.full(outer.size, -np.inf)
+        np.maximum.at(
+            backup, table["node"], sign * (table["gain"] + table["lost"] + rows.matrix @ outer)
+        )
+        # The bound of an expanded belief may be that of its decomposition, before it was expanded.
+        is_loose = backup > sign * outer + _LOOSE * np.abs(outer)
+        for expanded in (False, True):
+            leaf, matrix = self.explored.interpolation.leaves(expanded)
+            for i, node in enumerate(leaf.tolist()):
+                to = self.place[matrix.indices[matrix.indptr[i] : matrix.indptr[i + 1]]]
+                if not expanded or is_loose[node]:
+                    terms[node] = to[to >= 0].tolist()[:LARGEST_COVER]
         return terms
 
     def _rows(self) -> Iterator[_BeliefRow]:

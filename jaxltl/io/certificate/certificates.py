@@ -162,7 +162,7 @@ def write_certificate(
             file = checker.CertificateFile(contents)
         except checker.Refusal as error:
             raise ValueError(f"the checker refuses the model or the question: {error}.") from None
-        problems, search = [problem], None
+        problems, search, limit = [problem], None, 0
         if induced is not None:
             problems = [induced]
             for name, (values, shape) in arrays.items():
@@ -170,14 +170,11 @@ def write_certificate(
         elif pomdp is not None and controller is not None:
             problems = _of_controller(problem, file, policy_of_states(pomdp, controller))
             limit = validation.integer("max_beliefs", max_beliefs, least=0)
-            width = TOLERANCE
-            if isinstance(solution, Solution):  # of rewards relative
-                scale = abs(float(solution.value)) if prop.operator == "R" else 1.0
-                width = max(float(solution.upper - solution.lower), 0.0) / max(scale, 1e-300)
-            search = BeliefSearch(pomdp, controller, width, limit) if limit else None
         claims = []
         for part in problems:
-            improve = None if search is None or part is problems[0] else search.improve
+            if limit and claims and pomdp is not None:
+                search = _search(pomdp, answer, str(claims[0]["bound"]), prop, limit)
+            improve = None if search is None else search.improve
             if automaton is not None:
                 claims += formula_claims(part, file, automaton, improve)
             else:
@@ -205,6 +202,20 @@ def _policies(
         )
     policy_of_states(pomdp, attained)
     return attained, None
+
+
+def _search(
+    pomdp: POMDP, answer: Solution | None, attained: str, prop: Property, max_beliefs: int
+) -> BeliefSearch:
+    """The search for a bound of all policies as close as that of an answer, or to a tolerance."""
+    value = float("inf") if attained == "inf" else float(Fraction(attained))
+    scale = abs(value) if prop.operator == "R" else 1.0
+    sign = 1 if prop.objective == "max" else -1
+    goal = value + sign * TOLERANCE * scale
+    if answer is not None:
+        goal = float(answer.upper if sign > 0 else answer.lower)
+    width = min(abs(goal - value) / max(scale, 1e-300), TOLERANCE)
+    return BeliefSearch(pomdp, goal, width, max_beliefs)
 
 
 def _of_controller(

@@ -284,11 +284,11 @@ def explore(
     max_beliefs: int,
     max_seconds: float = np.inf,
     report: Report | None = None,
-    improves: bool = True,
+    goal: float | None = None,
 ) -> BeliefBounds:
     """Expands beliefs that matter most until the bounds are within the tolerance, or a limit is met.
 
-    Without `improves` for the bound of all controllers alone: that of the known ones stays as it is.
+    With a `goal` until the bound of all controllers is as good, without a search for controllers.
     """
     begin = time.monotonic()
     library = Library(problem, list(controllers))
@@ -329,21 +329,23 @@ def explore(
             # An improvement, the last one too, takes longer than the one before.
             late = now + _GROWTH * state.latest > state.end
             early = not late and state.seconds <= _IMPROVED * (now - begin)
-            if improves and ((early and expanded >= 1.25 * checked + 20) or not leaves):
+            if goal is None and ((early and expanded >= 1.25 * checked + 20) or not leaves):
                 checked = expanded
                 state.improve(rows)
             rounds += 1
             if report is not None:
                 low, high = sorted((state.best_inner, state.best_outer))
                 report(expanded, low, high)
-            if state.gap <= tolerance or not leaves:
-                complete = state.gap <= tolerance
+            sign = 1 if problem.maximize else -1
+            reached = goal is not None and sign * state.best_outer <= sign * goal
+            if state.gap <= tolerance or not leaves or reached:
+                complete = reached or state.gap <= tolerance
                 break
             room = max_beliefs - expanded
             late = room <= 0 or time.monotonic() + _GROWTH * state.latest > state.end
             depth = _DEEP if rounds & (rounds - 1) == 0 else _DEPTH
             if late or not _grow(state, mass, room, depth):
-                if improves:
+                if goal is None:
                     state.improve(rows)
                 complete = state.gap <= tolerance
                 break

@@ -70,12 +70,12 @@ class Interpolation:
             share[some] = largest[self._record[some]]
         return share
 
-    def leaves(self) -> Interpolated:
-        """The unexpanded nodes with a decomposition."""
+    def leaves(self, expanded: bool = False) -> Interpolated:
+        """The unexpanded nodes with a decomposition, or those that were expanded since."""
         from scipy.sparse import csr_array
 
         self._extend()
-        leaf = np.flatnonzero((self._record >= 0) & ~self.graph.expanded)
+        leaf = np.flatnonzero((self._record >= 0) & (self.graph.expanded == expanded))
         record = self._record[leaf]
         count = self._count.array()[record]
         entry = concatenated_ranges(self._start.array()[record], count)
