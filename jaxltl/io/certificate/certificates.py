@@ -170,7 +170,7 @@ def write_certificate(
         elif pomdp is not None and controller is not None:
             problems = _of_controller(problem, file, policy_of_states(pomdp, controller))
             limit = validation.integer("max_beliefs", max_beliefs, least=0)
-        claims = []
+        claims: list[dict[str, object]] = []
         for part in problems:
             if limit and claims and pomdp is not None:
                 search = _search(pomdp, answer, str(claims[0]["bound"]), prop, limit)
