@@ -59,7 +59,7 @@ def test_lanes_are_a_vector_environment():
 
 
 @pytest.mark.parametrize("resets", ["next_step", "same_step"])
-def test_many_steps_follow_the_rules_of_the_environment(resets):
+def test_thousands_of_steps_follow_the_rules_of_the_environment(resets):
     lanes, rng = gymnasium_vector(corridor(), 8, resets=resets), np.random.default_rng(0)
     seen, _ = lanes.reset(seed=0)
     place, time, over = np.rint(seen["where"] * 5), seen["time"].copy(), np.zeros(8, bool)
