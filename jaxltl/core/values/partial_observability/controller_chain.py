@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxltl.core.values.engine.iterate import sequential_vmap
 from jaxltl.core.values.engine.linear import inverse, solve_linear
 
-# Pairs up to which a chain is inverted, once for both systems. Seconds of a step in single and double
-# precision (benchmarks/learner_cases.py): 152 pairs 7e-4 and 1e-3, 462 pairs 1e-2 and 1.6e-2, 600 pairs
-# 2e-2 and 3e-2; by BiCGSTAB 2e-3, 5e-3 to 6e-2, and 5e-2 to 1e-1. The inverse of a lane takes 5 MB.
+# Pairs up to which a chain is factorised, once for both systems (benchmarks/learner_cases.py): a step takes
+# 4e-4 s for 152 pairs and 4e-3 s for 462 in single precision; by BiCGSTAB 9e-4 s, and 2e-2 to 6e-2 s. The
+# factors of a lane take 5 MB.
 _DENSE_LIMIT = 768
 
 
@@ -58,12 +58,42 @@ class ControllerChain(NamedTuple):
         return jnp.eye(size, dtype=weight.dtype) - self.discount * moved.reshape(size, size)
 
 
+class Factors(NamedTuple):
+    """A matrix of 2 by 2 blocks ``[[A, B], [C, D]]``, factorised: half the cost of its inverse."""
+
+    first: jax.Array  # the inverse of A
+    right: jax.Array  # B
+    below: jax.Array  # C A^-1
+    second: jax.Array  # the inverse of the Schur complement D - C A^-1 B
+
+    @classmethod
+    def of(cls, matrix: jax.Array) -> Factors:
+        """The factors of ``float[N, N]``, stable as :func:`~jaxltl.core.values.engine.linear.inverse` is."""
+        n = len(matrix) // 64 * 32  # half of the blocks of the inversion
+        first = inverse(matrix[:n, :n]) if n else matrix[:0, :0]
+        right, below = matrix[:n, n:], matrix[n:, :n] @ first
+        return cls(first, right, below, inverse(matrix[n:, n:] - below @ right))
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """The solution for ``[N]``."""
+        n = len(self.first)
+        end = self.second @ (b[n:] - self.below @ b[:n])
+        return jnp.concatenate([self.first @ (b[:n] - self.right @ end), end])
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        n = len(self.first)
+        start = b[:n] @ self.first
+        end = (b[n:] - start @ self.right) @ self.second
+        return jnp.concatenate([start - end @ self.below, end])
+
+
 class ControllerSolver(NamedTuple):
     """Solutions of a controller's chain and of its transpose; lanes of a ``vmap`` one after the other."""
 
     # Batches of gathers are slow, and lanes of one loop would wait for the slowest.
     chain: ControllerChain
-    inverse: jax.Array | None  # ``float[M N, M N]``, of small chains
+    factors: Factors | None  # of small chains
 
     def solve(self, b: jax.Array) -> jax.Array:
         """The solution for a right-hand side ``[M, N]``."""
@@ -71,27 +101,27 @@ class ControllerSolver(NamedTuple):
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
         """The solution of the transposed system."""
-        if self.inverse is None:
+        if self.factors is None:
             return sequential_vmap(partial(_krylov, transposed=True), self.chain, b)
-        return (b.ravel() @ self.inverse).reshape(b.shape)
+        return self.factors.transpose_solve(b.ravel()).reshape(b.shape)
 
 
 def controller_solver(chain: ControllerChain) -> ControllerSolver:
-    """The solver of a chain: inversion of small ones, else BiCGSTAB."""
+    """The solver of a chain: factorisation of small ones, else BiCGSTAB."""
     chain = jax.lax.stop_gradient(chain)
     size = chain.act.shape[0] * chain.act.shape[1]
     small = size <= _DENSE_LIMIT
     return ControllerSolver(
-        chain, sequential_vmap(lambda x: inverse(x.matrix()), chain) if small else None
+        chain, sequential_vmap(lambda x: Factors.of(x.matrix()), chain) if small else None
     )
 
 
 def _solution(solver: ControllerSolver, b: jax.Array) -> jax.Array:
-    if solver.inverse is None:
+    if solver.factors is None:
         return _krylov(solver.chain, b)
-    x = (solver.inverse @ b.ravel()).reshape(b.shape)
+    x = solver.factors.solve(b.ravel()).reshape(b.shape)
     rest = b - solver.chain.matvec(x)  # refined once
-    refined: jax.Array = x + (solver.inverse @ rest.ravel()).reshape(b.shape)
+    refined: jax.Array = x + solver.factors.solve(rest.ravel()).reshape(b.shape)
     return refined
 
 

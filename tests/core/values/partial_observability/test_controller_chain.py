@@ -7,7 +7,12 @@ import pytest
 
 from jaxltl.core.values.partial_observability import controller_chain as chains
 
-SHAPE = NUM_MEMORY, NUM_STATES, NUM_ACTIONS, WIDTH = 2, 7, 3, 2
+SHAPE = NUM_MEMORY, NUM_STATES, NUM_ACTIONS, WIDTH = (
+    2,
+    40,
+    3,
+    2,
+)  # pairs beyond one block of the factors
 
 
 def random_chain(seed, leak):
