@@ -58,7 +58,7 @@ class ControllerChain(NamedTuple):
         return jnp.eye(size, dtype=weight.dtype) - self.discount * moved.reshape(size, size)
 
 
-class Factors(NamedTuple):
+class ChainFactors(NamedTuple):
     """A matrix of 2 by 2 blocks ``[[A, B], [C, D]]``, factorised: half the cost of its inverse."""
 
     first: jax.Array  # the inverse of A
@@ -67,7 +67,7 @@ class Factors(NamedTuple):
     second: jax.Array  # the inverse of the Schur complement D - C A^-1 B
 
     @classmethod
-    def of(cls, matrix: jax.Array) -> Factors:
+    def of(cls, matrix: jax.Array) -> ChainFactors:
         """The factors of ``float[N, N]``, stable as :func:`~jaxltl.core.values.engine.linear.inverse` is."""
         n = len(matrix) // 64 * 32  # half of the blocks of the inversion
         first = inverse(matrix[:n, :n]) if n else matrix[:0, :0]
@@ -93,7 +93,7 @@ class ControllerSolver(NamedTuple):
 
     # Batches of gathers are slow, and lanes of one loop would wait for the slowest.
     chain: ControllerChain
-    factors: Factors | None  # of small chains
+    factors: ChainFactors | None  # of small chains
 
     def solve(self, b: jax.Array) -> jax.Array:
         """The solution for a right-hand side ``[M, N]``."""
@@ -112,7 +112,7 @@ def controller_solver(chain: ControllerChain) -> ControllerSolver:
     size = chain.act.shape[0] * chain.act.shape[1]
     small = size <= _DENSE_LIMIT
     return ControllerSolver(
-        chain, sequential_vmap(lambda x: Factors.of(x.matrix()), chain) if small else None
+        chain, sequential_vmap(lambda x: ChainFactors.of(x.matrix()), chain) if small else None
     )
 
 
