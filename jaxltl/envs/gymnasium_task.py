@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core.array_types import PyTree
-from jaxltl.core.automata.automaton import Automaton, named_propositions
-from jaxltl.core.automata.translate import FormulaLike, to_automaton
+from jaxltl.core.automata.automaton import named_propositions
+from jaxltl.core.automata.translate import FormulaLike
 from jaxltl.core.automata.runs import Verdict
+from jaxltl.core.environments.monitor import automaton_of_any_labels
 from jaxltl.core.environments.task_environment import TaskTables, make_task_tables
 
 Labels = Callable[[PyTree, PyTree], Collection[str]]
@@ -61,7 +62,7 @@ def gymnasium_task(
     >>> int(task.observation_space.n), task.reset(seed=0)[0]
     (48, 0)
     """
-    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    automaton = automaton_of_any_labels(formula)
     names = named_propositions(automaton) if propositions is None else tuple(propositions)
     tables = make_task_tables(
         automaton,

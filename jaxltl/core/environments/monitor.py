@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxltl.core import struct, validation
 from jaxltl.core.automata import Automaton, to_automaton
-from jaxltl.core.automata.automaton import named_propositions
+from jaxltl.core.automata.automaton import MAX_FREE_PROPOSITIONS, named_propositions
 from jaxltl.core.automata.runs import (
     Verdict as Verdict,
     lasso_verdicts as lasso_verdicts,
@@ -24,7 +24,7 @@ from jaxltl.core.automata.runs import (
     verdicts as verdicts,
 )
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief
 
@@ -233,6 +233,27 @@ class VerdictFrequencies(NamedTuple):
     undecided: jax.Array
 
 
+def automaton_of_any_labels(formula: Formula | str | Automaton) -> Automaton:
+    """The automaton that reads every set of the propositions of a formula; an automaton as it is.
+
+    Raises:
+      ValueError: a formula of more than 12 propositions.
+
+    >>> automaton_of_any_labels("a U b").letters.shape
+    (4, 2)
+    """
+    if isinstance(formula, Automaton):
+        return formula
+    names = (parse_ltl(formula) if isinstance(formula, str) else formula).propositions
+    if len(names) > MAX_FREE_PROPOSITIONS:
+        raise ValueError(
+            f"the formula has {len(names)} propositions, and the limit is {MAX_FREE_PROPOSITIONS} where "
+            f"trajectories may have any labels, since all 2^{len(names)} sets of them are read. Let the "
+            "environment label what the formula says of several, such as one proposition for 'c1 | c2'."
+        )
+    return to_automaton(formula)
+
+
 def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[str]) -> FiniteTask:
     """A formula over the columns of a label matrix; computed on the host.
 
@@ -244,14 +265,14 @@ def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[
       :class:`FiniteTask`.
 
     Raises:
-      ValueError: a proposition without a column, a name twice, or an automaton that does not read
-        every subset.
+      ValueError: a proposition without a column, a name twice, over 12 propositions, or an automaton that
+        does not read every subset.
 
     >>> make_finite_task("!wet U dry", ["wet", "dry"]).columns
     (1, 0)
     """
     names = validation.distinct_names("propositions", propositions)
-    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    automaton = automaton_of_any_labels(formula)
     text = "the automaton" if isinstance(formula, Automaton) else f"the formula {str(formula)!r}"
     require_known(named_propositions(automaton), names, text)
     count = len(automaton.propositions)

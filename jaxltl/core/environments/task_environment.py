@@ -23,7 +23,8 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import struct, validation
-from jaxltl.core.automata import Automaton, to_automaton
+from jaxltl.core.automata import Automaton
+from jaxltl.core.automata.runs import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.environments.environment import (
     ENDINGS,
     Environment,
@@ -34,7 +35,7 @@ from jaxltl.core.environments.environment import (
     optional,
     require_environment,
 )
-from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, make_finite_task, verdicts
+from jaxltl.core.environments.monitor import automaton_of_any_labels, make_finite_task
 from jaxltl.core.environments.task_reward import make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
@@ -165,7 +166,7 @@ def make_task_tables(
     """
     validation.choice("ending", ending, ENDINGS)
     propositions = validation.distinct_names("propositions", propositions)
-    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    automaton = automaton_of_any_labels(formula)
     if not isinstance(formula, Automaton):
         require_known(automaton.propositions, propositions, f"the formula {str(formula)!r}")
     with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called

@@ -340,6 +340,11 @@ def impure():
         ((walk, "F goal"), {}, "the formula 'F goal' mentions the proposition 'goal'"),
         ((walk, to_automaton("F goal")), {}, "the automaton mentions the proposition 'goal'"),
         ((walk, to_automaton("F a & F b", [{"a"}, {}])), {}, "does not read the letter"),
+        (
+            (walk, " & ".join(f"F c{i}" for i in range(13))),
+            {},
+            "13 propositions, and the limit is 12",
+        ),
         ((walk, "F a"), {"labels": lambda state: bits(state)[:2]}, r"labels returns bool\[2\]"),
         (
             (walk, "F a"),
