@@ -153,6 +153,7 @@ CALLS = {
     "occupancy_measure": lambda m: jl.occupancy_measure(m, np.ones((8, 2)) / 2, 0.9),
     "with_allowed": lambda m: jl.with_allowed(m, MASK),
     "choice_reward": lambda m: jl.models.choice_reward(m, "stays"),
+    "write_model": lambda m: jl.io.write_model("pomdp.tra", m),
     "solve_program": lambda m: solve_program(read_program(LAMP), "P=? [ F on ]", method="partial"),
     "program_environment": lambda m: program_environment(read_program(LAMP)),
 }
