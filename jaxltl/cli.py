@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -172,7 +172,12 @@ def synthesize(
         # Before the work, since the directory may not be writable.
         held.enter_context(run_job.claimed(out, "game.toml", game_file.read_bytes(), again))
         held.enter_context(float64())
-        progress = held.enter_context(_stages(STAGES))
+        bar = held.enter_context(run_job.progress_bar(len(STAGES), visible=sys.stderr.isatty()))
+
+        def progress(stage: str) -> None:
+            bar.set_description_str(stage, refresh=False)
+            bar.update(STAGES.index(stage) - bar.n)
+
         solved = solve_game(file, progress)
         place = report.place_of(solved, environment)
         progress("writing")
@@ -187,22 +192,6 @@ def synthesize(
             "please report it with the game file."
         )
     solved.demand()
-
-
-@contextlib.contextmanager
-def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
-    """A progress bar over named stages, shown after a second."""
-    from tqdm import tqdm
-
-    form = "{desc} {bar} {elapsed}"
-    # disable=None hides the bar if standard error is no terminal.
-    with tqdm(total=len(names), leave=False, delay=1, bar_format=form, disable=None) as bar:
-
-        def begin(name: str) -> None:
-            bar.set_description_str(f"{name:9}", refresh=False)
-            bar.update(names.index(name) - bar.n)
-
-        yield begin
 
 
 @main.command()

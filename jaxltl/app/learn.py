@@ -16,7 +16,7 @@ from jaxltl.app.files.task_irl import MlirlFile
 from jaxltl.app.files import worlds
 from jaxltl.app.reports import steps
 from jaxltl.app.reports import page
-from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
+from jaxltl.app.wording import Record, Result, about, bounds_of, counted, enclosure, plain
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import Product, Trajectories, product, project_policy, restrict
 from jaxltl.core.models.construct.lifting import memory_along
@@ -260,11 +260,11 @@ def _guarantee_entry(setup: MlirlSetup, kept: mlirl.GuaranteedPolicy) -> Record:
 def _evidence(
     solution: Solution, model: Product, world: worlds.MappedModel, starts: np.ndarray
 ) -> Record:
-    parts = solution.value, solution.lower, solution.upper
-    value, lower, upper = (from_starts(model, x) for x in parts)
+    parts = bounds_of(solution)
+    value, lower, upper = (from_starts(model, x) for x in parts.values())
     worst = int(starts[np.argmin(value[starts])])
     return {
-        "mean": enclosure(*(at_starts(model, x, "mean")[0] for x in parts)),
+        "mean": {k: at_starts(model, x, "mean")[0] for k, x in parts.items()},
         "minimum": {
             **enclosure(value[worst], lower[starts].min(), upper[worst]),
             **world.position(worst),

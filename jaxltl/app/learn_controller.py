@@ -15,7 +15,7 @@ from jaxltl.algos.common.seeds import Training, make_hparams
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_rl import ControllerFile
 from jaxltl.app.files.worlds import grid_options
-from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
+from jaxltl.app.wording import Record, Result, about, bounds_of, counted, plain
 from jaxltl.io.certificate.results import Certifiable, formula_question
 from jaxltl.plot.drawing import Picture, automaton_picture, drawing
 from jaxltl.plot.explorer import LONGEST_RUN, Explorer, MapLayer, ReportTrajectory
@@ -25,7 +25,7 @@ from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models import POMDP, belief_filter, rollout
 from jaxltl.core.models.pomdp import policy_of_states
 from jaxltl.core.policies.policy_file import save_policy
-from jaxltl.core.types import AtInitial, Solution, Status
+from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values import controlled_chain, mealy_machine, optimal_satisfaction
 from jaxltl.core.values.partial_observability.reduction import MealyTransition
@@ -127,10 +127,6 @@ def learn(setup: ControllerSetup, training: Training) -> ControllerOutcome:
     )
 
 
-def _entry(value: AtInitial | Solution) -> Record:
-    return enclosure(*(float(np.asarray(x)) for x in (value.value, value.lower, value.upper)))
-
-
 def summary(outcome: ControllerOutcome) -> Record:
     """The results for ``result.json``."""
     setup, learned = outcome.setup, outcome.learned
@@ -144,14 +140,14 @@ def summary(outcome: ControllerOutcome) -> Record:
             "num_memory": learned.policy.next_memory.shape[1],
             "max_memory": setup.hparams.num_memory,
             "start": learned.start,
-            "satisfaction": _entry(learned.satisfaction),
+            "satisfaction": bounds_of(learned.satisfaction),
             "bounds": {
-                **_entry(explored),
+                **bounds_of(explored),
                 "num_memory": learned.reduced.next_memory.shape[1],
                 "status": Status(int(explored.status)).name,
                 "method": explored.method,
             },
-            "fully_observable": _entry(learned.fully_observable),
+            "fully_observable": bounds_of(learned.fully_observable),
             "starts": {
                 "number": history["value"].shape[1],
                 "value": history["value"][-1],
@@ -175,10 +171,8 @@ def save(out: Path, outcome: ControllerOutcome) -> None:
 
     Further arrays: ``observation [S]`` of each cell, ``value``, ``lower`` and ``upper``.
     """
-    learned = outcome.learned
-    bounds = {x: np.asarray(getattr(learned.satisfaction, x)) for x in ("value", "lower", "upper")}
-    seen = {"observation": np.asarray(outcome.setup.pomdp.observation)}
-    save_policy(out / "policy.npz", learned.policy, seen | bounds)
+    learned, seen = outcome.learned, {"observation": outcome.setup.pomdp.observation}
+    save_policy(out / "policy.npz", learned.policy, seen | bounds_of(learned.satisfaction))
 
 
 # --- the report ---------------------------------------------------------------------------

@@ -12,14 +12,13 @@ import numpy as np
 from jaxltl.algos import grounding
 from jaxltl.algos.common.seeds import Training
 from jaxltl.algos.grounding.problem import require_task
-from jaxltl.io.demonstrations import read_demonstrations
-from jaxltl.app.files.schema import read_bytes, read_map
-from jaxltl.app.files.task_irl import GroundingFile, map_file
-from jaxltl.app.files.worlds import grid_options, MappedModel
+from jaxltl.app.files.schema import read_bytes
+from jaxltl.app.files.task_irl import GroundingFile, read_entry
+from jaxltl.app.files.worlds import MappedModel, grid_options, read_all
 from jaxltl.io.certificate.results import Certifiable, policy_certificate
 from jaxltl.plot.drawing import Picture, automaton_picture, drawing
 from jaxltl.app.reports import page
-from jaxltl.app.wording import Record, Result, about, counted, enclosure, plain
+from jaxltl.app.wording import Record, Result, about, bounds_of, counted, plain
 from jaxltl.core import models
 from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, Status
@@ -71,8 +70,7 @@ class GroundingOutcome:
 def prepare(task: GroundingFile, seed: int) -> GroundingSetup:
     """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
     path = task.path
-    maps = zip(map(map_file, task.maps), task.maps, strict=True)
-    texts = [read_map(path, str(x) if name is None else {"file": name}) for name, x in maps]
+    texts = [read_entry(path, entry) for entry in task.maps]
     options = grid_options(task.world)
     wall = task.world.wall or "#"
     with errors_in(f"{path}: [world] "):
@@ -135,8 +133,7 @@ def _demonstrations(
     """Demonstrations in each world, read or simulated with the hidden meanings."""
     table, trajectories = task.demonstrations, []
     if table.files is not None:
-        files = [task.path.parent / name for name in table.files]
-        return [read_demonstrations(x, world) for x, world in zip(files, worlds, strict=True)]
+        return read_all(task.path, table.files, worlds)
     with errors_in(f"{task.path}: "):
         automaton, meaning = require_task(task.formula), table.meaning or {}
         for symbol in automaton.propositions:
@@ -220,8 +217,7 @@ def _answer(
 
 def _mean(answer: GroundingAnswer, solution: Solution) -> Record:
     """A probability from the initial distribution, with its bounds."""
-    parts = (solution.value, solution.lower, solution.upper)
-    mean = enclosure(*(at_starts(answer.model, x, "mean")[0] for x in parts))
+    mean = {k: at_starts(answer.model, x, "mean")[0] for k, x in bounds_of(solution).items()}
     return {**mean, "status": Status(int(solution.status)).name}
 
 

@@ -24,11 +24,10 @@ from jaxltl.app.files.scenes import (
     ObservedScene,
     cell_kinds,
     load_automata,
-    load_demonstrations,
     load_scenes,
 )
 from jaxltl.app.files.task_irl import TodirlFile
-from jaxltl.app.files.worlds import synthetic_demonstrations
+from jaxltl.app.files.worlds import read_all, synthetic_demonstrations
 from jaxltl.app.reports import steps
 from jaxltl.app.reports import page
 from jaxltl.app.todirl_results import LENGTH, TodirlOutcome, TodirlSetup, summary as summary
@@ -64,7 +63,7 @@ def prepare(task: TodirlFile, seed: int) -> TodirlSetup:
         trivial = check_formula(automaton)
     training, others = load_scenes(task, automaton)
     scenes = [*training, *others]
-    demonstrations = load_demonstrations(task, training) if table.files is not None else []
+    demonstrations = read_all(task.path, table.files, training) if table.files is not None else []
     with errors_in(f"{task.path}: "):
         worlds = todirl.make_worlds(
             [scene.mdp for scene in scenes],
@@ -297,7 +296,7 @@ def sections(outcome: TodirlOutcome) -> list[page.Section]:
     if not np.isnan(scores).any():
         caption += ". The parameters with the least held-out figure are kept"
     parts = page.learning_curves(outcome.kept.learned.history, _FIGURES, caption, len(scores))
-    if time := outcome.result["training"].get("expected_steps"):
+    if time := summary(outcome)["training"].get("expected_steps"):
         parts += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
         parts += _world_sections(outcome, *one)

@@ -161,24 +161,27 @@ class ProcessGroup:
             for name in {**every[0], **other}:
                 one, two = (x.get(name, "nothing") for x in (every[0], other))
                 if one != two:
-                    raise self._error(
+                    raise _found_by_all(
+                        self.process,
                         f"process {process} has {name} {two}, and process 0 {one}; start all "
-                        "processes with the same arguments, files and versions."
+                        "processes with the same arguments, files and versions.",
                     )
 
     def sees(self, name: str, here: bool) -> bool:
         """True if a file is present, which must be the same in all processes."""
         every = self.exchanged(str(here))
         if len(set(every)) > 1:
-            raise self._error(
+            raise _found_by_all(
+                self.process,
                 f"process {every.index('False')} does not see {name}; give --out a directory that "
-                "all processes share."
+                "all processes share.",
             )
         return here
 
-    def _error(self, text: str) -> ValueError | SystemExit:
-        """The error that all processes find, and the first reports."""
-        return ValueError(text) if self.is_first else SystemExit(2)
+
+def _found_by_all(process: int, text: str) -> ValueError | SystemExit:
+    """An error that all processes find, and the first reports."""
+    return SystemExit(2) if process else ValueError(text)
 
 
 @contextlib.contextmanager
@@ -200,7 +203,7 @@ def process_group(
     _read_apart(launch)
     try:
         _join(launch, options.wait)
-        group = ProcessGroup(launch.process, launch.processes, _same_mesh(options, launch))
+        group = ProcessGroup(launch.process, launch.processes, _mesh(options, launch))
         say(f"on {_devices_of(group)} of {launch.processes} processes")
         yield group
     except Exception as error:
@@ -237,16 +240,6 @@ def _choose_devices(options: DeviceOptions, launch: Launch) -> None:
             jax.config.update("jax_num_cpu_devices", options.mesh // launch.processes)
 
 
-def _same_mesh(options: DeviceOptions, launch: Launch) -> Mesh:
-    """The mesh; all processes find the same error, and only the first reports it."""
-    try:
-        return _mesh(options, launch)
-    except ValueError:
-        if launch.process:
-            raise SystemExit(2) from None
-        raise
-
-
 def _mesh(options: DeviceOptions, launch: Launch) -> Mesh:
     """Mesh of an equal number of devices of each process, on one axis."""
     import jax
@@ -258,17 +251,19 @@ def _mesh(options: DeviceOptions, launch: Launch) -> Mesh:
     number = len(each[0])
     other = next((p for p, x in enumerate(each) if len(x) != number), None)
     if other is not None:
-        raise ValueError(
+        raise _found_by_all(
+            launch.process,
             f"process {other} has another number of devices, {len(each[other])}, than "
-            f"process 0, {number}; give all processes as many."
+            f"process 0, {number}; give all processes as many.",
         )
     per = options.mesh // launch.processes if options.mesh else number
     if number < per:
         several = launch.processes > 1
         takes = f" takes {per} devices of each process" if several else ""
-        raise ValueError(
+        raise _found_by_all(
+            launch.process,
             f"--mesh {options.mesh}{takes}: {'each has' if several else 'there are'} {number} "
-            f"({jax.default_backend()}); give fewer, or --mesh alone for all."
+            f"({jax.default_backend()}); give fewer, or --mesh alone for all.",
         )
     return Mesh(np.array([d for x in each for d in x[:per]]), ("devices",))
 

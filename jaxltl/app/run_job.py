@@ -236,7 +236,7 @@ def _run(
             if group.sees(str(checkpoint), checkpoint.exists()):
                 say(f"going on from {checkpoint}")
             group.sees(str(out), (out / "task.toml").exists())
-            bar = held.enter_context(_progress_bar(task.learner.steps, visible=group.is_first))
+            bar = held.enter_context(progress_bar(task.learner.steps, visible=group.is_first))
             begun = begin_drawing(
                 job.task_pictures(setup) if group.is_first else [], console.artist
             )
@@ -341,7 +341,7 @@ def seed_distribution(num_seeds: int, num_devices: int) -> str:
 
 
 @contextlib.contextmanager
-def _progress_bar(total: int, *, visible: bool) -> Iterator[tqdm[Any]]:
+def progress_bar(total: int, *, visible: bool) -> Iterator[tqdm[Any]]:
     """A progress bar that refreshes its clock each second, also while the work blocks.
 
     Where standard error is no terminal, each stage has a line, and another one each ten seconds.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 
 import jax
 import numpy as np
@@ -53,7 +53,7 @@ class TodirlSetup:
         return np.array([w for w, name in names if w >= count and name not in exempt], int)
 
 
-@dataclass
+@dataclass(eq=False)  # hashed by identity
 class TodirlOutcome:
     """Learned rewards of all seeds and their evaluations."""
 
@@ -61,18 +61,10 @@ class TodirlOutcome:
     kept: TransferredReward
     seed: int  # the first seed
 
-    @cached_property
-    def result(self) -> Record:
-        """The result as a JSON object."""
-        return _summary(self)
 
-
+@lru_cache(maxsize=1)
 def summary(outcome: TodirlOutcome) -> Record:
     """The results for ``result.json``."""
-    return outcome.result
-
-
-def _summary(outcome: TodirlOutcome) -> Record:
     setup, task, demands = outcome.setup, outcome.setup.task, outcome.setup.demands
     pairs = [int(np.sum(trajectories.length)) for trajectories in demands.demonstrations]
     result = {

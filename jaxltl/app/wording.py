@@ -21,6 +21,11 @@ def enclosure(*numbers: object) -> Record:
     return dict(zip(("value", "lower", "upper"), numbers, strict=True))
 
 
+def bounds_of(quantity: Any) -> Record:
+    """The value of a solution or of another certified quantity, with its bounds."""
+    return enclosure(quantity.value, quantity.lower, quantity.upper)
+
+
 def counted(number: int, noun: str) -> str:
     """Number with its noun, in the plural unless the number is 1."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

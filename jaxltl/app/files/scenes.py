@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -10,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.validation import errors_in
-from jaxltl.io.demonstrations import read_demonstrations
-from jaxltl.app.files.schema import read_map
-from jaxltl.app.files.task_irl import TodirlFile, ScenesTable, map_file
+from jaxltl.app.files.task_irl import TodirlFile, ScenesTable, map_file, read_entry
 from jaxltl.app.files.worlds import MappedModel, grid_options
 from jaxltl.core.automata import Automaton, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import parse_ltl
-from jaxltl.core.models import Trajectories
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import cell_observations, parse_map
@@ -72,14 +68,9 @@ def load_scenes(
 def _read_scene(
     task: TodirlFile, table: str, number: int, entry: str | dict[str, str]
 ) -> ObservedScene:
-    file = map_file(entry)
-    name = f"map {number + 1}" if file is None else file
+    name = map_file(entry) or f"map {number + 1}"
     with errors_in(f"{task.path}: [{table}] {name}: "):
-        text = (
-            entry
-            if isinstance(entry, str) and file is None
-            else read_map(task.path, {"file": str(file)})
-        )
+        text = read_entry(task.path, entry)
         world, radius = task.world, task.learner.radius
         if task.is_colored:
             names = ("margin", "slip", "objects", "obstacles")
@@ -181,9 +172,3 @@ def _translate(
         require_known(formula.propositions, names, "the formula")
         letters = dict.fromkeys(letter & set(formula.propositions) for letter in alphabet)
         return to_automaton(formula, letters=list(letters))
-
-
-def load_demonstrations(task: TodirlFile, scenes: Sequence[ObservedScene]) -> list[Trajectories]:
-    """The demonstrations in each of the training worlds, from their files."""
-    files = (task.path.parent / name for name in task.demonstrations.files or ())
-    return [read_demonstrations(file, scene) for file, scene in zip(files, scenes, strict=True)]

@@ -58,6 +58,7 @@ Count = Annotated[
 WholeNumber = Annotated[int, Meta("a whole number of at least 0", _in(0, LARGEST_INT), "5")]
 Number = Annotated[float, Meta("a finite number", example="1.5")]
 NonNegative = Annotated[float, Meta("a finite number of at least 0", _in(0), "0.01")]
+Positive = Annotated[float, Meta("a positive number", lambda v: v > 0, "60")]
 Unit = Annotated[float, Meta("a finite number in [0, 1]", _in(0, 1), "0.1")]
 Discount = Annotated[float, Meta("a finite number in [0, 1)", lambda v: 0 <= v < 1, "0.95")]
 Confidence = Annotated[float, Meta("a number between 0 and 1, such as 0.95", lambda v: 0 < v < 1)]
@@ -209,11 +210,9 @@ def read_bytes(path: Path, kind: str) -> bytes:
 
 def read_map(path: Path, entry: str | Mapping[str, str]) -> str:
     """The text of a map in a task file, or in the file that it names."""
-    return (
-        entry
-        if isinstance(entry, str)
-        else read_bytes(path.parent / entry["file"], "the map").decode()
-    )
+    if isinstance(entry, str):
+        return entry
+    return read_bytes(path.parent / entry["file"], "the map").decode()
 
 
 # --- conversion -----------------------------------------------------------------------------

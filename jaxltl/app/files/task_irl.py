@@ -7,6 +7,7 @@ relative to the task file.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from jaxltl.app.files.hyperparameters import hparams_table
@@ -27,6 +28,7 @@ from jaxltl.app.files.schema import (
     WholeNumber,
     Widths,
     key,
+    read_map,
     table,
 )
 from jaxltl.app.files.task import (
@@ -394,6 +396,12 @@ def map_file(entry: str | dict[str, str]) -> str | None:
     if isinstance(entry, dict):
         return entry["file"]
     return None if "\n" in entry else entry
+
+
+def read_entry(path: Path, entry: str | dict[str, str]) -> str:
+    """The text of a map of ``maps`` in a task file."""
+    name = map_file(entry)
+    return read_map(path, entry if name is None else {"file": name})
 
 
 # --- grounding ------------------------------------------------------------------------------------

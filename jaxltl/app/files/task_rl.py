@@ -17,6 +17,7 @@ from jaxltl.app.files.schema import (
     Meta,
     NonNegative,
     Number,
+    Positive,
     Propositions,
     Text,
     TomlTable,
@@ -296,7 +297,7 @@ class BoundsTable(TomlTable):
 
     tolerance: Confidence = key("Width at which the exploration ends.", default=1e-3)
     beliefs: Count = key("Largest number of explored beliefs.", default=2000)
-    seconds: NonNegative | None = key("Limit of the exploration; default none.", "60")
+    seconds: Positive | None = key("Limit of the exploration; default none.")
 
 
 @table
@@ -308,12 +309,6 @@ class ControllerFile(FormulaFile):
     learner: StartsTable = key("The learner.")
     controller: ControllerTable = key("Hyperparameters.")
     bounds: BoundsTable = key("Bounds of all controllers.")
-
-    def __attrs_post_init__(self) -> None:
-        self.require(
-            self.bounds.seconds is None or self.bounds.seconds > 0,
-            "[bounds] seconds = 0; give a positive number of seconds, or leave it out.",
-        )
 
     def named_files(self) -> Sequence[str]:
         return [self.world.map["file"]] if isinstance(self.world.map, dict) else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,10 +77,16 @@ def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:
 # --- demonstrations -------------------------------------------------------------------------------
 
 
+def read_all(path: Path, files: Sequence[str], worlds: Sequence[NamedWorld]) -> list[Trajectories]:
+    """The demonstrations of the files that a task file names, one for each world."""
+    pairs = zip(files, worlds, strict=True)
+    return [read_demonstrations(path.parent / name, world) for name, world in pairs]
+
+
 def load_demonstrations(task: MlirlFile, world: MappedModel) -> Trajectories:
     """The demonstrations of a task's file; see :func:`~jaxltl.io.read_demonstrations`."""
     assert task.demonstrations.file is not None
-    return read_demonstrations(task.path.parent / task.demonstrations.file, world)
+    return read_all(task.path, [task.demonstrations.file], [world])[0]
 
 
 def synthetic_demonstrations(
