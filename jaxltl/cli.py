@@ -32,6 +32,7 @@ from jaxltl.app.command_options import (
     compiling,
     options as with_options,
     plain_errors,
+    write_proofs,
 )
 from jaxltl.app.compilation import float64
 from jaxltl.plot.drawing import artist
@@ -355,12 +356,9 @@ def solve(
             file.write(solving.strategies(model, results, model_file))
         proofs: Record = {}
         if certificate is not None:
-            from jaxltl.io.certificate.results import certificate_lines, write_certificates
-
+            click.echo()
             answered = [solving.certifiable(model, result) for result in results]
-            records = write_certificates(certificate.parent, answered, certificate.name)
-            click.echo("\n".join(["", *certificate_lines(records, certificate.parent)]))
-            proofs = {"certificates": records}
+            proofs = {"certificates": write_proofs(certificate, answered)}
     if options.as_json and group.is_first:
         entries = [solving.result_entry(r) for r in results]
         _print_json({"model": entry, "results": entries, **proofs})

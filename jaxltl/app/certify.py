@@ -14,11 +14,12 @@ import click
 import numpy as np
 
 from jaxltl.io.padded_models import padded
-from jaxltl.app.command_options import CertifyOptions
+from jaxltl.app.command_options import CertifyOptions, write_proofs
 from jaxltl.app.files.task_irl import ModelTable
 from jaxltl.app.wording import Record
 from jaxltl.core import validation
 from jaxltl.core import models
+from jaxltl.core.models.construct.counts import listed
 from jaxltl.core.pretty_print import rounded_outward
 from jaxltl.core.statistics.confidence_sets import Graph, LeastProbability, check_confidence
 from jaxltl.core.types import Status
@@ -85,25 +86,11 @@ def read_evidence(
     if not initial:
         raise ValueError(
             f"{str(log)!r} does not name the states in which episodes begin; add "
-            f"{option.format('initial')}STATE. It has the states {_some(counts)}."
+            f"{option.format('initial')}STATE; there are {listed(counts.states)}."
         )
-    for option_name, names in (("initial", initial), ("terminal", terminal)):
-        unknown = [x for x in names if x not in counts.states]
-        if unknown:
-            raise ValueError(
-                f"{option.format(option_name)}{unknown[0]}: the log has no such state; it "
-                f"has {_some(counts)}."
-            )
-    known = None if labels is None else read_labels(labels, counts.states)
-    graph = graph or "complete"
-    sparse, count = models.model_from_counts(
-        counts,
-        initial=list(initial),
-        labels=known,
-        terminal=terminal,
-        graph=graph,  # type: ignore[arg-type]
-    )
-    return _named(sparse, count, graph)
+    assumed: Record = {"labels": None if labels is None else read_labels(labels, counts.states)}
+    assumed |= {"initial": list(initial), "terminal": terminal, "graph": graph or "complete"}
+    return _named(*models.model_from_counts(counts, **assumed), assumed["graph"])
 
 
 def graph_of_options(
@@ -118,12 +105,6 @@ def graph_of_options(
         "least probability", least_probability, Range(0, 1, open_below=True)
     )
     return LeastProbability(least_probability, failure=(1 - confidence) / 10)
-
-
-def _some(counts: models.TransitionCounts) -> str:
-    names = ", ".join(counts.states[:8])
-    more = len(counts.states) - 8
-    return names + (f" and {more} more" if more > 0 else "")
 
 
 def _named(model: models.SparseMDP, counts: np.ndarray, graph: Graph) -> CountEvidence:
@@ -288,8 +269,7 @@ def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Recor
         if proof is not None:
             question = results.formula_question(formula, *directions)
             one = results.Certifiable(guarantee.model, guarantee, question)
-            result["certificates"] = results.write_certificates(proof.parent, [one], proof.name)
-            click.echo("\n".join(results.certificate_lines(result["certificates"], proof.parent)))
+            result["certificates"] = write_proofs(proof, [one])
         if file is not None:
             about = json.dumps({**result, "seconds": None}, allow_nan=False)
             learned = models.project_policy(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -13,9 +13,11 @@ import click
 
 import jaxltl
 from jaxltl.app import compilation
+from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jaxltl.core.statistics.confidence_sets import Method
+    from jaxltl.io.certificate.results import Certifiable
 
 PATH = click.Path(path_type=Path)
 WAIT = 60.0  # seconds
@@ -100,6 +102,15 @@ class Devices(click.ParamType):
         raise Failure(
             f"--mesh {value}: give a number of devices, or all; other arguments come before --mesh."
         )
+
+
+def write_proofs(path: Path, answers: Sequence[Certifiable]) -> list[Record]:
+    """Writes certificates of the option --certificate, and prints what they prove."""
+    from jaxltl.io.certificate.results import certificate_lines, write_certificates
+
+    records = write_certificates(path.parent, answers, path.name)
+    click.echo("\n".join(certificate_lines(records, path.parent)))
+    return records
 
 
 # --- the options of commands ----------------------------------------------------------------------

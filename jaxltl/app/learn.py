@@ -221,6 +221,7 @@ def summary(outcome: MlirlOutcome) -> Record:
 def _guarantee_entry(setup: MlirlSetup, kept: mlirl.GuaranteedPolicy) -> Record:
     """The guarantee and how it was attained, for ``result.json``."""
     guarantee, model, demonstrations = setup.guarantee, setup.model, setup.demonstrations
+    unused, total = guarantee.unused(demonstrations), int(np.sum(demonstrations.length))
     attempt = kept.attempt
     record: Record = {"asked": guarantee.requested, "over": guarantee.over}
     if guarantee.requested == "best" and guarantee.actions is not None:
@@ -229,18 +230,16 @@ def _guarantee_entry(setup: MlirlSetup, kept: mlirl.GuaranteedPolicy) -> Record:
         record |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
         state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
         taken = attempt.policy[state, memory_along(model, state), action] > 0
-        record["never"] = int(
-            (np.asarray(demonstrations.mask) & ~guarantee.unused(demonstrations) & ~taken).sum()
-        )
-    if unused := int(guarantee.unused(demonstrations).sum()):
-        record["unused"] = {"steps": unused, "of": int(np.sum(demonstrations.length))}
-    excluded = guarantee.forbidden & ~guarantee.unused(demonstrations)
+        record["never"] = int((np.asarray(demonstrations.mask) & ~unused & ~taken).sum())
+    if unused.any():
+        record["unused"] = {"steps": int(unused.sum()), "of": total}
+    excluded = guarantee.forbidden & ~unused
     if excluded.any():
         n, t = np.argwhere(excluded)[0]
         before, after = guarantee.cost or (None, None)
         record["left_out"] = {
             "steps": int(excluded.sum()),
-            "of": int(np.sum(demonstrations.length)),
+            "of": total,
             "demonstration": int(n) + 1,
             "step": int(t) + 1,
             "from": before,
@@ -248,10 +247,8 @@ def _guarantee_entry(setup: MlirlSetup, kept: mlirl.GuaranteedPolicy) -> Record:
             **setup.world.position(int(np.asarray(demonstrations.state)[n, t])),
         }
     if guarantee.requested == "none":
-        missing = at_starts(model, np.subtract(guarantee.best.value, kept.solution.value), "mean")[
-            0
-        ]
-        if missing > 1e-3:  # the guarantee of the remedy
+        missing = np.subtract(guarantee.best.value, kept.solution.value)
+        if at_starts(model, missing, "mean")[0] > 1e-3:  # the guarantee of the remedy
             sure = optimal_actions(model, guarantee.best).attained
             record["remedy"] = at_starts(model, sure.lower, "mean")[0]
     return record

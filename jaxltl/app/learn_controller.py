@@ -278,23 +278,14 @@ def _trajectories(outcome: ControllerOutcome) -> list[ReportTrajectory]:
 
 def _values(result: Result) -> Record:
     bounds = result["bounds"]
+    own, best = (counted(x["num_memory"], "memory state") for x in (result, bounds))
+    lower, upper = page.probability(bounds["lower"]), page.probability(bounds["upper"])
+    mine = result["satisfaction"]
     rows = [
-        (
-            f"controller, {counted(result['num_memory'], 'memory state')}",
-            page.probability(result["satisfaction"]["lower"]),
-            page.certified(result["satisfaction"]),
-        ),
-        (
-            f"best explored controller, {counted(bounds['num_memory'], 'memory state')}",
-            page.probability(bounds["lower"]),
-            "lower bound of the optimum",
-        ),
-        ("all controllers", page.probability(bounds["upper"]), "upper bound of the optimum"),
-        (
-            "optimum with full observation",
-            page.probability(result["fully_observable"]["value"]),
-            page.certified(result["fully_observable"]),
-        ),
+        (f"controller, {own}", page.probability(mine["lower"]), page.certified(mine)),
+        (f"best explored controller, {best}", lower, "lower bound of the optimum"),
+        ("all controllers", upper, "upper bound of the optimum"),
+        ("optimum with full observation", *page.cells(result["fully_observable"])),
     ]
     return {"header": ("policy", "probability", "certified"), "rows": rows, "aligned": page.aligned}
 

@@ -146,13 +146,10 @@ def prepare(
 
 def _reward(task: EnvironmentFile, automaton: Automaton) -> Record:
     """The options of the reward, shaped by default where that changes no optimal policy."""
-    reward_options = {
-        key: value for key, value in task.task.specified().items() if key != "formula"
-    }
+    reward_options = task.task.specified()
+    del reward_options["formula"]
     shaping = reward_options.pop("shaping", "auto")
-    own = (
-        getattr(task.settings, "discount", 1.0) or 1.0
-    )  # the learner's; shaping takes it into account
+    own = getattr(task.settings, "discount", 1.0) or 1.0  # the learner's, which shaping regards
     if shaping == "auto":
         shaping = "none"
         options = {key: value for key, value in reward_options.items() if key != "ending"}
@@ -180,15 +177,14 @@ def describe(setup: EnvironmentSetup) -> str:
         if isinstance(actions, Finite)
         else f"actions in a box {list(actions.shape)}"
     )
-    steps = task.learner.steps
+    steps, most = task.learner.steps, setup.method.transitions
     return (
         f"{task.world.function}: {does}, {counted(seen, 'number')} observed, "
         f"{counted(len(environment.propositions), 'label')}; {counted(len(setup.automaton.delta), 'automaton state')} "
         f"({setup.automaton.acceptance}); {task.learner.method} with "
-        f"{setup.method.description}: {counted(steps, 'step')} of at most "
-        f"{setup.method.transitions:,} simulated steps, {steps * setup.method.transitions:,} in "
-        f"total per seed; evaluated by {task.evaluation.episodes:,} fresh episodes of at most "
-        f"{counted(setup.num_steps, 'step')}"
+        f"{setup.method.description}: {counted(steps, 'step')} of at most {most:,} simulated steps, "
+        f"{steps * most:,} in total per seed; evaluated by {task.evaluation.episodes:,} fresh "
+        f"episodes of at most {counted(setup.num_steps, 'step')}"
     )
 
 
@@ -256,11 +252,7 @@ def _acting(setup: EnvironmentSetup, state: PyTree) -> Agent:
 def summary(outcome: EnvironmentOutcome) -> Record:
     """The result as a JSON object."""
     setup, history = outcome.setup, outcome.history
-    task, environment, evaluation = (
-        setup.task,
-        setup.environment,
-        outcome.evaluations[outcome.chosen],
-    )
+    task, environment = setup.task, setup.environment
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
     status = history["status"][:, outcome.chosen]
     # Simulated steps of a seed: the learner's count, or an upper bound.
@@ -281,7 +273,7 @@ def summary(outcome: EnvironmentOutcome) -> Record:
             "acceptance": setup.automaton.acceptance,
             "trivial": setup.trivial,
             "policy": {"made_of": setup.method.description, "acts": setup.acts},
-            "evaluation": _as_numbers(evaluation),
+            "evaluation": _as_numbers(outcome.evaluations[outcome.chosen]),
             "training": {
                 "steps": task.learner.steps,
                 "transitions": upper if made is None else int(made[-1, 0]),

@@ -347,8 +347,7 @@ def _values(result: Result) -> Record:
     worlds = [
         (
             str(w),
-            page.probability(world["attained"]["value"]),
-            page.certified(world["attained"]),
+            *page.cells(world["attained"]),
             page.probability(world["best_achievable"]["value"]),
             "the same" if world["robust"] is None else page.rounded_down(world["robust"]["worst"]),
         )

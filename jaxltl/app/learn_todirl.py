@@ -93,9 +93,8 @@ def prepare(task: TodirlFile, seed: int) -> TodirlSetup:
                 dropped += lost
             demonstrations.append(runs)
     if memory is not automaton:
-        expert = np.tile(
-            expert, (1, 1, len(memory.delta), 1)
-        )  # the formula's automaton state varies fastest
+        # The formula's automaton state varies fastest.
+        expert = np.tile(expert, (1, 1, len(memory.delta), 1))
     with errors_in(f"{task.path}: [task] "):
         demands = todirl.make_demands(
             worlds,
@@ -230,8 +229,7 @@ def _values(result: Result) -> Record:
     evidence = [
         (
             f"{kind}, {policy}",
-            page.probability(one["mean"]["value"]),
-            page.certified(one["mean"]),
+            *page.cells(one["mean"]),
             page.number(one["std"]) if about["num_counted"] > 1 else "",
             f"{page.probability(one['worst_world']['value'])}, {one['worst_world']['name']}",
             page.probability(one["worst_start"]),

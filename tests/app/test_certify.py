@@ -130,7 +130,7 @@ def test_a_model_file_has_the_graph(log, tmp_path):
     ("more", "message"),
     [
         (["--confidence", 1.5], "confidence"),
-        (["--initial", "cellar"], "--initial cellar: the log has no such state; it has hall, "),
+        (["--initial", "cellar"], "initial: there is no state 'cellar'; there are "),
         (["--terminal", "hall"], "terminal state 'hall' was left"),
         (["--curve", "curve.txt"], "--curve curve.txt: the name must end in .svg"),
     ],
@@ -144,7 +144,7 @@ def test_mistakes(log, more, message):
 
 def test_mistakes_in_files(log):
     missing = run(log, "F safe", "--confidence", 0.9).stderr
-    assert "add --initial STATE. It has the states hall, " in missing
+    assert "add --initial STATE; there are 3: 'hall', " in missing
     place = log.parent / "labels.csv"
     place.write_text("state,label\nkitchen,safe\nattic,safe\n")
     assert "line 3" in certified_as_seen(log).stderr

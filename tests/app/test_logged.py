@@ -165,10 +165,10 @@ def test_what_is_guaranteed_of_a_policy(write, label_on, method):
         (('initial = "dock"', ""), "[world] lacks initial, the name of the initial state"),
         (
             ('"dock"', '["dock", "attic"]'),
-            "[world] initial = attic: the log has no such state; it has",
+            "[world] initial: there is no state 'attic'; there are",
         ),
         (('"dock"', "[]"), "initial = []; it must be"),
-        (('["pit"]', '["cellar"]'), "[world] terminal = cellar: the log has no such state"),
+        (('["pit"]', '["cellar"]'), "[world] terminal: there is no state 'cellar'"),
         (('graph = "seen"', ""), "[world] must have either graph ="),
         (('graph = "seen"', 'graph = "seen"\nleast_probability = 0.1'), "must have either graph ="),
         (('graph = "seen"', "least_probability = 0"), "least_probability = 0; it must be"),

@@ -56,7 +56,11 @@ class Report:
         lines = render_text(f"{self.name}.txt", result=result, **self.values(result))
         remarks = self.remarks(result) if self.has_remarks else []
         proofs = certificate_lines(result.get("certificates", ()), out)
-        return "\n".join(lines + remark_lines(remarks) + ([""] if proofs else []) + proofs)
+        lines += [  # as paragraphs, warnings in red
+            "\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text)
+            for kind, text in remarks
+        ]
+        return "\n".join(lines + ([""] if proofs else []) + proofs)
 
     def remarks(self, result: Result) -> list[Remark]:
         """Remarks on the result, by a template whose lines are ``kind: text``."""
@@ -143,14 +147,6 @@ def _static(name: str) -> Markup:
 # --- formats ---------------------------------------------------------------------------------
 
 
-def remark_lines(remarks: Iterable[Remark]) -> list[str]:
-    """Remarks as paragraphs for the terminal, warnings in red."""
-    return [
-        "\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text)
-        for kind, text in remarks
-    ]
-
-
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """The lines of a table of texts."""
     width = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -169,6 +165,11 @@ def mean_deviation(values: Iterable[float | None]) -> str:
 def rounded_down(value: float) -> str:
     """A lower bound, rounded down to four places."""
     return f"{math.floor(value * 1e4) / 1e4:.4f}"
+
+
+def cells(entry: Result) -> tuple[str, str]:
+    """A probability and its certificate, as cells of a table."""
+    return probability(entry["value"]), certified(entry)
 
 
 def certified(entry: Result) -> str:

@@ -248,11 +248,11 @@ def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[Pict
     # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
 
-    figures = []
+    drawn = []
     if synthesis.nodes.automaton is not None and len(synthesis.nodes.automaton.delta) <= 40:
         caption = "States are named by the remaining formula."
-        picture = Picture("automaton.svg", "Automaton of the formula", None, caption, "play")
-        figures.append((picture, plot.automaton(synthesis.nodes.automaton)))
+        svg = plot.to_bytes(plot.automaton(synthesis.nodes.automaton))
+        drawn.append(Picture("automaton.svg", "Automaton of the formula", svg, caption, "play"))
     world = synthesis.world
     if world.text is not None and world.places is not None:
         count = len(world.places)
@@ -262,23 +262,18 @@ def pictures(synthesis: SolvedGame, environment: int | None = None) -> list[Pict
             few = sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
         caption = "A map for each place of the environment's robot."
         region = plot.game_region(synthesis.wins, world.text, environment=few, wall=world.wall)
-        figures.append((Picture("region.svg", "Winning region", None, caption), region))
+        drawn.append(Picture("region.svg", "Winning region", plot.to_bytes(region), caption))
         if synthesis.strategy is not None:
             caption = (
                 "The allowed moves, for one place of the environment's robot; the system wins with "
                 "any choice among them."
             )
-            picture = Picture("moves.svg", "Permissive strategy", None, caption)
-            moves = plot.strategy_moves(
-                synthesis,
-                world.text,
-                environment,
-                actions=world.actions,
-                goals=synthesis.file.task.guarantees or (),
-                wall=world.wall,
-            )
-            figures.append((picture, moves))
-    return [replace(picture, drawing=plot.to_bytes(figure)) for picture, figure in figures]
+            goals, names = synthesis.file.task.guarantees or (), world.actions
+            options: Record = {"actions": names, "goals": goals, "wall": world.wall}
+            moves = plot.strategy_moves(synthesis, world.text, environment, **options)
+            svg = plot.to_bytes(moves)
+            drawn.append(Picture("moves.svg", "Permissive strategy", svg, caption))
+    return drawn
 
 
 def place_of(synthesis: SolvedGame, cell: tuple[int, int] | None) -> int | None:
