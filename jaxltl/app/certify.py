@@ -79,9 +79,8 @@ def read_evidence(
             )
         if graph is not None:
             raise ValueError("a model has its graph; leave --graph and --least-probability out.")
-        return _named(
-            source_model, models.align_counts(source_model, read_log(log, source_model)), "given"
-        )
+        aligned = models.align_counts(source_model, read_log(log, source_model))
+        return _named(source_model, aligned, "given")
     counts = read_log(log)
     if not initial:
         raise ValueError(
@@ -101,9 +100,8 @@ def graph_of_options(
         return graph  # type: ignore[return-value]
     if graph is not None:
         raise ValueError("graph and least probability are two assumptions; give one of them.")
-    validation.require_in_range(
-        "least probability", least_probability, Range(0, 1, open_below=True)
-    )
+    above_zero = Range(0, 1, open_below=True)
+    validation.require_in_range("least probability", least_probability, above_zero)
     return LeastProbability(least_probability, failure=(1 - confidence) / 10)
 
 
@@ -248,9 +246,8 @@ def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Recor
     directions = ("min", "max") if options.smallest else ("max", "min")
     query: Record = {"formula": formula, "objective": directions[0]}
     query |= {"confidence": options.confidence, "method": options.method}
-    source: Record = {
-        name: getattr(options, name) for name in ("labels", "model", "initial", "terminal")
-    }
+    names = ("labels", "model", "initial", "terminal")
+    source: Record = {name: getattr(options, name) for name in names}
     source["graph"] = graph_of_options(options.graph, options.least_probability, options.confidence)
     check_confidence(options.confidence)
     picture, proof = options.curve, options.certificate
@@ -272,9 +269,8 @@ def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Recor
             result["certificates"] = write_proofs(proof, [one])
         if file is not None:
             about = json.dumps({**result, "seconds": None}, allow_nan=False)
-            learned = models.project_policy(
-                evidence.model, guarantee.satisfaction, states=evidence.states
-            )
+            model, best = evidence.model, guarantee.satisfaction
+            learned = models.project_policy(model, best, states=evidence.states)
             save_policy(file, learned, {"result": about})
         if picture is not None and drawing is not None:
             from jaxltl import plot

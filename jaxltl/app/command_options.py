@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 WAIT = 60.0  # seconds
-_CERTIFICATE = (
-    "File for a certificate, which `jaxltl verify` checks; numbered if there are several."
-)
+_CERTIFICATE = "File for a certificate, which `jaxltl verify` checks; several are numbered."
 
 
 class Failure(click.ClickException):

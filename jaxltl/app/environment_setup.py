@@ -74,6 +74,11 @@ class LearnerSetup:
     transitions: int  # bound of the environment's steps in a step of the learner
     description: str  # of the policy
 
+    def state_shapes(self) -> Any:
+        """The shapes of a state."""
+        problem, hparams = self.problem, self.hparams  # not traced
+        return jax.eval_shape(lambda x: self.algorithm.init(x, problem, hparams), jax.random.key(0))
+
 
 def make_method(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     """The learner of a task file."""
@@ -84,10 +89,7 @@ def make_method(task: EnvironmentFile, environment: Environment, num_steps: int)
             f"a step of the learner would make {method.transitions:,} simulated steps; at most "
             f"{_LARGEST_COUNT:,} are counted: simulate fewer or shorter episodes."
         )
-    # With concrete numbers, so that the learner's own checks see them.
-    jax.eval_shape(
-        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
-    )
+    method.state_shapes()  # with concrete numbers, so that the learner's own checks see them
     return method
 
 
@@ -108,9 +110,8 @@ def _settings(task: EnvironmentFile) -> Record:
 
 def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, bool], Agent]:
     """The policy of a state of a learner: greedy, or with drawn actions."""
-    return lambda state, likeliest: (learner.greedy if likeliest else learner.policy)(
-        state, problem, hparams
-    )
+    rules = {True: learner.greedy, False: learner.policy}
+    return lambda state, likeliest: rules[likeliest](state, problem, hparams)
 
 
 def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:

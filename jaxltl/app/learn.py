@@ -51,20 +51,15 @@ class MlirlSetup:
         avoid, used = table.avoid or (), self.guarantee.until_lost(demonstrations)
         # Without a guarantee, those of the dissertation's Table 1 alone.
         best = None if self.guarantee.requested == "none" else self.guarantee.best
+        options: Record = {"avoid": avoid, "progress": table.progress_states, "best": best}
+        if table.in_world:
+            options = {"avoid": avoid, "progress": table.progress_labels, "goal": table.goal or ()}
         return mlirl.Demands(
             model,
             demonstrations,
-            mlirl.world_features(
-                model.mdp,
-                demonstrations,
-                goal=table.goal or (),
-                progress=table.progress_labels,
-                avoid=avoid,
-            )
+            mlirl.world_features(model.mdp, demonstrations, **options)
             if table.in_world
-            else mlirl.task_features(
-                model, used, avoid=avoid, progress=table.progress_states, best=best
-            ),
+            else mlirl.task_features(model, used, **options),
             self.guarantee,
             self.bound,
             in_world=table.in_world,
@@ -106,10 +101,8 @@ def prepare(task: MlirlFile, seed: int) -> MlirlSetup:
     if table.file is not None:
         demonstrations, dropped = worlds.load_demonstrations(task, world), 0
     else:
-        key = jax.random.fold_in(jax.random.key(seed), 0)
-        demonstrations, dropped = worlds.synthetic_demonstrations(
-            key, task.path, table, model, best
-        )
+        simulated = jax.random.fold_in(jax.random.key(seed), 0), task.path, table, model, best
+        demonstrations, dropped = worlds.synthetic_demonstrations(*simulated)
     with errors_in(f"{task.path}: [task] "):
         place = world.position_text
         guarantee = guarantees.make_guarantee(
@@ -181,9 +174,7 @@ def summary(outcome: MlirlOutcome) -> Record:
         "num_states": world.mdp.num_states,
         "num_memory": model.num_memory,
         "demonstrations": {
-            "number": len(lengths),
-            "pairs": int(lengths.sum()),
-            "synthetic": task.demonstrations.synthetic is not None,
+            **task.demonstrations.entry(len(lengths), lengths.sum()),
             "dropped": setup.dropped,
         },
         "guarantee": _guarantee_entry(setup, kept),

@@ -70,10 +70,9 @@ def prepare(task: ControllerFile, seed: int) -> ControllerSetup:
     """The world of a task; ValueError for one that does not fit."""
     del seed
     text, world = read_map(task.path, task.world.map), task.world
+    options = {"hidden": world.hidden or (), **grid_options(world)}
     with errors_in(f"{task.path}: [world] "):
-        pomdp = partial_gridworld(
-            text, world.observations, hidden=world.hidden or (), **grid_options(world)
-        )
+        pomdp = partial_gridworld(text, world.observations, **options)
     with errors_in(f"{task.path}: [task] "):
         _, _, automaton = task_pomdp(pomdp, task.formula)
     hparams = make_hparams(fsc.Hparams, task.controller.specified())
@@ -234,16 +233,13 @@ def _layers(outcome: ControllerOutcome) -> dict[str, MapLayer]:
     """A layer for each memory state, of the cells that are reachable with it."""
     pomdp, policy = outcome.setup.pomdp, outcome.learned.policy
     action = np.asarray(policy_of_states(pomdp, policy).action)
-    value = np.asarray(outcome.chain.value)
-    layers = {}
-    for q in range(policy.next_memory.shape[1]):
-        number = np.flatnonzero(outcome.place[:, 1] == q)
-        state = outcome.place[number, 0]
-        of_state = np.full(pomdp.num_states, np.nan)
-        of_state[state] = value[number]
-        arrows = np.where(np.isnan(of_state)[:, None], np.nan, action[:, q])
-        layers[str(q)] = MapLayer(f"memory state {q}", of_state, arrows)
-    return layers
+    value = np.full(action.shape[:2], np.nan)
+    value[tuple(outcome.place.T)] = np.asarray(outcome.chain.value)
+    arrows = np.where(np.isnan(value)[..., None], np.nan, action)
+    return {
+        str(q): MapLayer(f"memory state {q}", value[:, q], arrows[:, q])
+        for q in range(policy.next_memory.shape[1])
+    }
 
 
 def _trajectories(outcome: ControllerOutcome) -> list[ReportTrajectory]:

@@ -168,9 +168,8 @@ def describe(setup: EnvironmentSetup) -> str:
     """Sizes of the environment, of learning and of the evaluation, as text."""
     task, environment = setup.task, setup.environment
     actions = environment.actions
-    shapes = jax.eval_shape(
-        lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
-    )
+    key, world = jax.random.key(0), environment
+    shapes = jax.eval_shape(lambda key: world.observe(world.reset(key)), key)
     seen = sum(x.size for x in jax.tree.leaves(shapes))
     does = (
         f"{actions.num} actions"
@@ -389,9 +388,7 @@ def load_policy(
     task = EnvironmentFile.read(task_file) if task_file else _kept_task(policy_file, arrays)
     setup = prepare(task, 0, environment)
     method = setup.method
-    state = jax.eval_shape(
-        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
-    )
+    state = method.state_shapes()
     for name, x in _parts(method, state):
         array = arrays.get(name)
         if array is None or array.shape != x.shape:
@@ -417,12 +414,8 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
     path, raw = Path(str(arrays["task_file"])), str(arrays["task"]).encode()
     beside = policy_file.absolute().parent
     named = EnvironmentFile.read(path, raw).named_files()
-    there = [
-        folder
-        for folder in (path.parent, beside)
-        if all((folder / name).is_file() for name in named)
-    ]
-    return EnvironmentFile.read((there or [path.parent])[0] / path.name, raw)
+    complete = (x for x in (path.parent, beside) if all((x / name).is_file() for name in named))
+    return EnvironmentFile.read(next(complete, path.parent) / path.name, raw)
 
 
 def certify_policy_file(policy: Path, formula: str | None, say: Report) -> Proof:

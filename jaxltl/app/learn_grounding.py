@@ -74,18 +74,15 @@ def prepare(task: GroundingFile, seed: int) -> GroundingSetup:
     options = grid_options(task.world)
     wall = task.world.wall or "#"
     with errors_in(f"{path}: [world] "):
-        kinds = sorted(
-            {str(kind) for text in texts for kind in np.unique(parse_map(text))} - {wall}
-        )
+        cells = [parse_map(text) for text in texts]
+        kinds = sorted({str(kind) for x in cells for kind in np.unique(x)} - {wall})
         options.setdefault("legend", {kind: [] if kind == "." else [kind] for kind in kinds})
-        worlds = [
-            MappedModel(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts
-        ]
+        mdps = [gridworld(text, **options) for text in texts]
+        worlds = [MappedModel(x, y, ACTIONS) for x, y in zip(mdps, cells, strict=True)]
     names, seen = _observations(task, worlds)
     count, hparams = len(task.world.maps), grounding.Hparams(discount=task.demonstrations.discount)
     demonstrations = _demonstrations(task, worlds[:count], seed)
     with errors_in(f"{path}: "):
-        mdps = [world.mdp for world in worlds]
         problem = grounding.make_problem(mdps[:count], seen[:count], demonstrations, task.formula)
         size = max(world.num_states for world in mdps)
         wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in seen])
@@ -210,9 +207,8 @@ def _answer(
     robust = None
     if len(labels) > 1:
         robust = grounding.robust_policy(mdp, labels, posterior.symbols, automaton)
-    return GroundingAnswer(
-        model, policy, satisfaction_probability(model, policy), inside.best, robust
-    )
+    attained = satisfaction_probability(model, policy)
+    return GroundingAnswer(model, policy, attained, inside.best, robust)
 
 
 def _mean(answer: GroundingAnswer, solution: Solution) -> Record:
@@ -240,11 +236,7 @@ def summary(outcome: GroundingOutcome) -> Record:
     level, first = task.grounding.level, members[:_LIMIT].tolist()
     result = {
         **about(task.name, task.formula, task.learner.method),
-        "demonstrations": {
-            "number": len(problem.length),
-            "pairs": int(jnp.sum(problem.length)),
-            "synthetic": task.demonstrations.synthetic is not None,
-        },
+        "demonstrations": task.demonstrations.entry(len(problem.length), jnp.sum(problem.length)),
         "num_demonstrated": len(problem.observation),
         "meanings": setup.names,
         "grounding": [{**x._asdict(), "steps": _steps(setup, x)} for x in outcome.table],

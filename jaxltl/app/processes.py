@@ -52,9 +52,8 @@ class Launch:
 
 def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ) -> Launch:
     """Launch of this process by its options, else by a launcher's environment."""
-    options_of_launch = [
-        x for x in ("coordinator", "process", "processes") if getattr(options, x) is not None
-    ]
+    names = ("coordinator", "process", "processes")
+    options_of_launch = [x for x in names if getattr(options, x) is not None]
     if options.mesh is None:
         if options_of_launch:
             raise ValueError(f"--{options_of_launch[0]} needs --mesh; give that too.")
@@ -233,9 +232,8 @@ def _choose_devices(options: DeviceOptions, launch: Launch) -> None:
         # Its handler of SIGTERM would keep the process alive.
         with contextlib.suppress(AttributeError):
             jax.config.update("jax_enable_preemption_service", False)
-    if options.mesh and "xla_force_host_platform_device_count" not in os.environ.get(
-        "XLA_FLAGS", ""
-    ):
+    flags = os.environ.get("XLA_FLAGS", "")
+    if options.mesh and "xla_force_host_platform_device_count" not in flags:
         with contextlib.suppress(RuntimeError):  # devices exist already
             jax.config.update("jax_num_cpu_devices", options.mesh // launch.processes)
 

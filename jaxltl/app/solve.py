@@ -76,11 +76,10 @@ def load(
     else:
         from jaxltl.core.programs.build import MAX_STATES, build_model
 
+        limit = max_states or MAX_STATES
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            model = build_model(
-                program, max_states=max_states or MAX_STATES, progress=_ProgressPrinter()
-            )
+            model = build_model(program, max_states=limit, progress=_ProgressPrinter())
         for warning in caught:
             print(f"warning: {warning.message}", file=sys.stderr, flush=True)
     return model
@@ -105,29 +104,23 @@ def solve(
     queries: Sequence[PropertyQuery],
     tolerance: float,
     max_states: int | None = None,
-    *,
-    relative: bool = False,
-    exact: bool = False,
-    fair: bool = False,
+    **how: bool,
 ) -> Iterator[PropertyResult]:
-    """Yields the result of each property; of a program, some states are explored for each."""
+    """Yields the result of each property; of a program, some states are explored for each.
+
+    `how` has the options relative, exact and fair of :func:`~jaxltl.solve_property`.
+    """
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
-    def answer(prop: Property) -> AnyAnswer:
-        if not isinstance(model, Program):
-            how = {"relative": relative, "exact": exact, "fair": fair}
-            return solve_property(model, prop, tolerance=tolerance, **how)
-        from jaxltl.core.programs.build import MAX_STATES
-        from jaxltl.core.programs.partial import solve_program
+    if not isinstance(model, Program):
+        return answers(queries, lambda x: solve_property(model, x, tolerance=tolerance, **how))
+    from jaxltl.core.programs.build import MAX_STATES
+    from jaxltl.core.programs.partial import solve_program
 
-        return solve_program(
-            model,
-            prop,
-            method="partial",
-            tolerance=tolerance,
-            max_states=max_states or MAX_STATES,
-            report=_ProgressPrinter(),
-        )
+    def answer(prop: Property) -> AnyAnswer:
+        options: Record = {"tolerance": tolerance, "max_states": max_states or MAX_STATES}
+        report = _ProgressPrinter()
+        return solve_program(model, prop, method="partial", report=report, **options)
 
     return answers(queries, answer)
 
@@ -272,11 +265,8 @@ def summary(results: Sequence[PropertyResult]) -> str:
     for result in results:
         prop, entry = result.query.parsed, result_entry(result)
         name = f'"{prop.name}": ' if prop is not None and prop.name else ""
-        value = (
-            entry["value"]
-            if isinstance(entry["value"], bool)
-            else entry.get("exact", entry["value"])
-        )
+        value = entry["value"]
+        value = value if isinstance(value, bool) else entry.get("exact", value)
         value_text = "refused" if result.answer is None else json.dumps(value).replace('"', "")
         status = "" if result.status in ("CONVERGED", "INVALID") else f" ({result.status})"
         lines.append(f"{name}{' '.join(result.query.text.split())}: {value_text}{status}")

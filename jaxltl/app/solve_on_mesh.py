@@ -69,9 +69,7 @@ def read(
             if isinstance(whole, POMDP):
                 raise ValueError(f"{str(path)!r} holds a POMDP, which is solved on one device.")
             if isinstance(whole, Game | MultiplayerGame):
-                raise ValueError(
-                    f"{str(path)!r} is a game; solve it on one device, without --mesh."
-                )
+                raise ValueError(f"{str(path)!r} is a game, which is solved without --mesh.")
         with group.together():
             model = on_mesh(whole, group)
         mark = files.fingerprint(model=whole)
@@ -196,10 +194,8 @@ def _restored(
         state = files.load(path, _state(model, bounds, 0, 0), mark)
     else:
         count, size = model.num_unpadded, -(-model.num_unpadded // devices)
-        begins = np.arange(devices + 1) * count // devices
-        each = np.concatenate(
-            [np.arange(b - a) + i * size for i, (a, b) in enumerate(pairwise(begins))]
-        )
+        ends = enumerate(pairwise(np.arange(devices + 1) * count // devices))
+        each = np.concatenate([np.arange(b - a) + i * size for i, (a, b) in ends])
         state["bounds"] = tuple(
             to_mesh(model, np.asarray(x)[each], fill)
             for x, fill in zip(state["bounds"], (0, 1), strict=True)

@@ -87,9 +87,7 @@ def summary(outcome: TodirlOutcome) -> Record:
         "expert": "soft" if setup.soft else "quickest",
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
-            "number": [len(trajectories.length) for trajectories in demands.demonstrations],
-            "pairs": pairs,
-            "synthetic": task.demonstrations.synthetic is not None,
+            **task.demonstrations.entry([len(x.length) for x in demands.demonstrations], pairs),
             "dropped": setup.dropped,
         },
         "training": None,

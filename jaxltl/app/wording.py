@@ -66,14 +66,8 @@ def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
     import jax
     import jax.numpy as jnp
 
-    parts = [
-        digest,
-        seed,
-        num_seeds,
-        jaxltl.__version__,
-        jax.__version__,
-        str(jnp.result_type(float)),
-    ]
+    versions = jaxltl.__version__, jax.__version__, str(jnp.result_type(float))
+    parts = [digest, seed, num_seeds, *versions]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
@@ -94,7 +88,5 @@ def postfix(metrics: Mapping[str, np.ndarray]) -> dict[str, str]:
     import numpy as np
 
     known = [n for n in _PROGRESS if n in metrics and np.isfinite(metrics[n]).any()]
-    figures = ((n, *_PROGRESS[n]) for n in known[:2])
-    return {
-        n.removesuffix("_norm"): f"{getattr(np, f)(metrics[n]):{form}}" for n, f, form in figures
-    }
+    figures = ((n.removesuffix("_norm"), metrics[n], *_PROGRESS[n]) for n in known[:2])
+    return {n: f"{getattr(np, reduction)(x):{form}}" for n, x, reduction, form in figures}

@@ -31,7 +31,7 @@ from jaxltl.app.files.schema import (
 )
 from jaxltl.app.files.worlds import initial_where
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
-from jaxltl.core.games.synthesis import Synthesis, synthesize
+from jaxltl.core.games.synthesis import PlayStep, Synthesis, synthesize
 from jaxltl.core.games.winning import task_game
 from jaxltl.core.models import Game, make_game
 from jaxltl.envs.robots import ACTIONS, grid_game, places
@@ -241,6 +241,10 @@ class SolvedGame(Synthesis):
 
     file: GameFile
     world: MappedGame
+
+    def position(self, step: PlayStep) -> Record:
+        """The place of a step of a play."""
+        return self.world.position(self.nodes.world_state[step.node])
 
     def demand(self) -> None:
         """Raises ValueError if the file demands a strategy and the task is unrealizable."""

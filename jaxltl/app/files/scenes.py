@@ -54,9 +54,7 @@ def load_scenes(
     for table, scenes in (("world", training), ("test", test)):
         names = [scene.name for scene in scenes]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(
-                f"{task.path}: [{table}] maps has {twice[0]} twice; leave one of them out."
-            )
+            raise ValueError(f"{task.path}: [{table}] maps has {twice[0]} twice; leave one out.")
     if unknown := [name for name in task.left_out if name not in names]:  # of the test worlds
         raise ValueError(
             f"{task.path}: [test] leave_out names {unknown[0]!r}, which is no test world; there are "

@@ -29,11 +29,8 @@ Probability = Annotated[float, Meta("a probability in (0, 1]", lambda v: 0 < v <
 def _is_guarantee(value: str | float | dict[str, float]) -> bool:
     if not isinstance(value, dict):
         return True
-    return (
-        value.keys() == {"probability", "steps"}
-        and 0 < value["probability"] <= 1
-        and value["steps"] > 0
-    )
+    complete = value.keys() == {"probability", "steps"}
+    return complete and 0 < value["probability"] <= 1 and value["steps"] > 0
 
 
 GuaranteeKey = Annotated[
@@ -117,6 +114,10 @@ class SyntheticTable(TomlTable):
         "Discount of a simulated demonstrator's reward; default the quickest optimal policy."
     )
     length: Count | None = key("Longest simulated demonstration; default 200.")
+
+    def entry(self, number: object, pairs: object) -> Record:
+        """The demonstrations in ``result.json``."""
+        return {"number": number, "pairs": pairs, "synthetic": self.synthetic is not None}
 
 
 @table
@@ -203,9 +204,7 @@ class TaskFile(FormulaFile):
         )
         if factor not in (None, "none") and (self.steps is not None or guarantee == "none"):
             other = 'none, with guarantee = "none"' if self.steps is None else "steps in guarantee"
-            raise ValueError(
-                f"[task] steps_factor = {factor:g} bounds the steps, but there is {other}."
-            )
+            raise ValueError(f"[task] steps_factor = {factor:g} bounds steps; there is {other}.")
 
 
 def kind_of(path: Path) -> Literal["environment", "grounding", "controller", "todirl", "mlirl"]:

@@ -209,14 +209,12 @@ class MlirlFile(TaskFile):
     def named_files(self) -> Sequence[str]:
         world, demonstrations = self.world, self.demonstrations
         named = [world.map["file"]] if isinstance(world.map, dict) else []
-        named += [
-            x for x in (world.model, world.transitions, world.labels, demonstrations.file) if x
-        ]
+        single = (world.model, world.transitions, world.labels, demonstrations.file)
+        named += filter(None, single)
         if world.model is not None:  # PRISM keeps labels in another file
             from jaxltl.io.prism.explicit import files_beside  # imports JAX
 
-            beside = files_beside(self.path.parent / world.model)
-            named += [str(x.absolute()) for x in beside]
+            named += [str(x.absolute()) for x in files_beside(self.path.parent / world.model)]
         return named
 
 

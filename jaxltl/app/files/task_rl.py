@@ -150,9 +150,8 @@ class CceTable(hparams_table("cce", "sample_share", "num_samples")):  # type: ig
             self.limit is None or self.cost is not None,
             'limit is that of a cost: give cost = "failure", "violation" or another score.',
         )
-        self.require(
-            self.cost is None or self.limit is not None, "cost needs a limit, its upper bound."
-        )
+        limited = self.cost is None or self.limit is not None
+        self.require(limited, "cost needs a limit, its upper bound.")
 
 
 @table

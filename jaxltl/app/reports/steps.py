@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.algos.common.guarantees import StepBound, neg_log_likelihood
 from jaxltl.plot.drawing import Picture, drawing
 from jaxltl.app.reports.page import number, probability
-from jaxltl.app.wording import Record, Result, enclosure
+from jaxltl.app.wording import Record, Result, bounds_of, enclosure
 from jaxltl.core.models import Product
 from jaxltl.core.values.undiscounted.mixture import Mixture
 from jaxltl.core.values.undiscounted.satisfaction_steps import Quickest, StepAnalysis, steps_front
@@ -49,7 +49,7 @@ def entry(
     record["likelihood"] = [
         {
             "share": share,
-            "steps": enclosure(*clock.steps(policy)[:3]),
+            "steps": bounds_of(clock.steps(policy)),
             "neg_log_likelihood": neg_log_likelihood(policy, counts),
         }
         for share, policy in mixed
@@ -101,14 +101,11 @@ def _is_quickest(steps: Result) -> bool:
 
 def front_rows(steps: Result) -> list[tuple[str, str, str]]:
     """Maximal probability, its expected steps, and their certificate."""
-    return [
-        (
-            probability(one["probability"]["value"]),
-            spent(one["steps"]["value"]),
-            _certified(*(one["steps"][k] for k in ("value", "lower", "upper"))),
-        )
-        for one in steps.get("front", ())
-    ]
+    names = ("value", "lower", "upper")
+    front = (
+        (x["probability"]["value"], *map(x["steps"].get, names)) for x in steps.get("front", ())
+    )
+    return [(probability(p), spent(n), _certified(n, low, high)) for p, n, low, high in front]
 
 
 def lines(steps: Result | None) -> list[str]:
@@ -137,10 +134,8 @@ def pictures(steps: Result | None) -> list[Picture]:
     panels = {}
     front = steps.get("front", ())
     if len(front) > 1:
-        value, low, high = (
-            [x["probability"][k] for x in front] for k in ("value", "lower", "upper")
-        )
-        half = [(b - a) / 2 for a, b in zip(low, high, strict=True)]
+        ends = [x["probability"] for x in front]
+        value, half = [x["value"] for x in ends], [(x["upper"] - x["lower"]) / 2 for x in ends]
         panels["maximal satisfaction probability"] = {
             "all policies": ([x["steps"]["value"] for x in front], value, half)
         }

@@ -74,11 +74,7 @@ def summary(synthesis: SolvedGame, seconds: float) -> Record:
         and {
             **vars(synthesis.play),
             "steps": [
-                {
-                    "mover": step.mover,
-                    "move": step.action,
-                    **world.position(int(synthesis.nodes.world_state[step.node])),
-                }
+                {"mover": step.mover, "move": step.action, **synthesis.position(step)}
                 for step in synthesis.play.steps
             ],
         },
@@ -135,7 +131,7 @@ def describe_play(synthesis: SolvedGame) -> list[str]:
         return []
     rows = [["step", "mover", "move", *(world.position(0))]]
     for i, step in enumerate(play.steps):
-        where = world.position(int(synthesis.nodes.world_state[step.node])).values()
+        where = synthesis.position(step).values()
         cells = (f"{x['row']}, {x['column']}" if isinstance(x, dict) else str(x) for x in where)
         rows.append([str(i), step.mover, step.action, *cells])
     return [f"  {line}" for line in (*aligned(rows), _ending(play, synthesis))]
@@ -206,10 +202,9 @@ def _write(
         task = product(world.game.mdp, nodes.automaton, label_on="exit")
     skipped, state = nodes.by_chance[part.state], nodes.world_state[part.state]
     part = part._replace(state=state, memory=memory)
+    options: Record = {"skipped": skipped, "task": task, "actions": world.actions}
     try:
-        policy = policy_of_nodes(
-            part, world.game.num_states, skipped=skipped, task=task, actions=world.actions
-        )
+        policy = policy_of_nodes(part, world.game.num_states, **options)
     except ValueError:  # an adversary's random moves
         write_policy_file(path, kind, arrays)
         return
