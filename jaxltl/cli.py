@@ -346,7 +346,8 @@ def solve(
             solver.agree(list(properties))
             answers = solver.solve(questions)
         if group.is_first and "states" in entry:
-            click.echo(solving.model_text(entry))
+            sizes = "{states} states, {choices} choices, {transitions} transitions"
+            click.echo(f"{{kind}} of {sizes}, read in {{seconds:.3f}} s".format(**entry))
         results = []
         for result in answers:
             results.append(result)

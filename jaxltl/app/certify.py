@@ -119,18 +119,6 @@ def certify(evidence: CountEvidence, query: Record) -> values.DataGuarantee:
     return values.learn_guarantee(evidence.model, evidence.counts, graph=evidence.graph, **query)
 
 
-def text(evidence: CountEvidence, result: Record) -> str:
-    """The :func:`entry` of a guarantee as text."""
-    return render(
-        "jaxltl.app.reports",
-        "certify.txt",
-        result=result,
-        formula=repr(result["formula"]),
-        complete=evidence.graph == "complete",
-        rounded=rounded_outward,
-    ).rstrip("\n")
-
-
 def entry(
     evidence: CountEvidence, query: Record, guarantee: values.DataGuarantee, seconds: float
 ) -> Record:
@@ -262,7 +250,10 @@ def certify_and_write(log: Path, formula: str, options: CertifyOptions) -> Recor
         begin = time.perf_counter()
         guarantee = certify(evidence, query)
         result = entry(evidence, query, guarantee, time.perf_counter() - begin)
-        click.echo(text(evidence, result))
+        complete, rounded = evidence.graph == "complete", rounded_outward
+        context: Record = {"result": result, "complete": complete, "rounded": rounded}
+        lines = render("jaxltl.app.reports", "certify.txt", formula=repr(formula), **context)
+        click.echo(lines.rstrip("\n"))
         if proof is not None:
             question = results.formula_question(formula, *directions)
             one = results.Certifiable(guarantee.model, guarantee, question)

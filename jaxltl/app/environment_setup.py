@@ -17,6 +17,7 @@ from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.algos.common.seeds import Algorithm, make_hparams
+from jaxltl.app.files.schema import LARGEST_INT
 from jaxltl.app.files.task_rl import CceTable, CpoTable, EnvironmentFile
 from jaxltl.app.wording import Record
 from jaxltl.core.continuous.dynamics import Dynamics
@@ -84,16 +85,13 @@ def make_method(task: EnvironmentFile, environment: Environment, num_steps: int)
     """The learner of a task file."""
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
     method = make(task, environment, num_steps)
-    if method.transitions > _LARGEST_COUNT:
+    if method.transitions > LARGEST_INT:  # int32 counters of the learners
         raise ValueError(
             f"a step of the learner would make {method.transitions:,} simulated steps; at most "
-            f"{_LARGEST_COUNT:,} are counted: simulate fewer or shorter episodes."
+            f"{LARGEST_INT:,} are counted: simulate fewer or shorter episodes."
         )
     method.state_shapes()  # with concrete numbers, so that the learner's own checks see them
     return method
-
-
-_LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
 
 
 def _settings(task: EnvironmentFile) -> Record:

@@ -51,9 +51,9 @@ class MlirlSetup:
         avoid, used = table.avoid or (), self.guarantee.until_lost(demonstrations)
         # Without a guarantee, those of the dissertation's Table 1 alone.
         best = None if self.guarantee.requested == "none" else self.guarantee.best
-        options: Record = {"avoid": avoid, "progress": table.progress_states, "best": best}
+        options: Record = {"avoid": avoid, "progress": table.progress, "best": best}
         if table.in_world:
-            options = {"avoid": avoid, "progress": table.progress_labels, "goal": table.goal or ()}
+            options = {"avoid": avoid, "progress": table.progress or (), "goal": table.goal}
         return mlirl.Demands(
             model,
             demonstrations,
@@ -279,25 +279,13 @@ def save(out: Path, outcome: MlirlOutcome) -> None:
     """
     model, kept = outcome.setup.model, outcome.kept
     learned, i = kept.learned, kept.chosen
-    logged = outcome.setup.world.logged
-    policy = project_policy(
-        model,
-        kept.policy,
-        actions=outcome.setup.world.actions,
-        states=() if logged is None else logged.states,
-    )
-    save_policy(
-        out / "policy.npz",
-        policy,
-        {
-            "weights": learned.weights[i],
-            "features": learned.names,
-            "all_weights": learned.weights,
-            "satisfaction": kept.solution.value,
-            "lower": kept.solution.lower,
-            "upper": kept.solution.upper,
-        },
-    )
+    world, weights = outcome.setup.world, learned.weights
+    states = world.states or ()
+    policy = project_policy(model, kept.policy, actions=world.actions, states=states)
+    bounds = bounds_of(kept.solution)
+    more = {"weights": weights[i], "features": learned.names, "all_weights": weights}
+    more |= {"satisfaction": bounds.pop("value"), **bounds}
+    save_policy(out / "policy.npz", policy, more)
 
 
 # --- the report ---------------------------------------------------------------------------
@@ -367,7 +355,7 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 def sections(outcome: MlirlOutcome) -> list[page.Section]:
     """The policy on the map, expected steps, and learning curves."""
     setup, model, learned = outcome.setup, outcome.setup.model, outcome.kept.learned
-    world, logged, policy = setup.world, setup.world.logged, np.asarray(outcome.kept.policy)
+    world, policy = setup.world, np.asarray(outcome.kept.policy)
     return [
         *([] if world.cells is None else _maps(outcome, world.cells)),
         *steps.pictures(plain(outcome.expected_steps)),
@@ -384,7 +372,7 @@ def sections(outcome: MlirlOutcome) -> list[page.Section]:
             ],
             place=world.cells,
             actions=world.actions,
-            places={} if logged is None else dict(enumerate(logged.states)),
+            places=dict(enumerate(world.states or ())),
             label=_LABEL,
             wall=setup.task.world.wall or "#",
             marked=_left_out(setup),
@@ -430,15 +418,9 @@ def _layers(outcome: MlirlOutcome) -> dict[str, MapLayer]:
 
 def _maps(outcome: MlirlOutcome, cells: np.ndarray) -> list[Picture]:
     layers = _layers(outcome)
-    maps = [
-        Picture(
-            "values.svg",
-            "Satisfaction probability",
-            drawing("grid", cells, layers.pop(START).value, label=_LABEL),
-            "Satisfaction probability of the learned policy from each initial state.",
-            LIVE,
-        )
-    ]
+    drawn = drawing("grid", cells, layers.pop(START).value, label=_LABEL)
+    text = "Satisfaction probability of the learned policy from each initial state."
+    maps = [Picture("values.svg", "Satisfaction probability", drawn, text, LIVE)]
     if layers:
         drawn = drawing(
             "grid",
@@ -449,15 +431,8 @@ def _maps(outcome: MlirlOutcome, cells: np.ndarray) -> list[Picture]:
             label=_LABEL,
             actions=outcome.setup.world.actions,
         )
-        maps.append(
-            Picture(
-                "policy.svg",
-                "Learned policy",
-                drawn,
-                "One map for each state of the automaton, which is the policy's memory. " + _MAP,
-                LIVE,
-            )
-        )
+        text = f"One map for each state of the automaton, which is the policy's memory. {_MAP}"
+        maps.append(Picture("policy.svg", "Learned policy", drawn, text, LIVE))
     return maps
 
 
@@ -466,7 +441,5 @@ def _left_out(setup: MlirlSetup) -> list[tuple[int, int, int]]:
     model, guarantee, demonstrations = setup.model, setup.guarantee, setup.demonstrations
     state, action = np.asarray(demonstrations.state), np.asarray(demonstrations.action)
     marked = guarantee.forbidden | guarantee.unused(demonstrations)
-    if not marked.any():
-        return []
     steps = np.stack([state, memory_along(model, state), action], -1)[marked]
     return [(s, q, a) for s, q, a in np.unique(steps, axis=0).tolist()]

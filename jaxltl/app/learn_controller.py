@@ -264,11 +264,9 @@ def _trajectories(outcome: ControllerOutcome) -> list[ReportTrajectory]:
             if over:
                 break
         observed = seen[states[: len(steps)]]
-        trajectories.append(
-            ReportTrajectory(
-                f"trajectory {n + 1}", steps, observed.tolist(), belief_filter(pomdp, observed, did)
-            )
-        )
+        beliefs = belief_filter(pomdp, observed, did)
+        one = ReportTrajectory(f"trajectory {n + 1}", steps, observed.tolist(), beliefs)
+        trajectories.append(one)
     return trajectories
 
 

@@ -298,19 +298,12 @@ def sections(outcome: GroundingOutcome) -> list[page.Section]:
     """The grounding on each map: for each symbol the posterior probability of its label."""
     setup, posterior = outcome.setup, outcome.posterior
     heavy = np.flatnonzero(posterior.weight > 1e-9).tolist()
-    drawn: list[page.Section] = []
+    titles, drawn = [f"{row.symbol}: {row.meaning}" for row in outcome.table], list[page.Section]()
+    text = "For each symbol the posterior probability that it holds in a cell."
     for w, world in enumerate(setup.worlds):
         weight = sum(posterior.weight[i] * labels_of(setup, posterior, i, w) for i in heavy)
-        titles = [f"{row.symbol}: {row.meaning}" for row in outcome.table]
-        picture = drawing("grid", world.cells, np.asarray(weight).T, titles=titles, label="weight")
-        drawn.append(
-            Picture(
-                f"map_{w + 1}.svg",
-                f"Grounding on map {w + 1}",
-                picture,
-                "For each symbol the posterior probability that it holds in a cell.",
-            )
-        )
+        maps = drawing("grid", world.cells, np.asarray(weight).T, titles=titles, label="weight")
+        drawn.append(Picture(f"map_{w + 1}.svg", f"Grounding on map {w + 1}", maps, text))
     return drawn
 
 

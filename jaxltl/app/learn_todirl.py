@@ -181,11 +181,8 @@ def save(out: Path, outcome: TodirlOutcome) -> None:
         model = replace(model, letter=model.letter[:size])
         policy = kept.policy[w][..., :size, :, :]
         value = kept.performance["learned"].value[w, :size]
-        save_policy(
-            out / f"policy_{w + 1}.npz",
-            models.project_policy(model, policy, actions=ACTIONS),
-            {"satisfaction": value},
-        )
+        table = models.project_policy(model, policy, actions=ACTIONS)
+        save_policy(out / f"policy_{w + 1}.npz", table, {"satisfaction": value})
 
 
 def learned_reward(outcome: TodirlOutcome) -> LearnedReward:
@@ -272,15 +269,9 @@ def task_pictures(setup: TodirlSetup) -> list[Picture]:
     same = setup.worlds.memory is setup.worlds.automaton
     drawings = [automaton_picture(setup.worlds.automaton, "training-1" if same else "")]
     if not same:
-        drawings.append(
-            Picture(
-                "memory.svg",
-                "Memory of the learner",
-                drawing("automaton", setup.worlds.memory),
-                "The automaton whose state is the learner's memory; the formula's automaton evaluates it.",
-                "training-1",
-            )
-        )
+        text = "The automaton whose state is the learner's memory; the formula's automaton evaluates it."
+        drawn = drawing("automaton", setup.worlds.memory)
+        drawings.append(Picture("memory.svg", "Memory of the learner", drawn, text, "training-1"))
     return drawings
 
 
@@ -384,16 +375,13 @@ def _world_sections(
         end = f"violated, or for {explorer.LONGEST_RUN} steps"
         if worlds.automaton.is_cosafe:  # by a finite prefix
             end = "satisfied or violated"
-        parts.append(
-            Picture(
-                f"{stem}_runs.svg",
-                f"Trajectories in {scene.name}" if arrows else title,
-                drawing("temporal_gridworld", place, trajectories=walks),
-                f"{len(walks.length)} trajectories of the learned policy from random initial states, "
-                f"each until the formula is {end}.",
-                live,
-            )
+        text = (
+            f"{len(walks.length)} trajectories of the learned policy from random initial states, "
+            f"each until the formula is {end}."
         )
+        drawn = drawing("temporal_gridworld", place, trajectories=walks)
+        title = f"Trajectories in {scene.name}" if arrows else title
+        parts.append(Picture(f"{stem}_runs.svg", title, drawn, text, live))
     return parts
 
 

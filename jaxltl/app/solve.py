@@ -169,12 +169,6 @@ def model_entry(model: SourceModel | POMDP, seconds: float) -> Record:
     }
 
 
-def model_text(entry: Record) -> str:
-    """The model in one line."""
-    sizes = "{states} states, {choices} choices, {transitions} transitions".format(**entry)
-    return "{kind} of {sizes}, read in {seconds:.3f} s".format(sizes=sizes, **entry)
-
-
 def result_entry(result: PropertyResult) -> Record:
     """Answer to a property, as a JSON object."""
     answer = result.answer

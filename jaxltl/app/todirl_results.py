@@ -37,15 +37,6 @@ class TodirlSetup:
         return self.demands.worlds
 
     @property
-    def groups(self) -> dict[str, slice]:
-        """The training worlds and, if there are any, the test worlds."""
-        count = self.worlds.num_training
-        groups = {"training": slice(count)}
-        if len(self.scenes) > count:
-            groups["test"] = slice(count, None)
-        return groups
-
-    @property
     def counted(self) -> np.ndarray:
         """Indices of the test worlds that count."""
         names = enumerate(self.worlds.names)
@@ -67,6 +58,7 @@ def summary(outcome: TodirlOutcome) -> Record:
     """The results for ``result.json``."""
     setup, task, demands = outcome.setup, outcome.setup.task, outcome.setup.demands
     pairs = [int(np.sum(trajectories.length)) for trajectories in demands.demonstrations]
+    count = setup.worlds.num_training
     result = {
         **about(task.name, task.formula, task.learner.method),
         "memory": task.memory,
@@ -90,9 +82,8 @@ def summary(outcome: TodirlOutcome) -> Record:
             **task.demonstrations.entry([len(x.length) for x in demands.demonstrations], pairs),
             "dropped": setup.dropped,
         },
-        "training": None,
-        "test": None,
-        **{kind: _about_worlds(outcome, part) for kind, part in setup.groups.items()},
+        "training": _about_worlds(outcome, slice(count)),
+        "test": _about_worlds(outcome, slice(count, None)) if len(setup.scenes) > count else None,
         **_about_learning(outcome),
         "network": {
             "file": "network.npz",

@@ -195,7 +195,7 @@ def test_what_is_seen_on_a_text_map():
         ),
         (
             ("synthetic = 40\ndiscount = 0.9\nlength = 30", 'files = ["a", "b", "c"]'),
-            r"names 3 files for 2 worlds",
+            r"\[demonstrations\] files has 3 files for 2 maps; give one for each",
         ),
         (("hidden = [12]", "hidden = [0]"), r"widths of the hidden layers"),
         (("discount = 0.9\nhidden", "discount = 1\nhidden"), r"discount = 1 needs a horizon"),

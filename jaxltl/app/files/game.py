@@ -268,9 +268,8 @@ def solve_game(file: GameFile, progress: Callable[[str], None] = lambda stage: N
             game,
             objective,
             chance=file.task.chance,
-            method=table.method,
-            bound=table.bound,
             actions=world.actions,
             progress=progress,
+            **table.specified(),
         )
     return SolvedGame(**vars(solved), file=file, world=world)

@@ -169,18 +169,6 @@ class MlirlTable(hparams_table("mlirl", base=OptimizerTable)):  # type: ignore[m
             raise ValueError(f"progress = {self.progress!r}; it must be a list of {expected}.")
 
     @property
-    def progress_labels(self) -> list[str]:
-        """The propositions of progress, in the world."""
-        return [x for x in self.progress or () if isinstance(x, str)]
-
-    @property
-    def progress_states(self) -> list[int] | None:
-        """The automaton states of progress, in the product; None for the default."""
-        if self.progress is None:
-            return None
-        return [x for x in self.progress if isinstance(x, int)]
-
-    @property
     def hides_formula(self) -> str | None:
         return 'in = "world"' if self.in_world else None
 
@@ -357,12 +345,7 @@ class TodirlFile(TaskFile):
     test: TestScenesTable | None = key("The test worlds.")
 
     def __attrs_post_init__(self) -> None:
-        files, count = self.demonstrations.files, len(self.world.maps)
-        if files is not None and len(files) != count:
-            raise ValueError(
-                f"[demonstrations] names {len(files)} files for {count} worlds; give one for each "
-                "of [world] maps, in their order."
-            )
+        require_one_each("[demonstrations] files", self.demonstrations.files, self.world.maps)
         self.require(
             self.is_colored or self.test is None or self.test.generate is None,
             "[test] generate makes coloured worlds; where [world] has a legend, give maps = [...].",
@@ -394,6 +377,13 @@ def map_file(entry: str | dict[str, str]) -> str | None:
     if isinstance(entry, dict):
         return entry["file"]
     return None if "\n" in entry else entry
+
+
+def require_one_each(name: str, files: Sequence[str] | None, maps: Sequence[object]) -> None:
+    """Raises ValueError unless there is a file for each map, or none."""
+    if files and len(files) != len(maps):
+        text = f"{name} has {len(files)} files for {len(maps)} maps; give one for each, in order."
+        raise ValueError(text)
 
 
 def read_entry(path: Path, entry: str | dict[str, str]) -> str:
@@ -479,12 +469,8 @@ class GroundingFile(FormulaFile):
         return [] if isinstance(seen, str) else seen
 
     def __attrs_post_init__(self) -> None:
-        for name, files, count in (
-            ("[grounding] observations", self.tables, len(self.maps)),
-            ("[demonstrations] files", self.demonstrations.files, len(self.world.maps)),
-        ):
-            if files and len(files) != count:
-                raise ValueError(f"{name} has {len(files)} files for {count} maps.")
+        require_one_each("[grounding] observations", self.tables, self.maps)
+        require_one_each("[demonstrations] files", self.demonstrations.files, self.world.maps)
 
     def named_files(self) -> Sequence[str]:
         named = [*filter(None, map(map_file, self.maps)), *self.tables]

@@ -21,14 +21,11 @@ from jaxltl.io.templates import render
 _PROBABILITIES = ("success", "violation", "undecided")
 
 
-def _visits(result: Result) -> list[str]:
-    """The estimate of interest where no finite episode decides the formula."""
-    return [] if result["acceptance"] in ("cosafe", "safety") else ["visits"]
-
-
 def _values(result: Result) -> Record:
     """The proof in words, and rows of estimates."""
-    names = (*_PROBABILITIES, *_visits(result))
+    # Visits are the estimate of interest where no finite episode decides the formula.
+    visits = () if result["acceptance"] in ("cosafe", "safety") else ("visits",)
+    names = (*_PROBABILITIES, *visits)
     evaluation, seeds = result["evaluation"], result["seeds"]
     return {
         "tiles": [(name, *_numbers(name, evaluation)) for name in (*names, "length")],
@@ -37,7 +34,7 @@ def _values(result: Result) -> Record:
         "estimates": [
             (name.replace("_", " "), *_numbers(name, evaluation), evaluation[name]["method"])
             for name in evaluation["estimates"]
-            if _visits(result) or "visits" not in name
+            if visits or "visits" not in name
         ],
         "seed_header": ("seed", *names),
         "seed_rows": [

@@ -158,14 +158,8 @@ def pictures(steps: Result | None) -> list[Picture]:
             " The second line is the likelihood of the demonstrations when a share of the quick "
             "policy is mixed into the learned one."
         )
-    return [
-        Picture(
-            "steps.svg",
-            "Probability, steps and likelihood",
-            drawing("bands", {"": panels}, label="expected steps"),
-            text,
-        )
-    ]
+    bands = drawing("bands", {"": panels}, label="expected steps")
+    return [Picture("steps.svg", "Probability, steps and likelihood", bands, text)]
 
 
 def spent(value: float | None) -> str:
