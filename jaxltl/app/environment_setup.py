@@ -69,11 +69,21 @@ class LearnerSetup:
     algorithm: Algorithm  # its module
     problem: PyTree  # with `hparams`, arguments of its functions
     hparams: PyTree
-    agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
     drawn: tuple[str, ...]  # names of the metrics that are drawn
-    policy_fields: tuple[str, ...]  # names of the state's fields that determine a policy
     transitions: int  # bound of the environment's steps in a step of the learner
     description: str  # of the policy
+    # names of the state's fields that determine a policy
+    policy_fields: tuple[str, ...] = ("parameters", "moments")
+    make: Callable[[PyTree], Agent] | None = None  # the agent of a sample, in searches
+
+    def agent(self, state: PyTree, likeliest: bool) -> Agent:
+        """The policy of a state: greedy, or with drawn actions."""
+        learner: Any = self.algorithm
+        if self.make is not None:
+            return self.make(learner.policy(state, self.problem, self.hparams))
+        rule = learner.greedy if likeliest else learner.policy
+        agent: Agent = rule(state, self.problem, self.hparams)
+        return agent
 
     def state_shapes(self) -> Any:
         """The shapes of a state."""
@@ -106,12 +116,6 @@ def _settings(task: EnvironmentFile) -> Record:
     return hparams
 
 
-def _acts(learner: Any, problem: PyTree, hparams: PyTree) -> Callable[[PyTree, bool], Agent]:
-    """The policy of a state of a learner: greedy, or with drawn actions."""
-    rules = {True: learner.greedy, False: learner.policy}
-    return lambda state, likeliest: rules[likeliest](state, problem, hparams)
-
-
 def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> LearnerSetup:
     spec = _settings(task)
     parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
@@ -122,9 +126,7 @@ def _ppo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
         ppo,
         problem,
         hparams,
-        _acts(ppo, problem, hparams),
         ("episode_return", "episode_length", "entropy", "explained_variance"),
-        ("parameters", "moments"),
         hparams.num_envs * hparams.num_steps,
         f"two networks with hidden layers {list(network.hidden)}",
     )
@@ -153,11 +155,11 @@ def _cce(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
         cce,
         problem,
         hparams,
-        lambda state, likeliest: make(cce.policy(state, problem, hparams)),
         ("objective", "cost", "best_objective", "num_feasible", "max_deviation"),
-        ("family",),
         hparams.population * table.episodes * num_steps,
         f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters",
+        ("family",),
+        make,
     )
 
 
@@ -178,9 +180,7 @@ def _cpo(task: EnvironmentFile, environment: Environment, num_steps: int) -> Lea
         trust_region,
         problem,
         hparams,
-        _acts(trust_region, problem, hparams),
         ("reward", "cost", "length", "deviation", "kl"),
-        ("parameters", "moments"),
         hparams.num_trajectories * num_steps,
         f"a Gaussian whose mean is a network with hidden layers {list(hparams.hidden)}",
     )

@@ -404,12 +404,9 @@ def _layers(outcome: MlirlOutcome) -> dict[str, MapLayer]:
     met[np.asarray(restricted.base_state), np.asarray(restricted.memory)] = True
     memories = np.flatnonzero(undecided & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
+    value_met, policy_met = np.where(met, value, np.nan), np.where(met[..., None], policy, np.nan)
     layers = {
-        str(q): MapLayer(
-            f"memory state {q}: {names[q]}",
-            np.where(met[:, q], value[:, q], np.nan),
-            np.where(met[:, q, None], policy[:, q], np.nan),
-        )
+        str(q): MapLayer(f"memory state {q}: {names[q]}", value_met[:, q], policy_met[:, q])
         for q in memories
     }
     at_start = np.where(starts, from_starts(model, value), np.nan)

@@ -213,11 +213,8 @@ def _write(
 
 def _arrays(synthesis: SolvedGame, game: Game, node: np.ndarray) -> Record:
     return {
-        "successor": game.mdp.successor,
-        "probability": game.mdp.probability,
-        "initial": game.initial,
-        "system": game.system,
-        "label": game.label,
+        **{name: getattr(game.mdp, name) for name in ("successor", "probability")},
+        **{name: getattr(game, name) for name in ("initial", "system", "label")},
         "propositions": np.array(game.propositions, str),
         "actions": np.array(synthesis.world.actions),
         "world_state": synthesis.nodes.world_state[node],
