@@ -364,7 +364,7 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
     assert result.exit_code == 130 and "goes on from the last checkpoint" in result.stderr
     monkeypatch.undo()
     # What comes after learning is the same; pictures take long.
-    for name in ("pictures", "live"):
+    for name in ("task_pictures", "sections"):
         monkeypatch.setattr(learn_todirl, name, lambda outcome: [])
     result = run(*command)
     assert result.exit_code == 0 and "going on from" in result.stderr

@@ -240,4 +240,4 @@ def test_certificates_of_random_models(kind, tmp_path):
 def test_certificates_of_many_random_models(kind, count, tmp_path):
     written, accepted, refused, reasons = run(kind, 1, count, 1, tmp_path)
     print(kind, written, accepted, refused, reasons[:9])
-    assert written >= 0.95 * count and refused > 0.2 * count, reasons
+    assert written >= 0.95 * count and refused > 0.1 * count, reasons

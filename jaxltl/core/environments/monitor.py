@@ -244,7 +244,8 @@ def automaton_of_any_labels(formula: Formula | str | Automaton) -> Automaton:
     """
     if isinstance(formula, Automaton):
         return formula
-    names = (parse_ltl(formula) if isinstance(formula, str) else formula).propositions
+    parsed = parse_ltl(formula) if isinstance(formula, str) else formula
+    names = parsed.propositions if isinstance(parsed, Formula) else ()
     if len(names) > MAX_FREE_PROPOSITIONS:
         raise ValueError(
             f"the formula has {len(names)} propositions, and the limit is {MAX_FREE_PROPOSITIONS} where "
