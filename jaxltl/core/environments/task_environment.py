@@ -416,7 +416,8 @@ def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree)
     Raises:
       ValueError: an unknown state.
 
-    >>> residual_formula(to_automaton("F (a & X b)"), 0)
+    >>> import jaxltl as jl
+    >>> residual_formula(jl.to_automaton("F (a & X b)"), 0)
     'F (a & X b)'
     """
     if isinstance(task, Automaton):
