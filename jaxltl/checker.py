@@ -313,7 +313,7 @@ def recurring(graph: dict, marks: Sequence[set]) -> dict:
 
 
 def accepting(graph: dict, priority: dict, parity: int, marks: Sequence[set], ends: bool) -> set:
-    """Where marked sets and the least recurring priority, of a parity, can recur almost surely.
+    """Nodes from which marked sets and the least priority, of a parity, can recur almost surely.
 
     With `ends` without nodes that only lead to these: each follows one of the least priority.
     """
@@ -834,7 +834,7 @@ class ClaimChecker:
         return max(sum([n * self.y[self.row(v, k)] for v, n in mass.items()]) for k in range(count))
 
     def moved(self, mass: dict, k: int) -> tuple[Any, dict, int]:
-        """What row k of each node earns, the measure after it, and the denominator of both."""
+        """The reward of row k of each node, the measure after it, and the denominator of both."""
         options = [self.graph[v][k] for v in mass]
         common, gain = math.lcm(*[option[2] for option in options]), 0
         after: dict = {}

@@ -195,7 +195,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[object]:
-    """What is imported stays: to look for garbage meanwhile, or later in it, only takes time."""
+    """Collection without looking for garbage, which there is none of: imported modules stay."""
     gc.disable()
     try:
         return (yield)

@@ -16,6 +16,7 @@ from jaxltl.core.array_types import Array, PyTree
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.environments.environment import Environment, allowed_in
 from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.environments.model_environment import allows_all
 from jaxltl.core.environments.task_environment import TaskObservation, task_tables
 from jaxltl.core.policies.finite_memory import Controller, Key, Progress
 from jaxltl.core.policies.policy_file import Arrays, automaton_of, automaton_text, write_policy_file
@@ -169,9 +170,8 @@ def _program(agent: Agent, environment: Environment, automaton: Automaton | None
         return environment.observe(world), allowed_in(environment, world)
 
     observation, allowed = jax.eval_shape(seen, jax.random.key(0))
-    masks = [np.asarray(x) for x in jax.tree.leaves(environment.allowed)]
-    if masks and all(x.dtype == bool and x.all() for x in masks):
-        allowed = None  # rows of a table, as of a model all of whose actions are available
+    if allows_all(environment):
+        allowed = None
     rows = None
     if isinstance(observation, TaskObservation):
         tables = task_tables(environment)

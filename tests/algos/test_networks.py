@@ -189,6 +189,10 @@ def test_a_deployed_network_obeys_the_mask_or_asks_for_it(tmp_path):
     assert policy.reads_mask and robot.act(allowed=np.array([False, True, True, True])) == 1
     with pytest.raises(ValueError, match=r"allowed is None.*bool\[4\]"):
         robot.act()
+    # A function of a table without a False may restrict actions all the same.
+    flags = Partial(lambda flags, world: flags & (jnp.arange(4) > 1), jnp.ones(4, bool))
+    jl.io.save_network(path, agent, dataclasses.replace(world, allowed=flags))
+    assert jl.io.load_policy(path).reads_mask
     table = jl.FiniteMemoryPolicy(np.array([[0]]), np.array([0]), np.array([[0]])).controller()
     table.start(0)
     with pytest.raises(ValueError, match="the policy is a table"):

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.validation import first_true
 from jaxltl.core.array_types import Key, PyTree
-from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.environments.environment import (
+    Environment,
+    Timestep,
+    make_box,
+    make_environment,
+    of_world,
+)
 from jaxltl.core.models import MDP, DenseMDP, Game, SparseMDP, sample_successor, to_padded
 from jaxltl.core.models.construct.padded import pad_rows
 from jaxltl.core.models.pomdp import POMDP
@@ -184,6 +190,20 @@ def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:
 
 def _one_hot_observation(like: jax.Array, seen: jax.Array, state: jax.Array) -> jax.Array:
     return jax.nn.one_hot(jnp.asarray(seen)[state], len(like))
+
+
+def allows_all(environment: Environment) -> bool:
+    """True if all actions are available in all states of a model's environment, or of a task in one.
+
+    >>> from jaxltl import gridworld
+    >>> allows_all(model_environment(gridworld("a .", initial="a")))
+    True
+    """
+    function: PyTree = environment.allowed
+    while isinstance(function, Partial) and function.func is of_world:
+        (function,) = function.args
+    is_table = isinstance(function, Partial) and function.func is _row
+    return function is None or (is_table and bool(np.asarray(function.args[0]).all()))
 
 
 def _row(table: jax.Array, state: jax.Array) -> jax.Array:

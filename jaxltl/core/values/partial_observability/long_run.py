@@ -47,9 +47,7 @@ _STARTS = ((1, 0.0, 0.3), (2, 0.5, 0.2), (2, 1.0, 0.3), (3, 0.5, 0.2), (3, 1.0, 
 _STEPS = 150  # of a start
 _PATIENCE, _STILL = 25, 1e-4  # steps without a change, after which a start ends
 _LARGE = 6000  # pairs of product states and memory states beyond which a start has a limit of time
-_SECONDS = (
-    30.0  # of such starts but the first, with the certificates of their controllers, all together
-)
+_SECONDS = 30.0  # of such starts but the first, all together with the certificates of controllers
 _CUTS = (1e-7, 1e-2, 0.1, 0.3)  # probabilities up to which actions are left out of a result
 _DONE = 1e-9  # distance to the upper bound at which the search ends
 _WIDTH = 1e-9  # of the bounds of a controller's value

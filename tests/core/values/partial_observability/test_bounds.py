@@ -5,6 +5,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
+from jaxltl.core.values.partial_observability import exploration
 from jaxltl.core.values.partial_observability.solve import belief_bounds, controller_value
 
 from .reference import controller_values, random_pomdp, tree_value
@@ -65,6 +66,13 @@ def check_bounds(seed, kind, depth=4, max_beliefs=100):
 @pytest.mark.parametrize("seed", [2, 4, 6])
 def test_bounds_are_on_the_right_side(seed, kind):
     check_bounds(seed, kind)
+
+
+@pytest.mark.parametrize("kind", QUESTIONS)
+def test_bounds_that_begin_by_rollouts_are_on_the_right_side(kind, monkeypatch):
+    monkeypatch.setattr(exploration, "_SMALL", 10)  # beliefs of an exploration without rollouts
+    for seed in (3, 5):
+        check_bounds(seed, kind)
 
 
 @pytest.mark.exhaustive
